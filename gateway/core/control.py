@@ -1,0 +1,196 @@
+"""The control channel: newline-delimited JSON between a running process and whoever watches or steers it.
+
+A request is one line ``{"v": 1, "id": 7, "verb": "get", "args": {...}}``, its answer one line
+``{"v": 1, "id": 7, "ok": true, "result": ...}`` or ``{"v": 1, "id": 7, "ok": false, "error": {"kind", "message",
+"exit_code"}}``. Each process registers its own verbs: a plant's controller has no fault verb because nobody registered
+one. Over a Unix socket in the instance's run directory (owner only), or over TCP with a token where asked for.
+
+A line is at most `MAX_LINE` bytes. Text and JSON come in and go out; no state of the process is known here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from gateway.core.errors import Bug, ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable, UsageError
+
+VERSION = 1
+MAX_LINE = 4 * 1024 * 1024
+MAX_CLIENTS = 64
+
+Verb = Callable[[dict[str, Any]], Awaitable[Any]]
+
+
+class ControlServer:
+    """Serves verbs on a Unix socket and, if asked, on TCP.
+
+    `verbs` maps a name to ``async (args) -> JSON-able result``. A `FieldtwinError` from a verb becomes an error answer;
+    any other exception too, as a bug of ours, and the connection stays open.
+    """
+
+    def __init__(self, verbs: dict[str, Verb], token: str = "") -> None:
+        self._verbs = dict(verbs)
+        self._token = token
+        self._servers: list[asyncio.Server] = []
+        self._clients: set[asyncio.StreamWriter] = set()
+
+    async def listen_unix(self, path: Path) -> None:
+        """Listen on `path`, replacing a stale socket; readable and writable for the owner only."""
+        path.unlink(missing_ok=True)
+        try:
+            server = await asyncio.start_unix_server(self._serve_unix, path=str(path), limit=MAX_LINE)
+        except OSError as e:
+            raise Unreachable(f"cannot listen for control: {e.strerror or e}", where=str(path)) from e
+        path.chmod(0o600)
+        self._servers.append(server)
+
+    async def listen_tcp(self, host: str, port: int) -> int:
+        """Listen on TCP and return the port. Off loopback a token is required: whoever connects may steer."""
+        if not self._token and host not in ("127.0.0.1", "::1", "localhost"):
+            raise UsageError("a control channel off loopback needs a token", where=f"{host}:{port}")
+        try:
+            server = await asyncio.start_server(self._serve_tcp, host, port, limit=MAX_LINE)
+        except OSError as e:
+            raise Unreachable(f"cannot listen for control: {e.strerror or e}", where=f"{host}:{port}") from e
+        self._servers.append(server)
+        return int(server.sockets[0].getsockname()[1])
+
+    async def aclose(self) -> None:
+        """Stop listening and drop every client."""
+        for server in self._servers:
+            server.close()
+        for writer in list(self._clients):
+            writer.close()
+        for server in self._servers:
+            await server.wait_closed()
+        self._servers.clear()
+
+    async def _serve_unix(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await self._serve(reader, writer, trusted=True)
+
+    async def _serve_tcp(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await self._serve(reader, writer, trusted=not self._token)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, trusted: bool) -> None:
+        if len(self._clients) >= MAX_CLIENTS:
+            writer.close()
+            return
+        self._clients.add(writer)
+        try:
+            while line := await reader.readline():
+                answer, trusted = await self._answer(line, trusted)
+                writer.write(answer)
+                await writer.drain()
+        except (ConnectionError, asyncio.CancelledError, ValueError):
+            pass  # client gone, server closing, or a line over the limit: only this client is dropped
+        finally:
+            self._clients.discard(writer)
+            writer.close()
+
+    async def _answer(self, line: bytes, trusted: bool) -> tuple[bytes, bool]:
+        request_id: Any = None
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict) or request.get("v") != VERSION:
+                raise UsageError("not a control request", expected=f'a JSON object with "v": {VERSION}')
+            request_id = request.get("id")
+            trusted = trusted or hmac.compare_digest(str(request.get("token", "")), self._token)
+            if not trusted:
+                raise UsageError("this control channel wants its token")
+            verb = self._verbs.get(str(request.get("verb")))
+            if verb is None:
+                raise UsageError(f"unknown verb {request.get('verb')!r}", expected=", ".join(sorted(self._verbs)))
+            answer: dict[str, Any] = {"ok": True, "result": await verb(request.get("args") or {})}
+        except FieldtwinError as e:
+            answer = {"ok": False, "error": _describe(e)}
+        except json.JSONDecodeError as e:
+            answer = {"ok": False, "error": _describe(UsageError(f"not JSON: {e}"))}
+        except Exception as e:  # a verb's bug must not take the channel down; it is reported to the caller
+            answer = {"ok": False, "error": _describe(Bug(f"{type(e).__name__}: {e}"))}
+        text = json.dumps({"v": VERSION, "id": request_id, **answer}, separators=(",", ":"), default=str)
+        return text.encode() + b"\n", trusted
+
+
+def _describe(e: FieldtwinError) -> dict[str, Any]:
+    return {"kind": type(e).__name__, "message": str(e), "exit_code": e.exit_code}
+
+
+class RemoteError(FieldtwinError):
+    """The other process answered with an error; `kind` is its class there."""
+
+    def __init__(self, kind: str, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.kind = kind
+        self.remote_exit_code = exit_code
+
+
+class ControlClient:
+    """One connection to a control channel; requests go one at a time."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, where: str, token: str) -> None:
+        self._reader = reader
+        self._writer = writer
+        self._where = where
+        self._token = token
+        self._next_id = 0
+        self._turn = asyncio.Lock()
+
+    @classmethod
+    async def connect_unix(cls, path: Path) -> ControlClient:
+        """Connect to a process of this host; raises `Unreachable` when it is not there."""
+        try:
+            reader, writer = await asyncio.open_unix_connection(str(path), limit=MAX_LINE)
+        except OSError as e:
+            raise Unreachable(f"no control channel: {e.strerror or e}", where=str(path)) from e
+        return cls(reader, writer, str(path), "")
+
+    @classmethod
+    async def connect_tcp(cls, host: str, port: int, token: str = "") -> ControlClient:
+        """Connect to a process elsewhere; raises `Unreachable` when it is not there."""
+        try:
+            reader, writer = await asyncio.open_connection(host, port, limit=MAX_LINE)
+        except OSError as e:
+            raise Unreachable(f"no control channel: {e.strerror or e}", where=f"{host}:{port}") from e
+        return cls(reader, writer, f"{host}:{port}", token)
+
+    async def call(self, verb: str, timeout_s: float = 5.0, **args: Any) -> Any:
+        """Ask for `verb` and return its result. Raises `RemoteError`, `ConnectionLost` or `ReplyTimeout`."""
+        async with self._turn:
+            self._next_id += 1
+            request = {"v": VERSION, "id": self._next_id, "verb": verb, "args": args}
+            if self._token:
+                request["token"] = self._token
+            try:
+                async with asyncio.timeout(timeout_s):
+                    self._writer.write(json.dumps(request).encode() + b"\n")
+                    await self._writer.drain()
+                    answer = await self._read_answer(self._next_id)
+            except TimeoutError as e:
+                raise ReplyTimeout(f"no answer to {verb!r} within {timeout_s} s", where=self._where) from e
+            except (OSError, ValueError) as e:
+                raise ConnectionLost(f"control channel broke: {e}", where=self._where) from e
+        if answer.get("ok"):
+            return answer.get("result")
+        error = answer.get("error") or {}
+        raise RemoteError(error.get("kind", "?"), error.get("message", "?"), error.get("exit_code", 70))
+
+    async def _read_answer(self, request_id: int) -> dict[str, Any]:
+        while True:
+            line = await self._reader.readline()
+            if not line:
+                raise ConnectionLost("the other process closed its control channel", where=self._where)
+            answer: dict[str, Any] = json.loads(line)
+            if answer.get("id") == request_id:  # an answer to a call that timed out earlier is skipped
+                return answer
+
+    async def aclose(self) -> None:
+        self._writer.close()
+        try:
+            await self._writer.wait_closed()
+        except OSError:
+            pass  # the peer was gone already

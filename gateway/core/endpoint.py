@@ -1,0 +1,166 @@
+"""Endpoints are URLs: where a wire ends, and what is spoken on it.
+
+==================================================  =====================================================
+``rtu:/dev/ttyUSB0?baudrate=19200&frame=8E1``       Modbus RTU on a serial port (``rtu:COM5`` on Windows)
+``ascii:/dev/ttyUSB0?baudrate=9600&frame=7E1``      Modbus ASCII on a serial port
+``tcp://host:502``                                  Modbus TCP; raw bytes where the far end is a serial line
+``rtu+tcp://host:4001``                             Modbus RTU frames in a TCP stream
+``udp://host:502``, ``tls://host:802``              Modbus UDP, Modbus/TCP Security
+``can:socketcan/can0``                              a kernel CAN interface
+``can:fieldtwin/127.0.0.1:29536``                   the software CAN bus
+``pty:line1``                                       (listening side only) a virtual serial port with that link name
+==================================================  =====================================================
+
+Pure text handling: this module opens nothing and knows no operating system.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from urllib.parse import parse_qsl, urlencode
+
+from gateway.core.errors import UsageError
+
+SERIAL_SCHEMES = ("rtu", "ascii")
+SOCKET_SCHEMES = ("tcp", "rtu+tcp", "udp", "tls")
+SCHEMES = (*SERIAL_SCHEMES, *SOCKET_SCHEMES, "can", "pty")
+DEFAULT_PORTS = {"tcp": 502, "udp": 502, "tls": 802}
+
+_FRAME = re.compile(r"^([78])([NEO])([12])$")
+
+
+@dataclass(frozen=True, slots=True)
+class SerialSettings:
+    """What both ends of a serial line must agree on. `frame` as in manuals: data bits, parity N/E/O, stop bits."""
+
+    baudrate: int = 19200
+    frame: str = "8E1"
+
+    @property
+    def data_bits(self) -> int:
+        return int(self.frame[0])
+
+    @property
+    def parity(self) -> str:
+        return self.frame[1]
+
+    @property
+    def stop_bits(self) -> int:
+        return int(self.frame[2])
+
+    @property
+    def bits_per_char(self) -> int:
+        """Bits a character takes on the wire: start, data, parity if any, stop."""
+        return 1 + self.data_bits + (self.parity != "N") + self.stop_bits
+
+    @property
+    def char_time_s(self) -> float:
+        """Seconds that one character takes on the wire."""
+        return self.bits_per_char / self.baudrate
+
+
+@dataclass(frozen=True, slots=True)
+class Endpoint:
+    """A parsed endpoint URL.
+
+    `path` is the device path of a serial port, the channel of a CAN interface, or the link name of a pty.
+    `interface` is the kind of CAN interface (``socketcan``, ``fieldtwin``...). Parameters keep their order.
+    """
+
+    scheme: str
+    host: str = ""
+    port: int = 0
+    path: str = ""
+    interface: str = ""
+    params: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def parse(cls, url: str) -> Endpoint:
+        """Read a URL; raises `UsageError` that says which part is wrong."""
+        scheme, colon, rest = url.partition(":")
+        scheme = scheme.lower()
+        if not colon or scheme not in SCHEMES:
+            raise UsageError(f"cannot read endpoint {url!r}", expected="one of " + ", ".join(f"{s}:" for s in SCHEMES))
+        rest, _, query = rest.partition("?")
+        params = tuple(parse_qsl(query, keep_blank_values=True))
+        if scheme in SOCKET_SCHEMES:
+            host, port = _host_port(url, scheme, rest)
+            endpoint = cls(scheme, host=host, port=port, params=params)
+        elif scheme == "can":
+            interface, slash, channel = rest.partition("/")
+            if not slash or not interface or not channel:
+                raise UsageError(f"cannot read endpoint {url!r}", expected="can:INTERFACE/CHANNEL")
+            endpoint = cls(scheme, interface=interface, path=channel, params=params)
+        else:
+            if not rest:
+                raise UsageError(f"endpoint {url!r} names no port", expected=f"{scheme}:PATH")
+            endpoint = cls(scheme, path=rest, params=params)
+        if endpoint.is_serial:
+            endpoint.serial  # noqa: B018  read once so that a bad setting is refused here, not at open
+        return endpoint
+
+    @property
+    def is_serial(self) -> bool:
+        return self.scheme in SERIAL_SCHEMES
+
+    @property
+    def is_can(self) -> bool:
+        return self.scheme == "can"
+
+    def param(self, name: str, default: str = "") -> str:
+        """The value of a parameter, or `default`."""
+        return dict(self.params).get(name, default)
+
+    @property
+    def serial(self) -> SerialSettings:
+        """Baud rate and frame of a serial endpoint (19200 8E1 where not said: the default of Modbus, SL 2.5.1)."""
+        text, frame = self.param("baudrate", "19200"), self.param("frame", "8E1").upper()
+        if not text.isdigit() or not 50 <= int(text) <= 4_000_000:
+            raise UsageError(f"endpoint {self}: baud rate", expected="a number from 50 to 4000000", got=repr(text))
+        if not _FRAME.match(frame):
+            raise UsageError(
+                f"endpoint {self}: frame", expected="data bits, parity, stop bits such as 8E1 or 8N2", got=repr(frame)
+            )
+        return SerialSettings(int(text), frame)
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port of a socket endpoint, or of a software CAN bus."""
+        if self.is_can:
+            host, _, port = self.path.rpartition(":")
+            if not host or not port.isdigit():
+                raise UsageError(f"cannot read endpoint {self}", expected="can:fieldtwin/HOST:PORT")
+            return host, int(port)
+        return self.host, self.port
+
+    def with_path(self, path: str) -> Endpoint:
+        """The same endpoint, baud rate and frame included, on another serial port or channel."""
+        return replace(self, path=path)
+
+    def with_address(self, host: str, port: int) -> Endpoint:
+        """The same endpoint on another host and port."""
+        if self.is_can:
+            return replace(self, path=f"{host}:{port}")
+        return replace(self, host=host, port=port)
+
+    def __str__(self) -> str:
+        query = f"?{urlencode(self.params)}" if self.params else ""
+        if self.scheme in SOCKET_SCHEMES:
+            host = f"[{self.host}]" if ":" in self.host else self.host
+            return f"{self.scheme}://{host}:{self.port}{query}"
+        if self.is_can:
+            return f"can:{self.interface}/{self.path}{query}"
+        return f"{self.scheme}:{self.path}{query}"
+
+
+def _host_port(url: str, scheme: str, rest: str) -> tuple[str, int]:
+    """Split ``//host:port``; the port may be left out where the scheme has a standard one."""
+    if not rest.startswith("//"):
+        raise UsageError(f"cannot read endpoint {url!r}", expected=f"{scheme}://HOST:PORT")
+    host, colon, port = rest[2:].rstrip("/").rpartition(":")
+    if not colon or "]" in port:  # no port given (the colons of an IPv6 address are inside its brackets)
+        host, port = rest[2:].rstrip("/"), str(DEFAULT_PORTS.get(scheme, ""))
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise UsageError(f"cannot read endpoint {url!r}", expected=f"{scheme}://HOST:PORT, port 0 to 65535")
+    return host.strip("[]"), int(port)

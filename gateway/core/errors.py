@@ -1,0 +1,208 @@
+"""One tree of errors: whose fault it is, what was expected, what came, where, and what to do.
+
+Every error that leaves fieldtwin is a `FieldtwinError`. Foreign exceptions (``OSError``, pymodbus, python-can) are
+translated once, at the border where they arise; nothing above that border catches them. Bad *quality* is data and
+never an error (SPEC ruling 11): these classes say why a value has none.
+
+The class decides the exit code of the command line (DESIGN.md, command line contract).
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import ClassVar
+
+
+class Blame(Enum):
+    """Who has to act for the error to go away."""
+
+    USER = "the command line"
+    FILE = "the file"
+    WIRE = "the wire"
+    DEVICE = "the device"
+    HOST = "this computer"
+    FIELDTWIN = "fieldtwin itself"
+
+
+class FieldtwinError(Exception):
+    """The root. `str()` is one line for a person; the parts stay readable for a program.
+
+    `expected`, `got`, `where` and `hint` are plain text, empty where they do not apply. `where` names bus, unit,
+    address, file and line: whatever leads to the spot.
+    """
+
+    exit_code: ClassVar[int] = 70
+    blame: ClassVar[Blame] = Blame.FIELDTWIN
+
+    def __init__(self, message: str, *, expected: str = "", got: str = "", where: str = "", hint: str = "") -> None:
+        self.message = message
+        self.expected = expected
+        self.got = got
+        self.where = where
+        self.hint = hint
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.message}" if self.where else self.message
+        if self.expected:
+            text += f"; expected {self.expected}"
+        if self.got:
+            text += f"; got {self.got}"
+        return f"{text} ({self.hint})" if self.hint else text
+
+    def at(self, where: str) -> FieldtwinError:
+        """The same error with `where` put in front of what it already knows; returns itself, for ``raise e.at(...)``."""
+        self.where = f"{where}: {self.where}" if self.where else where
+        return self
+
+
+# -- ours and the user's ------------------------------------------------------------------------------------------
+
+
+class CheckFailed(FieldtwinError):
+    """A check ran and its verdict is no."""
+
+    exit_code = 1
+    blame = Blame.DEVICE
+
+
+class UsageError(FieldtwinError):
+    """What was asked for makes no sense or was not allowed."""
+
+    exit_code = 2
+    blame = Blame.USER
+
+
+class NotAllowed(UsageError):
+    """The request is well formed and the configuration forbids it (read-only plant, unmarked tag, limits, rate)."""
+
+
+class FileInvalid(FieldtwinError):
+    """A file that a user wrote or recorded cannot be used as it is.
+
+    `line` and `column` count from 1; 0 where the file has none.
+    """
+
+    exit_code = 3
+    blame = Blame.FILE
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        path: str = "",
+        line: int = 0,
+        column: int = 0,
+        expected: str = "",
+        got: str = "",
+        hint: str = "",
+    ) -> None:
+        self.path = path
+        self.line = line
+        self.column = column
+        where = path
+        if line:
+            where += f":{line}" + (f":{column}" if column else "")
+        super().__init__(message, expected=expected, got=got, where=where, hint=hint)
+
+
+class CommandListMismatch(FileInvalid):
+    """Driver and device do not accept the same commands (SPEC row Communication, ruling 12)."""
+
+
+class Bug(FieldtwinError):
+    """An invariant of ours broke."""
+
+
+# -- the wire -----------------------------------------------------------------------------------------------------
+
+
+class Unreachable(FieldtwinError):
+    """An endpoint cannot be opened, or was lost. Retrying later is sensible."""
+
+    exit_code = 4
+    blame = Blame.WIRE
+
+
+class EndpointBusy(Unreachable):
+    """The port, socket or bus exists and somebody else holds it."""
+
+    blame = Blame.HOST
+
+
+class ConnectionLost(Unreachable):
+    """A connection that was open ended: peer gone, cable pulled, bus-off."""
+
+
+class WireError(FieldtwinError):
+    """What came over the wire is not what the protocol allows. The request may be repeated."""
+
+    exit_code = 4
+    blame = Blame.WIRE
+
+
+class ReplyTimeout(WireError):
+    """Nothing that could be the reply arrived in time."""
+
+
+class CrcError(WireError):
+    """A reply arrived whole and its check sum is wrong."""
+
+
+class Desync(WireError):
+    """A frame arrived that is no answer to the request: another unit, function, size, transaction or index."""
+
+
+# -- the device ---------------------------------------------------------------------------------------------------
+
+
+class DeviceRefused(FieldtwinError):
+    """The device understood and said no."""
+
+    exit_code = 5
+    blame = Blame.DEVICE
+
+
+class ModbusExceptionReply(DeviceRefused):
+    """A Modbus exception response: `function` as requested, `code` as received (raw, vendor codes included)."""
+
+    NAMES: ClassVar[dict[int, str]] = {
+        1: "illegal function",
+        2: "illegal data address",
+        3: "illegal data value",
+        4: "server device failure",
+        5: "acknowledge",
+        6: "server device busy",
+        8: "memory parity error",
+        10: "gateway path unavailable",
+        11: "gateway target device failed to respond",
+    }
+
+    def __init__(self, function: int, code: int, *, where: str = "") -> None:
+        self.function = function
+        self.code = code
+        name = self.NAMES.get(code, "vendor specific")
+        super().__init__(f"function {function:02X}h refused with exception {code:02X}h ({name})", where=where)
+
+
+class SdoAborted(DeviceRefused):
+    """An SDO transfer was aborted by the node: `code` is the 32-bit abort code of CiA 301, 7.2.4.3.17."""
+
+    def __init__(self, index: int, subindex: int, code: int, meaning: str = "", *, where: str = "") -> None:
+        self.index = index
+        self.subindex = subindex
+        self.code = code
+        text = f"SDO {index:04X}h:{subindex:02X} aborted with {code:08X}h"
+        super().__init__(text + (f" ({meaning})" if meaning else ""), where=where)
+
+
+class UnknownCommand(DeviceRefused):
+    """A command that is not in the device's command list (SPEC row Device)."""
+
+
+class VerifyFailed(DeviceRefused):
+    """The device acknowledged a write and holds another value."""
+
+
+class WrongDevice(DeviceRefused):
+    """The device that answers is not the one that the system file expects; writes to it are blocked."""

@@ -1,0 +1,98 @@
+"""The observatory's state machine, M = (Q, Sigma, delta, q0, F).
+
+Q = {STANDBY, ACTIVE, OFF}, Sigma = Z, q0 = STANDBY, F = {OFF}. delta depends on the sign of the commanded period alone, from
+every state, OFF included (SPEC ruling 6):
+
+    x > 0  ->  ACTIVE   the sensor samples every x seconds
+    x = 0  ->  STANDBY  nothing is sampled
+    x < 0  ->  OFF      nothing is sampled; accepting for analysis, not absorbing
+
+Pure: no time, no I/O, no connection to the plant. The control logic, the digital model and every twin hold an
+instance each.
+"""
+
+from __future__ import annotations
+
+import struct
+from abc import ABC, abstractmethod
+
+from gateway.core.errors import Desync
+from gateway.core.values import COMMAND
+
+_PERIOD = struct.Struct(">h")
+PERIOD_MIN, PERIOD_MAX = -32768, 32767
+
+
+class STATE(ABC):
+    """A state; `execute` says whether the sensor samples in it."""
+
+    name: str
+
+    @abstractmethod
+    def execute(self, period_s: int) -> int:
+        """The sampling period in seconds that this state imposes, 0 when nothing is sampled."""
+
+
+class ACTIVE(STATE):
+    name = "ACTIVE"
+
+    def execute(self, period_s: int) -> int:
+        return period_s
+
+
+class STANDBY(STATE):
+    name = "STANDBY"
+
+    def execute(self, period_s: int) -> int:
+        return 0
+
+
+class OFF(STATE):
+    name = "OFF"
+
+    def execute(self, period_s: int) -> int:
+        return 0
+
+
+STATES: dict[str, STATE] = {s.name: s for s in (STANDBY(), ACTIVE(), OFF())}
+"""Q, in the order of their codes 0, 1, 2 wherever a state is written as a number."""
+
+STATE_CODES = {name: code for code, name in enumerate(STATES)}
+ACCEPTING = frozenset({"OFF"})
+
+
+def delta(period_s: int) -> STATE:
+    """The transition function: total, by the sign of the period alone."""
+    if period_s > 0:
+        return STATES["ACTIVE"]
+    return STATES["STANDBY"] if period_s == 0 else STATES["OFF"]
+
+
+def encode_period(period_s: int) -> COMMAND:
+    """A period command: seconds, signed 16 bit, big endian. Raises `Desync` outside -32768..32767."""
+    if not PERIOD_MIN <= period_s <= PERIOD_MAX:
+        raise Desync("a period command", expected=f"{PERIOD_MIN} to {PERIOD_MAX} s", got=str(period_s))
+    return COMMAND(_PERIOD.pack(period_s))
+
+
+def decode_period(command: COMMAND) -> int:
+    """The period of a command in seconds. Raises `Desync` when it is not two bytes."""
+    if len(command.data) != _PERIOD.size:
+        raise Desync("a period command", expected="2 bytes", got=f"{len(command.data)} bytes {command.data.hex()}")
+    (period_s,) = _PERIOD.unpack(command.data)
+    return int(period_s)
+
+
+class EventStateMachine:
+    """SPEC row EventStateMachine: Init is STANDBY with period 0; ProcessEvent sets period and state."""
+
+    def __init__(self) -> None:
+        self.state: STATE = STATES["STANDBY"]
+        self.period_s = 0
+
+    def process_event(self, command: COMMAND) -> STATE:
+        """Take a command; the new state. A command that is none changes nothing and raises `Desync`."""
+        period_s = decode_period(command)
+        self.period_s = period_s
+        self.state = delta(period_s)
+        return self.state

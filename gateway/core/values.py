@@ -1,0 +1,107 @@
+"""Values as they travel: the paper's DATA family, and a tag's value with its quality.
+
+DATA is a bit sequence (``bytes``); COMMAND and RESPONSE are DATA, MEASUREMENT and STATUS are RESPONSEs, a RECORDING is a
+RESPONSE. All are frozen: what was received cannot be changed on the way (SPEC, ControlLogic: "payload unaltered").
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+
+@dataclass(frozen=True, slots=True)
+class DATA:
+    """A bit sequence."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class COMMAND(DATA):
+    """What is asked of a device. For the observatory: a period in seconds, signed 16 bit (SPEC ruling 17)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RESPONSE(DATA):
+    """What a device answers: a MEASUREMENT or a STATUS."""
+
+
+@dataclass(frozen=True, slots=True)
+class MEASUREMENT(RESPONSE):
+    """Sampled values."""
+
+
+@dataclass(frozen=True, slots=True)
+class STATUS(RESPONSE):
+    """What state a device or system is in. Carries state and period (SPEC ruling 7)."""
+
+
+@dataclass(frozen=True, slots=True)
+class RECORDING(RESPONSE):
+    """A response that was recorded earlier."""
+
+
+class Quality(IntEnum):
+    """How far a value can be trusted (IEC 62541 reduces to these). Ordered: a larger number is worse."""
+
+    GOOD = 0
+    SUBSTITUTED = 1
+    SIMULATED = 2
+    UNCERTAIN = 3
+    BAD = 4
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Reason(IntEnum):
+    """Why a value is not good. Small integers, so that they fit into the process image."""
+
+    NONE = 0
+    NEVER_READ = 1
+    TIMEOUT = 2
+    WIRE_ERROR = 3
+    REFUSED = 4
+    UNREACHABLE = 5
+    STALE = 6
+    NOT_SAMPLING = 7
+    NOT_A_NUMBER = 8
+    OUT_OF_RANGE = 9
+    NOT_OPERATIONAL = 10
+    HEARTBEAT_LOST = 11
+    WRONG_DEVICE = 12
+    GATEWAY_DEAD = 13
+    SENTINEL = 14
+
+    def __str__(self) -> str:
+        return self.name.lower().replace("_", " ")
+
+
+Scalar = bool | int | float | str | bytes
+
+
+@dataclass(frozen=True, slots=True)
+class TagValue:
+    """A tag's value at an instant.
+
+    `value` is in engineering units, or None when there never was one. `t_ns` is the source's monotonic time: when the
+    reply that carried it was complete. `raw` is what the device sent, byte for byte, empty if nothing did.
+    """
+
+    value: Scalar | None
+    quality: Quality
+    reason: Reason = Reason.NONE
+    t_ns: int = 0
+    raw: bytes = b""
+
+    @property
+    def good(self) -> bool:
+        return self.quality is Quality.GOOD
+
+    def age_s(self, now_ns: int) -> float:
+        """Seconds since the source had this value; infinite when it never had one."""
+        return (now_ns - self.t_ns) / 1e9 if self.t_ns else float("inf")
+
+
+NEVER = TagValue(None, Quality.BAD, Reason.NEVER_READ)

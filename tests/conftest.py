@@ -1,0 +1,25 @@
+"""Every test must leave no thread, process or open socket behind; warnings are errors (pyproject.toml)."""
+
+from __future__ import annotations
+
+import gc
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture(autouse=True)
+def leaves_no_threads() -> Iterator[None]:
+    """Fail the test that leaves a thread running; collect, so that an unclosed resource warns in the test that left it."""
+    before = set(threading.enumerate())
+    yield
+    gc.collect()
+    leaked = [t for t in threading.enumerate() if t not in before and t.is_alive()]
+    for thread in leaked:
+        thread.join(timeout=2.0)
+    assert not [t for t in leaked if t.is_alive()], f"leaked threads: {leaked}"

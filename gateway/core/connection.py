@@ -82,7 +82,7 @@ class _End(Generic[T]):
     """
 
     def __init__(self, inbound: Connection[T], endpoint: Endpoint, max_pending: int) -> None:
-        self.inbound = inbound
+        self.inbound: Connection[T] = inbound
         self.endpoint = endpoint
         self.max_pending = max_pending
         self._lost: FieldtwinError | None = None

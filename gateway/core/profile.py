@@ -1,0 +1,333 @@
+"""A device profile with everything resolved: addresses as sent, sizes, groups, commands.
+
+Both sides of a wire read the same profile and nothing else in common: the driver decodes with gateway.devices.codec, the
+emulator encodes with a codec of its own (DESIGN.md, the one idea). Addresses are shown both ways, as printed in manuals
+and as sent (decision 9).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from gateway.core.errors import FileInvalid
+from gateway.core.profile_schema import BoxForm, MessageForm, ProfileForm, TagForm
+from gateway.core.yaml_file import Key, YamlFile, load, validate
+
+Table = Literal["coil", "discrete", "input", "holding"]
+
+PRINTED: tuple[tuple[Table, int], ...] = (("coil", 0), ("discrete", 1), ("input", 3), ("holding", 4))
+READ_FUNCTION: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+REGISTERS_OF = {
+    "int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2, "int64": 4, "uint64": 4, "float64": 4, "bool": 1,
+}  # fmt: skip
+INTEGER_RANGES = {
+    "bool": (0, 1), "int16": (-0x8000, 0x7FFF), "uint16": (0, 0xFFFF), "int32": (-0x80000000, 0x7FFFFFFF),
+    "uint32": (0, 0xFFFFFFFF), "int64": (-(1 << 63), (1 << 63) - 1), "uint64": (0, (1 << 64) - 1),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterRange:
+    """`count` registers (or bits) of `table` from PDU address `address` (0 to 65535)."""
+
+    table: Table
+    address: int
+    count: int
+
+    @property
+    def end(self) -> int:
+        """One past the last address."""
+        return self.address + self.count
+
+    def __str__(self) -> str:
+        """Both ways: ``30001 (input:0)``, with the count where it is not 1."""
+        digit = dict(PRINTED)[self.table]
+        number = self.address + 1
+        printed = f"{digit}{number:04d}" if number <= 9999 else f"{digit}{number:05d}"
+        return f"{printed} ({self.table}:{self.address})" + (f" x {self.count}" if self.count != 1 else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """One value of a device. Exactly one of `at` (Modbus) and `object` (CANopen index, subindex) is set."""
+
+    name: str
+    type: str
+    at: RegisterRange | None
+    object: tuple[int, int] | None
+    order: str
+    poll: str
+    access: str
+    unit: str
+    scale: float
+    offset: float
+    values: tuple[tuple[int, str], ...]
+    range: tuple[float, float] | None
+    counter: bool
+    secret: bool
+    danger: str
+
+    @property
+    def registers(self) -> RegisterRange:
+        """Where a Modbus tag stands; a profile's protocol guarantees it."""
+        assert self.at is not None
+        return self.at
+
+    @property
+    def readable(self) -> bool:
+        return self.access != "wo"
+
+    @property
+    def writable(self) -> bool:
+        return self.access != "ro"
+
+    @property
+    def is_text(self) -> bool:
+        return self.type in ("string", "bytes")
+
+    @property
+    def is_integer(self) -> bool:
+        """True when the engineering value is a whole number: an integer type without scale and offset."""
+        return self.type in INTEGER_RANGES and self.scale == 1.0 and self.offset == 0.0
+
+    @property
+    def limits(self) -> tuple[float, float] | None:
+        """The smallest and largest value that may be written, in engineering units; None where anything goes."""
+        if self.range is not None:
+            return self.range
+        if self.type in INTEGER_RANGES:
+            low, high = INTEGER_RANGES[self.type]
+            a, b = low * self.scale + self.offset, high * self.scale + self.offset
+            return min(a, b), max(a, b)
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A block of registers passed on unaltered when the tag `when` changes."""
+
+    name: str
+    at: RegisterRange
+    when: str
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """Which tag counts samples and which holds their period in seconds."""
+
+    count: str
+    period: str
+    slack_ms: int
+    poll: str
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """One mailbox: two registers (sequence, length in bytes), the payload, and the acknowledged sequence elsewhere."""
+
+    name: str
+    at: RegisterRange
+    bytes: int
+    ack: RegisterRange
+
+
+@dataclass(frozen=True)
+class DeviceProfile:
+    """A profile, resolved. Dictionaries keep the file's order."""
+
+    path: str
+    hash: str
+    form: ProfileForm
+    tags: dict[str, Tag]
+    messages: dict[str, Message]
+    sampled: Sampled | None
+    inbox: Box | None
+    outbox: Box | None
+
+    @property
+    def name(self) -> str:
+        return self.form.device
+
+    @property
+    def protocol(self) -> str:
+        return self.form.protocol
+
+    @property
+    def eds_path(self) -> Path | None:
+        """The EDS that a CANopen profile names, beside the profile."""
+        return Path(self.path).parent / self.form.eds if self.form.eds else None
+
+    def group(self, poll: str) -> list[Tag]:
+        """The readable tags of a poll group, in the file's order."""
+        return [t for t in self.tags.values() if t.poll == poll and t.readable]
+
+    @property
+    def groups(self) -> list[str]:
+        """The poll groups, in the file's order."""
+        return list(dict.fromkeys(t.poll for t in self.tags.values() if t.readable))
+
+    @property
+    def command_list(self) -> frozenset[str]:
+        """The commands a device of this profile accepts (SPEC ruling 12).
+
+        ``read_<group>`` for each poll group, the names in `commands`, ``set_<tag>`` for a writable tag without one; a
+        transmitter accepts ``send`` and ``acknowledge``, a CANopen node the NMT commands.
+        """
+        named = set(self.form.commands.values())
+        commands = {f"read_{g}" for g in self.groups} | set(self.form.commands)
+        commands |= {f"set_{t.name}" for t in self.tags.values() if t.writable and t.name not in named}
+        if self.inbox is not None:
+            commands |= {"receive", "acknowledge", "send"}
+        if self.protocol == "canopen":
+            commands |= {"nmt_start", "nmt_stop", "nmt_preoperational", "nmt_reset_node", "nmt_reset_communication"}
+        return frozenset(commands)
+
+    def command_for(self, tag: str) -> str:
+        """The command that writes `tag`."""
+        return next((c for c, t in self.form.commands.items() if t == tag), f"set_{tag}")
+
+
+def resolve_address(text: int | str, numbering: str, count: int = 1) -> RegisterRange:
+    """Read an address: ``30001`` / ``400001`` as printed in manuals, ``input:0`` / ``holding:0x10`` as sent.
+
+    Raises ValueError with a sentence that says what would have been right.
+    """
+    if isinstance(text, str) and ":" in text:
+        table, _, number = text.partition(":")
+        if table not in READ_FUNCTION:
+            raise ValueError(f"no table {table!r}: coil, discrete, input or holding")
+        address = int(number, 0)
+        found: Table | None = table
+    elif numbering == "printed" and re.fullmatch(r"[0-9]{5,6}", str(text)):
+        digits = str(text)
+        found = next((t for t, d in PRINTED if d == int(digits[0])), None)
+        address = int(digits[1:]) - 1
+    else:
+        raise ValueError(f"address {text!r}: 30001 or 400001 as printed in manuals, or holding:0x10 as sent")
+    if found is None:
+        raise ValueError(
+            f"address {text!r} starts with {str(text)[0]}: 0 coil, 1 discrete, 3 input, 4 holding register"
+        )
+    if address < 0 or address + count > 65536:
+        raise ValueError(f"address {text!r} with {count} registers leaves the table (0 to 65535 as sent)")
+    return RegisterRange(found, address, count)
+
+
+def load_profile(path: Path) -> DeviceProfile:
+    """Read a profile; raises `FileInvalid` with line and column for anything wrong."""
+    return resolve(load(path))
+
+
+def resolve(file: YamlFile) -> DeviceProfile:
+    """A parsed profile file as a `DeviceProfile`."""
+    form = validate(file, ProfileForm)
+    tags: dict[str, Tag] = {}
+    for name, tag_form in form.tags.items():
+        for tag in _tags_of(file, form, name, tag_form):
+            if tag.name in tags:
+                raise file.error(("tags", name), f"the tag {tag.name!r} stands twice")
+            tags[tag.name] = tag
+    profile = DeviceProfile(
+        path=file.path,
+        hash=hashlib.sha256(form.model_dump_json().encode()).hexdigest()[:16],
+        form=form,
+        tags=tags,
+        messages={n: _message(file, form, n, m) for n, m in form.messages.items()},
+        sampled=Sampled(**form.sampled.model_dump()) if form.sampled else None,
+        inbox=_box(file, form, "inbox", form.mailbox.inbox) if form.mailbox else None,
+        outbox=_box(file, form, "outbox", form.mailbox.outbox) if form.mailbox else None,
+    )
+    _check_references(file, profile)
+    return profile
+
+
+def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterable[Tag]:
+    """One tag, or several for a name such as ``voltage_l1..3``: the following ones stand right behind the first."""
+    loc: tuple[Key, ...] = ("tags", name)
+    kind = t.type or form.defaults.type
+    if form.protocol == "canopen":
+        if t.object is None or t.at is not None:
+            raise file.error(loc, f"the tag {name!r} of a CANopen device", expected='`object: "6010:00"`, and no `at`')
+        first, last = None, 0
+        indexes = (int(t.object[:4], 16), int(t.object[5:], 16))
+    else:
+        if t.at is None or t.object is not None:
+            raise file.error(loc, f"the tag {name!r} of a Modbus device", expected="`at: 30001`, and no `object`")
+        if kind in ("string", "bytes") and t.registers is None:
+            raise file.error(loc, f"the tag {name!r} is a {kind}", expected="`registers: N`, its length")
+        first = _address(file, (*loc, "at"), form, t.at, t.registers or REGISTERS_OF[kind])
+        indexes = None
+    match = re.fullmatch(r"(.*?)([0-9]+)\.\.([0-9]+)", name)
+    names = [name]
+    if match:
+        start, last = int(match[2]), int(match[3])
+        names = [f"{match[1]}{n}" for n in range(start, last + 1)]
+    for i, single in enumerate(names):
+        at = None
+        if first is not None:
+            step = first.count
+            at = RegisterRange(first.table, first.address + i * step, step)
+        yield Tag(
+            name=single,
+            type=kind,
+            at=at,
+            object=(indexes[0], indexes[1] + i) if indexes else None,
+            order=t.order or form.defaults.order,
+            poll=t.poll or form.defaults.poll,
+            access=t.access,
+            unit=t.unit,
+            scale=t.scale,
+            offset=t.offset,
+            values=tuple((t.values or {}).items()),
+            range=t.range,
+            counter=t.counter,
+            secret=t.secret,
+            danger=t.danger,
+        )
+
+
+def _address(file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, at: int | str, count: int) -> RegisterRange:
+    try:
+        return resolve_address(at, form.numbering, count)
+    except ValueError as e:
+        raise file.error(loc, str(e)) from e
+
+
+def _message(file: YamlFile, form: ProfileForm, name: str, m: MessageForm) -> Message:
+    return Message(name, _address(file, ("messages", name, "at"), form, m.at, m.registers), m.when)
+
+
+def _box(file: YamlFile, form: ProfileForm, name: str, box: BoxForm) -> Box:
+    at = _address(file, ("mailbox", name, "at"), form, box.at, 2 + (box.bytes + 1) // 2)
+    ack = _address(file, ("mailbox", name, "ack"), form, box.ack, 1)
+    return Box(name, at, box.bytes, ack)
+
+
+def _check_references(file: YamlFile, p: DeviceProfile) -> None:
+    """Every tag that is named elsewhere in the profile must exist, and be of the kind that its use needs."""
+    wanted: list[tuple[tuple[Key, ...], str]] = [(("commands", c), t) for c, t in p.form.commands.items()]
+    wanted += [(("messages", m.name, "when"), m.when) for m in p.messages.values()]
+    wanted += [(("identify", i, "tag"), e.tag) for i, e in enumerate(p.form.identify)]
+    if p.sampled:
+        wanted += [(("sampled", "count"), p.sampled.count), (("sampled", "period"), p.sampled.period)]
+    for loc, tag in wanted:
+        if tag not in p.tags:
+            raise file.error(loc, f"no tag {tag!r} in this profile", expected="one of " + ", ".join(p.tags))
+    for command, tag in p.form.commands.items():
+        if not p.tags[tag].writable:
+            raise file.error(("commands", command), f"the tag {tag!r} is read-only", expected="`access: rw` or `wo`")
+    for name, behaviour in p.form.behaviours.items():
+        for command in behaviour:
+            if command not in p.form.commands:
+                raise file.error(
+                    ("behaviours", name, command),
+                    f"no command {command!r}",
+                    expected=", ".join(p.form.commands) or "none",
+                )
+    if p.protocol == "canopen" and p.form.eds is None:
+        raise FileInvalid("a CANopen profile names its EDS", path=p.path, line=1, expected="`eds: FILE.eds`")

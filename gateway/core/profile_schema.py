@@ -1,0 +1,132 @@
+"""What a device profile may say: the pydantic models of the YAML form (see docs and `fieldtwin schema profile`).
+
+Only the form is here. gateway.core.profile turns it into frozen objects with resolved addresses.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+ValueType = Literal[
+    "bool", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64", "string", "bytes"
+]
+Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
+Access = Literal["ro", "rw", "wo"]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*(\.\.[0-9]+)?$")]
+Address = int | str
+
+
+class Strict(BaseModel):
+    """Unknown keys are refused; values are not coerced."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class Factory(Strict):
+    """How the device leaves the factory."""
+
+    baudrate: int = Field(default=19200, gt=0)
+    frame: str = Field(default="8E1", pattern=r"^[78][NEO][12]$")
+    unit: int = Field(default=1, ge=0, le=255)
+    node: int = Field(default=1, ge=1, le=127)
+
+
+class Limits(Strict):
+    """What the device accepts; both the driver and the emulator keep to it."""
+
+    functions: list[int] | None = None
+    read_registers: int = Field(default=125, ge=1, le=125)
+    even_only: bool = False
+    max_gap: int = Field(default=8, ge=0, le=125, description="registers read over to merge two reads into one")
+
+
+class Defaults(Strict):
+    """What a tag is unless it says otherwise."""
+
+    type: ValueType = "uint16"
+    order: Order = "ABCD"
+    poll: str = "values"
+
+
+class TagForm(Strict):
+    """One value of the device. `at` for Modbus, `object` for CANopen ("6010:00")."""
+
+    at: Address | None = None
+    object: str | None = Field(default=None, pattern=r"^[0-9A-Fa-f]{4}:[0-9A-Fa-f]{2}$")
+    type: ValueType | None = None
+    order: Order | None = None
+    registers: int | None = Field(default=None, ge=1, le=125, description="length of a string or of bytes")
+    poll: str | None = None
+    access: Access = "ro"
+    unit: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    values: dict[int, str] | None = None
+    range: tuple[float, float] | None = None
+    counter: bool = False
+    nonvolatile: bool = False
+    secret: bool = False
+    danger: str = ""
+    description: str = ""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class MessageForm(Strict):
+    """A block of registers that is passed on unaltered, as one message, each time the tag `when` changes."""
+
+    at: Address
+    registers: int = Field(ge=1, le=125)
+    when: str
+
+
+class SampledForm(Strict):
+    """The values of group `poll` are samples: new when tag `count` moves, taken every tag `period` seconds."""
+
+    count: str
+    period: str
+    slack_ms: int = Field(default=1500, ge=0)
+    poll: str = "values"
+
+
+class BoxForm(Strict):
+    """One direction of a mailbox: sequence, length and payload from `at`, the acknowledged sequence at `ack`."""
+
+    at: Address
+    bytes: int = Field(ge=2, le=240)
+    ack: Address
+
+
+class MailboxForm(Strict):
+    """A transmitter's two mailboxes (SPEC ruling 17)."""
+
+    inbox: BoxForm
+    outbox: BoxForm
+
+
+class IdentifyForm(Strict):
+    """A read whose answer tells this device from others; `tag` names the value to compare with `expect`."""
+
+    tag: str
+
+
+class ProfileForm(Strict):
+    """A device profile."""
+
+    device: str = Field(pattern=r"^[a-z0-9-]+/[a-z0-9.-]+$")
+    source: str
+    protocol: Literal["modbus", "canopen"]
+    factory: Factory = Factory()
+    numbering: Literal["printed", "sent"] = "printed"
+    limits: Limits = Limits()
+    defaults: Defaults = Defaults()
+    eds: str | None = None
+    identify: list[IdentifyForm] = []
+    sampled: SampledForm | None = None
+    mailbox: MailboxForm | None = None
+    messages: dict[Name, MessageForm] = {}
+    tags: dict[Name, TagForm] = {}
+    commands: dict[Name, str] = Field(default={}, description="command name -> the tag it writes")
+    behaviours: dict[Name, dict[str, int | float]] = Field(default={}, description="behaviour -> command -> value")

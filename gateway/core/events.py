@@ -49,6 +49,12 @@ class Consumer(EventHandler, Generic[D]):
             raise Bug("consume from an empty queue", where=self.event)
         return self.queue.popleft()
 
+    def put_back(self, item: D) -> None:
+        """Make `item`, consumed and not dealt with, the first again; a full queue drops its newest and counts it."""
+        if len(self.queue) == self.queue.maxlen:
+            self.dropped += 1
+        self.queue.appendleft(item)
+
     def drain(self) -> Iterator[D]:
         """Consume what is there now, one by one; what arrives meanwhile waits for the next drain."""
         for _ in range(len(self.queue)):

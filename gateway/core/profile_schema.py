@@ -126,7 +126,7 @@ class ProfileForm(Strict):
     identify: list[IdentifyForm] = []
     sampled: SampledForm | None = None
     mailbox: MailboxForm | None = None
-    messages: dict[Name, MessageForm] = {}
+    messages: dict[Name, MessageForm] = Field(default={}, max_length=1)
     tags: dict[Name, TagForm] = {}
     commands: dict[Name, str] = Field(default={}, description="command name -> the tag it writes")
     behaviours: dict[Name, dict[str, int | float]] = Field(default={}, description="behaviour -> command -> value")

@@ -19,7 +19,12 @@ class DATA:
 
 @dataclass(frozen=True, slots=True)
 class COMMAND(DATA):
-    """What is asked of a device. For the observatory: a period in seconds, signed 16 bit (SPEC ruling 17)."""
+    """What is asked of a device: its bits, and the name under which the device's command list knows it.
+
+    Between far side and control logic a command is a period in seconds, signed 16 bit (SPEC ruling 17), without a name.
+    """
+
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)

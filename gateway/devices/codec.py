@@ -1,0 +1,80 @@
+"""The driver's value codec: registers or object bytes to engineering values and back.
+
+The emulator has one of its own and shares nothing with this (a bug in a shared codec would cancel itself out).
+Registers are 16 bit, big endian on the wire (Modbus AP 4.2). `order` says how the bytes of a value longer than one register
+stand: ABCD big endian, CDAB words swapped, BADC bytes swapped within words, DCBA little endian.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+from gateway.core.errors import NotAllowed
+from gateway.core.profile import Tag
+from gateway.core.values import Quality, Reason, Scalar, TagValue
+
+_FORMATS = {
+    "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q", "uint64": ">Q",
+    "float32": ">f", "float64": ">d",
+}  # fmt: skip
+
+
+def reorder(data: bytes, order: str) -> bytes:
+    """Bring the bytes of one value into big-endian order, or back: every order is its own inverse."""
+    if order == "ABCD" or len(data) < 2:
+        return data
+    words = [data[i : i + 2] for i in range(0, len(data), 2)]
+    if order in ("BADC", "DCBA"):
+        words = [w[::-1] for w in words]
+    if order in ("CDAB", "DCBA"):
+        words.reverse()
+    return b"".join(words)
+
+
+def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
+    """The value of `tag` from its register bytes as on the wire. Text ends at the first NUL.
+
+    Not a number is a bad value and never a good one.
+    """
+    if tag.type == "string":
+        text = data.split(b"\0", 1)[0].decode("ascii", errors="replace").rstrip()
+        return TagValue(text, Quality.GOOD, Reason.NONE, t_ns, data)
+    if tag.type == "bytes":
+        return TagValue(data, Quality.GOOD, Reason.NONE, t_ns, data)
+    if tag.type == "bool":
+        return TagValue(bool(int.from_bytes(data)), Quality.GOOD, Reason.NONE, t_ns, data)
+    (number,) = struct.unpack(_FORMATS[tag.type], reorder(data, tag.order))
+    if isinstance(number, float) and not math.isfinite(number):
+        return TagValue(None, Quality.BAD, Reason.NOT_A_NUMBER, t_ns, data)
+    return TagValue(_scaled(tag, number), Quality.GOOD, Reason.NONE, t_ns, data)
+
+
+def decode_little(tag: Tag, data: bytes, t_ns: int) -> TagValue:
+    """The value of `tag` from a CANopen object's bytes, which are little endian (CiA 301, 7.1.4)."""
+    if tag.type in _FORMATS:
+        return decode(tag, reorder(data[::-1], tag.order), t_ns)
+    return decode(tag, data, t_ns)
+
+
+def encode(tag: Tag, value: Scalar) -> bytes:
+    """Register bytes of an engineering value. Raises `NotAllowed` for what the tag cannot hold."""
+    if isinstance(value, str | bytes) or tag.type in ("string", "bytes"):
+        raise NotAllowed(f"{tag.name}: text cannot be written", expected=f"a number for {tag.type}", got=repr(value))
+    low_high = tag.limits
+    if not math.isfinite(value) or (low_high is not None and not low_high[0] <= value <= low_high[1]):
+        expected = f"{low_high[0]:g} to {low_high[1]:g} {tag.unit}".rstrip() if low_high else "a finite number"
+        raise NotAllowed(f"{tag.name}: the value is outside its limits", expected=expected, got=f"{value:g}")
+    if tag.type == "bool":
+        return int(bool(value)).to_bytes(2)
+    number = (value - tag.offset) / tag.scale
+    if tag.type.startswith("float"):
+        return reorder(struct.pack(_FORMATS[tag.type], number), tag.order)
+    return reorder(struct.pack(_FORMATS[tag.type], round(number)), tag.order)
+
+
+def _scaled(tag: Tag, number: float) -> Scalar:
+    """Engineering units; whole numbers stay whole where nothing is scaled."""
+    if tag.scale == 1.0 and tag.offset == 0.0:
+        return number
+    return number * tag.scale + tag.offset

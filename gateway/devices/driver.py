@@ -1,0 +1,95 @@
+"""SPEC row DeviceDriver: one concrete connection, an emitter and a consumer.
+
+Send is consume ; write. Receive is read ; emit. A driver opens nothing (it is attached to a connection that the runtime
+opened through a Connector), knows no clock but the one it is given, and cannot tell an emulator from the device.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar, Protocol
+
+from gateway.core.connection import PROTOCOL, ByteConnection, CanConnection
+from gateway.core.errors import Bug, FileInvalid, UnknownCommand
+from gateway.core.events import Consumer, Producer
+from gateway.core.values import COMMAND, DATA, Reason, TagValue
+from gateway.devices.config import DeviceConfig
+
+
+class TagSink(Protocol):
+    """Where a driver's values go: the runtime's tag table."""
+
+    def put(self, name: str, value: TagValue) -> None:
+        """Take the newest value of the tag `name` (``device.tag``)."""
+        ...
+
+    def put_bad(self, names: list[str], reason: Reason) -> None:
+        """Every tag of `names` is bad from now on; its last value and time stay readable."""
+        ...
+
+
+class DeviceDriver(ABC):
+    """A driver of one device. Concrete ones name the kinds of connection they accept in `wire_types`."""
+
+    wire_types: ClassVar[frozenset[PROTOCOL]]
+
+    def __init__(self, config: DeviceConfig, sink: TagSink) -> None:
+        self.config = config
+        self.profile = config.profile
+        self.sink = sink
+        self.emitter: Producer[DATA] = Producer(f"{config.name}.received")
+        self.consumer: Consumer[DATA] = Consumer(f"{config.name}.to_send", capacity=64)
+        self.identity_error: str = ""
+        self._connection: ByteConnection | CanConnection | None = None
+
+    @property
+    def command_list(self) -> frozenset[str]:
+        """What this driver can ask of its device; a quirk may add to what the profile says."""
+        return self.profile.command_list
+
+    @property
+    def connection(self) -> ByteConnection | CanConnection:
+        """The connection that this driver is attached to."""
+        if self._connection is None:
+            raise Bug("a driver without a connection was used", where=self.config.where)
+        return self._connection
+
+    @property
+    def tag_names(self) -> list[str]:
+        """The full names of all tags that this driver publishes."""
+        return [f"{self.config.name}.{t.name}" for t in self.profile.tags.values() if t.readable]
+
+    def attach(self, connection: ByteConnection | CanConnection) -> None:
+        """Init: from now on this connection; what waited to be sent over an earlier one stays queued."""
+        if connection.inbound.type not in self.wire_types:
+            raise FileInvalid(
+                f"device {self.config.name!r} cannot stand on this bus",
+                path=self.profile.path,
+                expected=" or ".join(sorted(t.value for t in self.wire_types)),
+                got=connection.inbound.type.value,
+            )
+        self._connection = connection
+
+    def check(self, command: COMMAND) -> None:
+        """Raise `UnknownCommand` unless `command` is in the command list."""
+        if command.name not in self.command_list:
+            raise UnknownCommand(
+                f"no command {command.name!r}", expected=", ".join(sorted(self.command_list)), where=self.config.where
+            )
+
+    async def send(self) -> None:
+        """Send: consume ; write. The consumer's queue must not be empty."""
+        await self._write(self.consumer.consume())
+
+    async def receive(self, what: str) -> None:
+        """Receive: read ; emit. `what` is a poll group, or whatever else the driver reads by name."""
+        for item in await self._read(what):
+            self.emitter.emit(item)
+
+    @abstractmethod
+    async def _write(self, item: DATA) -> None:
+        """Carry out what was consumed. Raises the errors of the wire or of the device."""
+
+    @abstractmethod
+    async def _read(self, what: str) -> list[DATA]:
+        """Read from the device, publish tag values, and return what occurred, in order."""

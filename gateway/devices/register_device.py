@@ -1,0 +1,232 @@
+"""Drivers of devices that are registers: poll groups in, single values out.
+
+A group is read in as few transactions as the profile's limits allow; a value or a message is never split over two (one
+transaction, one time stamp). Where a profile says that values are *samples*, they are as old as the sample and not as the
+poll: a sensor that answers and does not sample has no good values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from gateway.core.connection import PROTOCOL, ByteConnection
+from gateway.core.errors import Bug, NotAllowed, VerifyFailed, WrongDevice
+from gateway.core.profile import DeviceProfile, Message, RegisterRange, Tag
+from gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, TagValue
+from gateway.devices.codec import decode, encode
+from gateway.devices.config import DeviceConfig
+from gateway.devices.driver import DeviceDriver, TagSink
+from gateway.protocols.modbus.client import ModbusClient
+
+SAMPLED_STEPS = 0x80000000
+"""A sample counter that moved by more than this went backwards: the device restarted."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """One transaction of a poll group."""
+
+    range: RegisterRange
+    tags: tuple[Tag, ...]
+    messages: tuple[Message, ...]
+
+
+def plan_reads(profile: DeviceProfile, group: str) -> tuple[Read, ...]:
+    """The fewest transactions that read `group`, in address order: gaps up to `max_gap` are read over, none is longer
+    than `read_registers`, no value or message is split. Messages come along with the tag that announces them."""
+    limits = profile.form.limits
+    members: list[tuple[RegisterRange, Tag | Message]] = [(t.registers, t) for t in profile.group(group)]
+    members += [(m.at, m) for m in profile.messages.values() if profile.tags[m.when].poll == group]
+    members.sort(key=lambda m: (m[0].table, m[0].address, -m[0].count))
+    reads: list[tuple[RegisterRange, list[Tag | Message]]] = []
+    for at, member in members:
+        if reads:
+            last, items = reads[-1]
+            end = max(last.end, at.end)
+            fits = end - last.address <= limits.read_registers and at.address - last.end <= limits.max_gap
+            if last.table == at.table and fits:
+                reads[-1] = (replace(last, count=end - last.address), [*items, member])
+                continue
+        reads.append((at, [member]))
+    return tuple(
+        Read(at, tuple(i for i in items if isinstance(i, Tag)), tuple(i for i in items if isinstance(i, Message)))
+        for at, items in reads
+    )
+
+
+class RegisterDriver(DeviceDriver):
+    """A driver of a Modbus device, made from its profile."""
+
+    wire_types = frozenset({PROTOCOL.RS232, PROTOCOL.TCP})
+
+    def __init__(self, config: DeviceConfig, sink: TagSink) -> None:
+        super().__init__(config, sink)
+        self.plans = {group: plan_reads(self.profile, group) for group in self.profile.groups}
+        self.samples_missed = 0
+        self._client: ModbusClient | None = None
+        self._sample_count: int | None = None
+        self._sample_t_ns = 0
+        self._held: dict[str, TagValue] = {}
+
+    @property
+    def message_tag(self) -> str | None:
+        """The full name of the message that this driver emits, if any."""
+        return next((f"{self.config.name}.{name}" for name in self.profile.messages), None)
+
+    @property
+    def client(self) -> ModbusClient:
+        """The Modbus client of the bus that this device stands on."""
+        if self._client is None:
+            raise Bug("a driver without a client was used", where=self.config.where)
+        return self._client
+
+    def attach_client(self, connection: ByteConnection, client: ModbusClient) -> None:
+        """Use `client`, which talks over `connection`, from now on."""
+        self.attach(connection)
+        self._client = client
+
+    def command(self, tag_name: str, value: float) -> COMMAND:
+        """The command that writes `value` (engineering units) to a tag. Raises `NotAllowed` outside its limits."""
+        tag = self.profile.tags.get(tag_name)
+        if tag is None or not tag.writable:
+            raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
+        return COMMAND(encode(tag, value), self.profile.command_for(tag_name))
+
+    async def identify(self) -> None:
+        """Read the identity group and compare it with what the system file expects.
+
+        Raises `WrongDevice` on a difference; the runtime blocks writes then and says so.
+        """
+        if not self.config.expect:
+            return
+        values: dict[str, TagValue] = {}
+        for tag_name in self.config.expect:
+            tag = self.profile.tags[tag_name]
+            values[tag_name] = await self._read_tag(tag)
+        wrong = {n: v.value for n, v in values.items() if str(v.value) != self.config.expect[n]}
+        self.identity_error = ", ".join(f"{n} is {v!r}" for n, v in wrong.items())
+        if wrong:
+            expected = ", ".join(f"{n} {self.config.expect[n]!r}" for n in wrong)
+            raise WrongDevice(
+                "another device answers", expected=expected, got=self.identity_error, where=self.config.where
+            )
+
+    async def _read(self, what: str) -> list[DATA]:
+        occurred: list[DATA] = []
+        for read in self.plans[what]:
+            raw, t_ns = await self._transaction(read.range)
+            values = {t.name: decode(t, _slice(read.range, t.registers, raw), t_ns) for t in read.tags}
+            if self.profile.sampled is not None and what == self.profile.sampled.poll:
+                fresh = self._note_sample(values, t_ns)
+            else:
+                fresh = False
+            for name, value in values.items():
+                self._publish(name, value)
+            if fresh:
+                occurred += [MEASUREMENT(_slice(read.range, m.at, raw)) for m in read.messages]
+        return occurred
+
+    async def _transaction(self, at: RegisterRange) -> tuple[bytes, int]:
+        """Read a range; the bytes as on the wire (bits one a byte) and when the reply was complete."""
+        unit = self.config.address
+        if at.table == "coil" or at.table == "discrete":
+            bits = await self.client.read_bits(unit, at.table, at.address, at.count)
+            return bytes(bits.bits), bits.t_ns
+        reply = await self.client.read_registers(unit, at.table, at.address, at.count)
+        return reply.raw, reply.t_ns
+
+    async def _read_tag(self, tag: Tag) -> TagValue:
+        raw, t_ns = await self._transaction(tag.registers)
+        value = decode(tag, raw, t_ns)
+        self._publish(tag.name, value)
+        return value
+
+    def _publish(self, name: str, value: TagValue) -> None:
+        self._held[name] = value
+        self.sink.put(f"{self.config.name}.{name}", value)
+
+    # -- samples ----------------------------------------------------------------------------------------------------
+
+    def _note_sample(self, values: dict[str, TagValue], t_ns: int) -> bool:
+        """Tell a new sample from an old one, and give every value of the group its age. True for a new sample.
+
+        The first count seen is only a base line: how old that sample is, nobody knows.
+        """
+        sampled = self.profile.sampled
+        assert sampled is not None
+        count = values[sampled.count].value
+        assert isinstance(count, int)
+        before, self._sample_count = self._sample_count, count
+        fresh = before is not None and count != before and count != 0
+        if fresh:
+            assert before is not None
+            step = (count - before) & 0xFFFFFFFF
+            self.samples_missed += step - 1 if step < SAMPLED_STEPS else 0
+            self._sample_t_ns = t_ns
+        reason = self._sample_reason(count, t_ns)
+        for name, value in values.items():
+            if name == sampled.count or value.quality is Quality.BAD:
+                continue
+            if reason is Reason.NEVER_READ:
+                values[name] = TagValue(None, Quality.BAD, reason, 0, value.raw)
+            else:
+                quality = Quality.GOOD if reason is Reason.NONE else Quality.UNCERTAIN
+                values[name] = replace(value, quality=quality, reason=reason, t_ns=self._sample_t_ns)
+        return fresh
+
+    def _sample_reason(self, count: int, now_ns: int) -> Reason:
+        """Why the group's values are not good, or NONE."""
+        sampled = self.profile.sampled
+        assert sampled is not None
+        if count == 0:
+            return Reason.NEVER_READ
+        period = self._held.get(sampled.period)
+        period_s = period.value if period is not None and isinstance(period.value, int) else 0
+        if not self._sample_t_ns or period_s <= 0:
+            return Reason.NOT_SAMPLING
+        limit_ns = period_s * 1_000_000_000 + sampled.slack_ms * 1_000_000
+        return Reason.NONE if now_ns - self._sample_t_ns <= limit_ns else Reason.NOT_SAMPLING
+
+    # -- writing ------------------------------------------------------------------------------------------------------
+
+    async def _write(self, item: DATA) -> None:
+        """Write a command's tag with one request and read it back: what is published is what the device holds."""
+        if not isinstance(item, COMMAND):
+            raise Bug("a register device takes commands only", got=type(item).__name__, where=self.config.where)
+        self.check(item)
+        tag = self._tag_of(item)
+        at = tag.registers
+        functions = self.profile.form.limits.functions
+        if at.table == "coil":
+            await self.client.write_coil(self.config.address, at.address, bool(int.from_bytes(item.data)))
+        elif at.count == 1 and functions is not None and 16 not in functions:
+            await self.client.write_register(self.config.address, at.address, int.from_bytes(item.data))
+        else:
+            words = [int.from_bytes(item.data[i : i + 2]) for i in range(0, len(item.data), 2)]
+            await self.client.write_registers(self.config.address, at.address, words)
+        if tag.readable:
+            held = await self._read_tag(tag)
+            if held.raw != item.data:
+                raise VerifyFailed(
+                    f"{item.name}: acknowledged, and not held",
+                    expected=item.data.hex(),
+                    got=held.raw.hex(),
+                    where=f"{self.config.where} {at}",
+                )
+
+    def _tag_of(self, command: COMMAND) -> Tag:
+        name = self.profile.form.commands.get(command.name, command.name.removeprefix("set_"))
+        return self.profile.tags[name]
+
+
+class SensorDriver(RegisterDriver):
+    """SPEC row SensorDriver: a register device on RS232."""
+
+    wire_types = frozenset({PROTOCOL.RS232})
+
+
+def _slice(read: RegisterRange, at: RegisterRange, raw: bytes) -> bytes:
+    """The bytes of `at` out of what `read` brought."""
+    width = 1 if read.table in ("coil", "discrete") else 2
+    start = (at.address - read.address) * width
+    return raw[start : start + at.count * width]

@@ -1,0 +1,139 @@
+"""SPEC row TransmitterDriver: a pure relay between two mailboxes and two queues (SPEC ruling 17).
+
+A mailbox holds one message: sequence, length, payload, in holding registers written in one request; the sequence that
+the taker acknowledges stands elsewhere. 0 is empty; sequences run 1 to 65535 and round to 1. A message whose sequence equals
+the acknowledged one was taken already: duplicates are discarded, and the same command sent twice is two commands.
+
+The plant's end and the far end are this same class: there, what comes in are COMMANDs and what goes out are RESPONSEs;
+here, the other way round. Payloads are never looked into.
+"""
+
+from __future__ import annotations
+
+from gateway.core.connection import PROTOCOL
+from gateway.core.errors import Desync, FileInvalid, NotAllowed
+from gateway.core.profile import Box
+from gateway.core.values import COMMAND, DATA
+from gateway.devices.config import DeviceConfig
+from gateway.devices.driver import TagSink
+from gateway.devices.register_device import RegisterDriver
+
+LAST_SEQUENCE = 0xFFFF
+
+
+def next_sequence(sequence: int) -> int:
+    """The sequence after `sequence`: 0 is never used, it means an empty mailbox."""
+    return 1 if sequence >= LAST_SEQUENCE else sequence + 1
+
+
+class TransmitterDriver(RegisterDriver):
+    """A driver of a transmitter on TCP.
+
+    `receive("inbox")` reads the inbox and emits a message that was not taken before; `acknowledge()` frees it.
+    `send()` writes the next queued message; it may be called when `outbox_free`, which `check_outbox()` brings up to date.
+    """
+
+    wire_types = frozenset({PROTOCOL.TCP})
+
+    def __init__(self, config: DeviceConfig, sink: TagSink, incoming: type[DATA] = COMMAND) -> None:
+        super().__init__(config, sink)
+        if self.profile.inbox is None or self.profile.outbox is None:
+            raise FileInvalid("a transmitter's profile needs its mailbox", path=self.profile.path)
+        self._inbox: Box = self.profile.inbox
+        self._outbox: Box = self.profile.outbox
+        self._incoming = incoming
+        self._synchronised = False
+        self._seen = 0
+        self._sent = 0
+        self.to_acknowledge = 0
+        """Sequence of the message that was emitted and not acknowledged yet; 0 when there is none."""
+        self.outbox_free = False
+        self.received = self.sent = self.taken = self.mailbox_waits = 0
+
+    @property
+    def message_tag(self) -> str:
+        return f"{self.config.name}.inbox"
+
+    @property
+    def outbox_tag(self) -> str:
+        """The name under which the control logic sends through this transmitter."""
+        return f"{self.config.name}.outbox"
+
+    async def synchronise(self) -> None:
+        """After (re)connecting: learn from the device what was taken on either side, so that nothing is done twice."""
+        _, inbox_ack = await self._words(self._inbox)
+        self._sent, outbox_ack = await self._words(self._outbox)
+        self._seen = inbox_ack
+        self.to_acknowledge = 0
+        self.outbox_free = self._sent == outbox_ack
+        self._synchronised = True
+
+    async def _words(self, box: Box) -> tuple[int, int]:
+        """Sequence and acknowledged sequence of a mailbox."""
+        unit = self.config.address
+        head = await self.client.read_registers(unit, "holding", box.at.address, 1)
+        ack = await self.client.read_registers(unit, "holding", box.ack.address, 1)
+        return head.registers[0], ack.registers[0]
+
+    async def _read(self, what: str) -> list[DATA]:
+        if what != "inbox":
+            return await super()._read(what)
+        box = self._inbox
+        reply = await self.client.read_registers(self.config.address, "holding", box.at.address, box.at.count)
+        sequence, length = reply.registers[0], reply.registers[1]
+        if sequence in (0, self._seen):
+            return []
+        if not 0 < length <= box.bytes:
+            raise Desync(
+                "an inbox message with an impossible length",
+                expected=f"1 to {box.bytes} bytes",
+                got=str(length),
+                where=f"{self.config.where} {box.at}",
+            )
+        self._seen = self.to_acknowledge = sequence
+        self.received += 1
+        return [self._incoming(reply.raw[4 : 4 + length])]
+
+    async def acknowledge(self) -> None:
+        """Tell the transmitter that the emitted message was taken; its mailbox is free for the next one."""
+        if self.to_acknowledge:
+            await self.client.write_registers(self.config.address, self._inbox.ack.address, [self.to_acknowledge])
+            self.to_acknowledge = 0
+
+    async def check_outbox(self) -> bool:
+        """Ask whether the transmitter took the last message. A mailbox still full is a wait, and counted."""
+        reply = await self.client.read_registers(self.config.address, "holding", self._outbox.ack.address, 1)
+        free = reply.registers[0] == self._sent
+        self.taken += free and not self.outbox_free
+        self.mailbox_waits += not free
+        self.outbox_free = free
+        return free
+
+    async def send(self) -> None:
+        """Send: consume ; write. A message whose write failed stays first in the queue, under the same sequence."""
+        item = self.consumer.consume()
+        try:
+            await self._write(item)
+        except NotAllowed:
+            raise
+        except BaseException:
+            self.consumer.put_back(item)
+            raise
+
+    async def _write(self, item: DATA) -> None:
+        box = self._outbox
+        if not 0 < len(item.data) <= box.bytes:
+            raise NotAllowed(
+                "a message does not fit the outbox",
+                expected=f"1 to {box.bytes} bytes",
+                got=f"{len(item.data)} bytes",
+                where=self.config.where,
+            )
+        sequence = next_sequence(self._sent)
+        padded = item.data + b"\0" * (len(item.data) % 2)
+        words = [sequence, len(item.data)]
+        words += [int.from_bytes(padded[i : i + 2]) for i in range(0, len(padded), 2)]
+        await self.client.write_registers(self.config.address, box.at.address, words)
+        self._sent = sequence
+        self.outbox_free = False
+        self.sent += 1

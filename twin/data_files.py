@@ -1,0 +1,61 @@
+"""Where shipped data lies: the wheel's copy, then the checkout (DESIGN.md decision 14).
+
+The user's search order for profiles and systems: what a flag says, FIELDTWIN_PROFILES, ./profiles, shipped.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from gateway.core.errors import UsageError
+
+_HERE = Path(__file__).resolve().parent.parent
+"""site-packages where a wheel is installed, the checkout otherwise."""
+
+
+def data_root(base: Path = _HERE) -> Path:
+    """The folder that holds `profiles` and `recordings`."""
+    for candidate in (base / "fieldtwin" / "_data", base):
+        if (candidate / "profiles").is_dir() and (candidate / "recordings").is_dir():
+            return candidate
+    raise UsageError("the shipped profiles are missing", where=str(base), hint="reinstall fieldtwin")
+
+
+def search_path(extra: Iterable[Path] = ()) -> list[Path]:
+    """Folders that may hold `devices`, `systems` and `recordings`, best first."""
+    folders = [Path(p) for p in extra]
+    folders += [Path(p) for p in os.environ.get("FIELDTWIN_PROFILES", "").split(os.pathsep) if p]
+    folders += [Path("profiles"), data_root() / "profiles"]
+    return [f for f in folders if f.is_dir()]
+
+
+def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path] = ()) -> Path:
+    """The file that `name` means: a path, or a bare name in the search path (`kind` is ``systems`` or ``devices``).
+
+    `beside` is the file that names it: a relative path is tried there first. Raises `UsageError` listing what there is.
+    """
+    direct = Path(name)
+    for candidate in ([beside.parent / direct] if beside else []) + [direct]:
+        if candidate.is_file():
+            return candidate
+    folders = search_path(extra)
+    if direct.name == name:
+        for folder in folders:
+            for sub in (folder / kind, folder):
+                for candidate in (sub / f"{name}.yaml", sub / name):
+                    if candidate.is_file():
+                        return candidate
+    known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if ".prototype" not in p.name})
+    raise UsageError(f"no {kind[:-1]} {name!r}", expected="a file, or one of " + ", ".join(known))
+
+
+def find_recording(name: str, beside: Path | None = None) -> Path:
+    """A recording by path, beside the file that names it, in ./recordings or shipped."""
+    folders = [beside.parent] if beside else []
+    folders += [Path(), Path("recordings"), data_root() / "recordings"]
+    for folder in folders:
+        if (folder / name).is_file():
+            return folder / name
+    raise UsageError(f"no recording {name!r}", expected="a file; looked in " + ", ".join(str(f) for f in folders))

@@ -1,0 +1,150 @@
+"""What a system file and a prototype file may say: the pydantic models of their YAML form.
+
+The plant reads `SystemForm` only. `PrototypeForm` is another file, which the plant never opens (SPEC part 2, row 2).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Name = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
+Milliseconds = Annotated[int, Field(ge=1, le=3_600_000)]
+TagName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*\.[a-zA-Z][a-zA-Z0-9_]*$")]
+
+
+class Strict(BaseModel):
+    """Unknown keys are refused; values are not coerced."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class BusForm(Strict):
+    """A bus or line and the endpoint at which the plant has it."""
+
+    url: str
+    timeout_ms: Milliseconds = 1000
+    retries: int = Field(default=1, ge=0, le=10)
+    bitrate: int = Field(default=125_000, ge=10_000, le=1_000_000, description="CAN only; checked, not set")
+
+
+class PollForm(Strict):
+    """How often a poll group is read."""
+
+    every_ms: Milliseconds
+
+
+class HeartbeatForm(Strict):
+    """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in us)."""
+
+    producer_ms: Milliseconds
+    consumer_ms: Milliseconds
+
+
+class TpdoForm(Strict):
+    """What a TPDO of the node carries and how often."""
+
+    map: list[Name] = Field(min_length=1, max_length=8)
+    event_ms: Milliseconds
+
+
+class DeviceForm(Strict):
+    """A device of the system."""
+
+    profile: str
+    bus: Name
+    unit: int | None = Field(default=None, ge=1, le=255)
+    node: int | None = Field(default=None, ge=1, le=127)
+    expect: dict[Name, str] = {}
+    poll: dict[Name, PollForm] = {}
+    stale_after_ms: Milliseconds = 5000
+    writable: list[Name] = []
+    safe: dict[Name, int | float] = {}
+    heartbeat: HeartbeatForm | None = None
+    tpdo1: TpdoForm | None = None
+    start: bool = False
+
+
+class WatchdogForm(Strict):
+    """When a scan counts as late, and after how many overruns in a row the PLC stops."""
+
+    late_ms: Milliseconds = 5
+    stop_after: int = Field(default=3, ge=1, le=1000)
+
+
+class InputForm(Strict):
+    """Where a program's input comes from and what it sees while that is bad."""
+
+    tag: TagName
+    if_bad: Literal["hold", "pass"] | float = "pass"
+
+
+class ProgramForm(Strict):
+    """A program of the PLC: its source and how its variables are bound to tags."""
+
+    source: str
+    inputs: dict[Name, InputForm] = {}
+    outputs: dict[Name, TagName] = {}
+
+
+class PlcForm(Strict):
+    """The soft PLC."""
+
+    cycle_ms: Milliseconds = 10
+    watchdog: WatchdogForm = WatchdogForm()
+    programs: dict[Name, ProgramForm] = Field(min_length=1)
+
+
+class SystemForm(Strict):
+    """A plant: read by the physical twin and by its prototype, byte for byte the same."""
+
+    fieldtwin: Literal[1]
+    system: Name
+    buses: dict[Name, BusForm] = Field(min_length=1)
+    devices: dict[Name, DeviceForm] = Field(min_length=1)
+    plc: PlcForm
+    remote: Literal["local", "remote"] = "local"
+
+
+class BusMappingForm(Strict):
+    """Where the emulators of a plant's bus listen."""
+
+    listen: str
+    pace: bool = True
+
+
+class FarLinkForm(Strict):
+    """The link between the two modems."""
+
+    bytes_per_s: float = Field(default=80.0, gt=0)
+    latency_ms: int = Field(default=900, ge=0, le=600_000)
+    loss: float = Field(default=0.0, ge=0.0, lt=1.0)
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class EmulatedForm(Strict):
+    """What stands in for a device: a recording (time-keyed signals), or a model."""
+
+    recording: str | None = None
+    model: Literal["mailbox"] | None = None
+    profile: str | None = Field(default=None, description="the emulated device's own profile, where it differs")
+    speed: float = Field(default=1.0, gt=0, le=10_000)
+    at_end: Literal["hold", "loop", "error"] = "hold"
+    latency_ms: float = Field(default=0.0, ge=0, le=60_000)
+    identity: dict[Name, str] = {}
+    far: str | None = Field(default=None, description="where the far modem listens")
+    far_link: FarLinkForm = FarLinkForm()
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class PrototypeForm(Strict):
+    """What is emulated, with what, and where. The plant never opens this file."""
+
+    prototype_of: str
+    unmapped: Literal["refuse"] = "refuse"
+    seed: int = 1
+    buses: dict[Name, BusMappingForm | Literal["plant"]]
+    devices: dict[Name, EmulatedForm]

@@ -1,0 +1,244 @@
+"""The process image: any values round trip, messages in order exactly once, two layouts never meet."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.core.errors import Bug, FileInvalid
+from gateway.core.image import (
+    INPUTS,
+    OUTPUTS,
+    Image,
+    ImageLayout,
+    Message,
+    NotEncodable,
+    RegionFlag,
+    RegionLayout,
+    TagKind,
+    TagSpec,
+    consumed_name,
+    message_tag,
+    process_image,
+    taken_name,
+)
+from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
+
+I64 = st.integers(-(2**63), 2**63 - 1)
+BY_KIND: dict[TagKind, st.SearchStrategy[Scalar]] = {
+    TagKind.REAL: st.floats(allow_nan=False),
+    TagKind.INT: I64,
+    TagKind.BOOL: st.booleans(),
+}
+
+
+def one_region(*tags: TagSpec) -> tuple[Image, ImageLayout]:
+    layout = ImageLayout((RegionLayout("r", tags),))
+    memory = memoryview(bytearray(layout.size))
+    layout.format(memory)
+    return layout.attach(memory), layout
+
+
+def good(value: Scalar | None, t_ns: int = 0) -> TagValue:
+    return TagValue(value, Quality.GOOD, t_ns=t_ns)
+
+
+@st.composite
+def publications(draw: st.DrawFn) -> tuple[list[TagKind], list[list[TagValue]]]:
+    kinds = draw(st.lists(st.sampled_from(list(BY_KIND)), max_size=12))
+    rows = []
+    for _ in range(draw(st.integers(1, 6))):
+        rows.append(
+            [
+                TagValue(
+                    draw(st.none() | BY_KIND[kind]),
+                    draw(st.sampled_from(Quality)),
+                    draw(st.sampled_from(Reason)),
+                    draw(I64),
+                )
+                for kind in kinds
+            ]
+        )
+    return kinds, rows
+
+
+@given(publications(), I64)
+def test_any_values_round_trip(published: tuple[list[TagKind], list[list[TagValue]]], now_ns: int) -> None:
+    kinds, rows = published
+    image, _ = one_region(*(TagSpec(f"t{i}", kind) for i, kind in enumerate(kinds)))
+    writer, reader = image.writer("r"), image.reader("r")
+    for n, row in enumerate(rows, 1):
+        assert writer.publish(row, now_ns) == n
+        snapshot = reader.snapshot()
+        assert (snapshot.counter, snapshot.t_ns) == (n, now_ns)
+        for i, sent in enumerate(row):
+            got = snapshot.value(f"t{i}")
+            assert got == sent
+            assert type(got.value) is type(sent.value)
+    assert reader.retries == 0
+
+
+@given(st.integers(1, 5), st.lists(st.tuples(st.lists(st.binary(max_size=20), max_size=5), st.booleans()), max_size=30))
+def test_messages_in_order_exactly_once_and_the_missed_counted(
+    depth: int, steps: list[tuple[list[bytes], bool]]
+) -> None:
+    image, _ = one_region(message_tag("m", 20, depth))
+    writer, reader = image.writer("r"), image.reader("r")
+    waiting: list[bytes] = []
+    sent = missed = 0
+    for new, look in [*steps, ([], True)]:
+        batch = new[:depth]
+        writer.publish([good(0)], 1, {"m": [(sent, data) for data in batch]})
+        sent += len(batch)
+        waiting += batch
+        if look:
+            missed += max(0, len(waiting) - depth)
+            got = reader.snapshot().messages.get("m", ())
+            assert [m.data for m in got] == waiting[-depth:]
+            assert [m.seq for m in got] == list(range(sent - len(got) + 1, sent + 1))
+            assert reader.missed["m"] == missed
+            assert reader.snapshot().messages == {}
+            waiting.clear()
+
+
+def test_a_message_tag_has_quality_and_its_last_sequence_as_value() -> None:
+    image, _ = one_region(message_tag("m", 8, 2), TagSpec("x", TagKind.INT))
+    writer, reader = image.writer("r"), image.reader("r")
+    writer.publish([TagValue(None, Quality.BAD, Reason.TIMEOUT, 5), good(1)], 9, {"m": [(7, b"a"), (8, b"")]})
+    snapshot = reader.snapshot()
+    assert snapshot.value("m") == TagValue(2, Quality.BAD, Reason.TIMEOUT, 5)
+    assert snapshot.messages == {"m": (Message(1, 7, b"a"), Message(2, 8, b""))}
+
+
+def test_before_the_first_publication_everything_was_never_read() -> None:
+    image, _ = one_region(TagSpec("x", TagKind.REAL))
+    snapshot = image.reader("r").snapshot()
+    assert snapshot.counter == 0
+    assert snapshot.value("x") == NEVER
+    assert math.isinf(snapshot.age_ns(10))
+
+
+def test_a_restarted_writer_goes_on_where_the_dead_one_stopped_mid_write() -> None:
+    image, _ = one_region(message_tag("m", 4, 2), TagSpec("x", TagKind.INT))
+    writer, reader = image.writer("r"), image.reader("r")
+    for n in range(1, 4):
+        writer.publish([good(0), good(n)], n, {"m": [(n, bytes([n]))]})
+    # killed while it filled the next slot and had already written the next two messages
+    writer._memory[writer.shape.slot_offset(4) :][:20] = b"\xff" * 20
+    writer._write_messages({"m": [(9, b"lost"), (9, b"lost")]})
+    snapshot = reader.snapshot()
+    assert (snapshot.counter, snapshot.value("x").value) == (3, 3)
+    assert [m.data for m in snapshot.messages["m"]] == [b"\2", b"\3"]  # depth 2: both still whole
+    again = image.writer("r")
+    assert again.publish([good(0), good(4)], 4, {"m": [(4, b"new")]}) == 4
+    assert reader.snapshot().messages["m"] == (Message(4, 4, b"new"),)
+    assert reader.retries == 0
+
+
+def test_a_slot_that_is_never_whole_gives_the_last_snapshot_counted() -> None:
+    image, _ = one_region(TagSpec("x", TagKind.INT))
+    writer, reader = image.writer("r"), image.reader("r")
+    writer.publish([good(1)], 1)
+    assert reader.snapshot().value("x").value == 1
+    writer.publish([good(2)], 2)
+    writer._memory[writer.shape.slot_offset(2) + 30] ^= 1
+    assert reader.snapshot().value("x").value == 1
+    assert reader.gave_up == 1
+    with pytest.raises(FileInvalid, match="damaged"):
+        image.writer("r")
+
+
+def test_a_restarted_reader_resumes_after_what_it_dealt_with() -> None:
+    image, _ = one_region(message_tag("m", 4, 8))
+    writer = image.writer("r")
+    writer.publish([good(0)], 1, {"m": [(0, b"a"), (0, b"b"), (0, b"c")]})
+    reader = image.reader("r")
+    reader.resume("m", 2)
+    assert [m.data for m in reader.snapshot().messages["m"]] == [b"c"]
+    assert reader.missed["m"] == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [(TagKind.INT, 2**63), (TagKind.INT, 1.5), (TagKind.REAL, "1"), (TagKind.BOOL, b"x"), (TagKind.REAL, 10**400)],
+)
+def test_a_value_that_does_not_fit_names_its_tag_and_publishes_nothing(kind: TagKind, value: Scalar) -> None:
+    image, _ = one_region(TagSpec("a", TagKind.INT), TagSpec("b", kind), message_tag("m", 4, 2))
+    writer, reader = image.writer("r"), image.reader("r")
+    with pytest.raises(NotEncodable) as caught:
+        writer.publish([good(1), good(value), good(0)], 1, {"m": [(0, b"x")]})
+    assert caught.value.tag == "b"
+    assert reader.snapshot().counter == 0
+    assert writer.last_sequence("m") == 0
+
+
+def test_messages_that_do_not_fit_are_refused() -> None:
+    image, _ = one_region(message_tag("m", 4, 2), TagSpec("x", TagKind.INT))
+    writer = image.writer("r")
+    for messages in ({"m": [(0, b"12345")]}, {"m": [(0, b"")] * 3}, {"x": [(0, b"")]}):
+        with pytest.raises(NotEncodable):
+            writer.publish([good(0), good(0)], 1, messages)
+    with pytest.raises(Bug, match="one value a tag"):
+        writer.publish([good(0)], 1)
+    assert writer.counter == 0
+
+
+def test_another_layout_or_no_image_is_refused() -> None:
+    layout = process_image([TagSpec("ctd.pressure", TagKind.REAL, "dbar")], [TagSpec("ctd.period_s", TagKind.INT)])
+    other = process_image([TagSpec("ctd.pressure", TagKind.REAL, "bar")], [TagSpec("ctd.period_s", TagKind.INT)])
+    memory = memoryview(bytearray(layout.size))
+    with pytest.raises(FileInvalid, match="not a process image"):
+        layout.attach(memory)
+    layout.format(memory)
+    with pytest.raises(FileInvalid, match="another layout"):
+        other.attach(memory)
+    with pytest.raises(FileInvalid, match="too small"):
+        layout.attach(memory[:-1])
+    with layout.attach(memory) as image, pytest.raises(FileInvalid, match="no region"):
+        image.reader("retain")
+
+
+def test_descriptions_survive_json_and_impossible_ones_are_refused() -> None:
+    layout = process_image([message_tag("modem.inbox", 250, 16)], [message_tag("modem.outbox", 250, 8)])
+    assert ImageLayout.from_description(layout.describe()) == layout
+    assert [t.name for t in layout.regions[0].tags] == ["modem.inbox", taken_name("modem.outbox")]
+    assert [t.name for t in layout.regions[1].tags] == ["modem.outbox", consumed_name("modem.inbox")]
+    assert [r.name for r in layout.regions] == [INPUTS, OUTPUTS]
+    for bad in ({}, {"regions": [{}]}, {"regions": [{"name": "r", "tags": [{"name": "x", "kind": "REEL"}]}]}):
+        with pytest.raises(FileInvalid):
+            ImageLayout.from_description(bad)
+    with pytest.raises(FileInvalid, match="twice"):
+        RegionLayout("r", (TagSpec("x", TagKind.INT), TagSpec("x", TagKind.REAL)))
+    with pytest.raises(FileInvalid, match="impossible size"):
+        message_tag("m", 0, 1)
+
+
+def test_flags_and_columns() -> None:
+    image, _ = one_region(TagSpec("x", TagKind.REAL), TagSpec("y", TagKind.INT), message_tag("m", 4, 1))
+    writer, reader = image.writer("r"), image.reader("r")
+    writer.publish_columns([1.0, None, None], Quality.BAD, Reason.STALE, 5, {"m": [(5, b"z")]}, RegionFlag.STOPPED)
+    snapshot = reader.snapshot()
+    assert snapshot.stopped
+    assert snapshot.value("x") == TagValue(1.0, Quality.BAD, Reason.STALE, 5)
+    assert snapshot.value("y") == TagValue(None, Quality.BAD, Reason.NEVER_READ, 5)
+    assert snapshot.value("m").value == 1
+    assert snapshot.age_ns(7) == 2
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 3), st.integers(1, 9))
+def test_released_memory_can_be_closed(readers: int, count: int) -> None:
+    layout = ImageLayout((RegionLayout("r", tuple(TagSpec(f"t{i}", TagKind.INT) for i in range(count))),))
+    backing = bytearray(layout.size)
+    memory = memoryview(backing)
+    layout.format(memory)
+    image = layout.attach(memory)
+    image.writer("r").publish([good(1)] * count, 1)
+    for _ in range(readers):
+        image.reader("r").snapshot()
+    image.release()
+    memory.release()
+    backing.append(0)  # BufferError while any view is left

@@ -1,0 +1,99 @@
+"""Two processes on one image: a writer at full speed, killed at an arbitrary instant. Never a torn value."""
+
+from __future__ import annotations
+
+import json
+import mmap
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from gateway.core.image import ImageLayout, RegionLayout, RegionReader, TagKind, TagSpec, message_tag
+
+TAGS = 300
+DEPTH = 512
+
+# Every publication is n in all tags and one message n: any mixture of two publications shows.
+WRITER = """
+import json, mmap, sys
+from gateway.core.image import ImageLayout
+from gateway.core.values import Quality, Reason
+layout = ImageLayout.from_description(json.loads(sys.argv[2]))
+with open(sys.argv[1], "r+b") as f:
+    memory = memoryview(mmap.mmap(f.fileno(), 0))
+writer = layout.attach(memory).writer("r")
+n = writer.counter
+assert writer.last_sequence("m") == n
+print("running", flush=True)
+while True:
+    n += 1
+    values = [0] + [n, float(n), n % 2 == 0] * TAGS
+    writer.publish_columns(values, Quality.GOOD, Reason.NONE, n, {"m": [(n, str(n).encode())]})
+"""
+
+
+@pytest.mark.slow
+def test_a_writer_at_full_speed_killed_again_and_again_never_tears_a_value(tmp_path: Path) -> None:
+    kinds = [TagKind.INT, TagKind.REAL, TagKind.BOOL]
+    tags = (message_tag("m", 20, DEPTH), *(TagSpec(f"t{i}", kinds[i % 3]) for i in range(3 * TAGS)))
+    layout = ImageLayout((RegionLayout("r", tags),))
+    path = tmp_path / "image"
+    path.write_bytes(bytes(layout.size))
+    with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapped:
+        memory = memoryview(mapped)
+        layout.format(memory)
+        image = layout.attach(memory)
+        reader = image.reader("r")
+        looks = seen = 0
+        for _ in range(4):
+            child = _start_writer(path, layout)
+            try:
+                deadline = time.monotonic() + 0.3
+                while time.monotonic() < deadline:
+                    seen, looks = _look(reader, seen), looks + 1
+            finally:
+                child.kill()
+                child.wait()
+                assert child.stdout is not None
+                child.stdout.close()
+            seen = _look(reader, seen)  # whole right after the kill, too
+        assert seen > 1000
+        assert looks > 1000
+        assert reader.gave_up == 0
+        image.release()
+        memory.release()
+
+
+def _start_writer(path: Path, layout: ImageLayout) -> subprocess.Popen[str]:
+    code = WRITER.replace("TAGS", str(TAGS))
+    child = subprocess.Popen(
+        [sys.executable, "-c", code, str(path), json.dumps(layout.describe())], stdout=subprocess.PIPE, text=True
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "running\n"
+    return child
+
+
+def _look(reader: RegionReader, seen: int) -> int:
+    """One snapshot: all of one publication, messages without a gap that was not counted. Returns the last sequence."""
+    missed_before = reader.missed["m"]
+    snapshot = reader.snapshot()
+    n = snapshot.counter
+    if n == 0:  # the writer is up and has not published yet
+        return 0
+    assert snapshot.t_ns == n
+    assert snapshot.values == (n, *[n, float(n), n % 2 == 0] * TAGS)
+    messages = snapshot.messages.get("m", ())
+    assert [m.data for m in messages] == [str(m.seq).encode() for m in messages]
+    sequences = [m.seq for m in messages]
+    assert sequences == sorted(set(sequences))
+    if messages:
+        assert sequences[0] > seen
+        assert sequences[-1] == n
+        assert len(messages) + reader.missed["m"] - missed_before == n - seen
+        return n
+    assert n == seen
+    return seen

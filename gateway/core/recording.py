@@ -272,7 +272,10 @@ class RecordingWriter:
 
     def sync(self) -> None:
         """Have what was written survive a power cut too."""
-        os.fsync(self._fd)
+        try:
+            os.fsync(self._fd)
+        except OSError as error:
+            raise FileInvalid(f"cannot write on: {error.strerror}", path=str(self.path)) from error
 
     def close(self) -> None:
         """Close the file; closing twice does nothing."""

@@ -1,0 +1,169 @@
+"""Time-keyed signals: a recorded cast or trajectory, read at the emulator's clock.
+
+A `SignalTrack` is the recording in memory (arrays of doubles: 65,158 rows of three signals take 2 MB); a `SignalPlayer`
+plays it from a start time, at a speed, and knows what comes after the end. Both are pure: time is passed in, and nothing
+here knows which register or object a signal ends up in.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from bisect import bisect_right
+from collections.abc import Iterable
+from enum import Enum
+from pathlib import Path
+
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.recording import RecordingReader, SignalRow
+
+MAX_NUMBERS = 16_000_000
+"""Times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. More is refused, not swapped."""
+
+
+class WhenUsedUp(Enum):
+    """What an emulator does when its recording has nothing left (SPEC ruling 3); named in the prototype file."""
+
+    HOLD = "hold"
+    LOOP = "loop"
+    ERROR = "error"
+
+    @classmethod
+    def parse(cls, text: str) -> WhenUsedUp:
+        """The policy of that name; raises `UsageError`."""
+        try:
+            return cls(text)
+        except ValueError:
+            expected = ", ".join(policy.value for policy in cls)
+            raise UsageError("unknown policy for the end of a recording", expected=expected, got=repr(text)) from None
+
+
+class UsedUp(FileInvalid):
+    """The recording has nothing left, and the prototype file says that this is an error."""
+
+
+class SignalTrack:
+    """Signals over time, linear between rows. Seconds count from the recording's start.
+
+    NaN is "no value": between a row and a NaN there is none either. Two rows of the same time are a step.
+    """
+
+    def __init__(self, names: Iterable[str], rows: Iterable[SignalRow], *, units: Iterable[str] = (), path: str = ""):
+        self.names = tuple(names)
+        self.units = tuple(units) or ("",) * len(self.names)
+        self.path = path
+        self._index = {name: i for i, name in enumerate(self.names)}
+        self._times = array("d")
+        self._columns = tuple(array("d") for _ in self.names)
+        width = len(self.names) + 1
+        for row in rows:
+            if (len(self._times) + 1) * width > MAX_NUMBERS:
+                raise FileInvalid(
+                    "the recording is too long to be played", path=path, expected=f"{MAX_NUMBERS} numbers"
+                )
+            self._times.append(row.t_s)
+            for column, value in zip(self._columns, row.values, strict=True):
+                column.append(value)
+        if not self._times:
+            raise FileInvalid("the recording holds no rows", path=path, expected="at least one")
+
+    @classmethod
+    def load(cls, path: Path) -> SignalTrack:
+        """Read a recording of signals; raises `FileInvalid`. A cut-off last line is left out."""
+        with RecordingReader(path) as reader:
+            signals = reader.header.signals
+            units = [info.unit for info in signals.values()]
+            return cls(signals, reader.rows(), units=units, path=str(path))
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    @property
+    def first_s(self) -> float:
+        """Time of the first row."""
+        return self._times[0]
+
+    @property
+    def last_s(self) -> float:
+        """Time of the last row."""
+        return self._times[-1]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the numbers take."""
+        return sum(numbers.buffer_info()[1] * numbers.itemsize for numbers in (self._times, *self._columns))
+
+    def at(self, t_s: float, name: str) -> float:
+        """The signal `name` at `t_s`; before the first row that row's value, after the last one that one's."""
+        return self._interpolate(self._columns[self._column(name)], *self._locate(t_s))
+
+    def values(self, t_s: float) -> dict[str, float]:
+        """All signals at `t_s`, of one and the same instant."""
+        place = self._locate(t_s)
+        return {name: self._interpolate(column, *place) for name, column in zip(self.names, self._columns, strict=True)}
+
+    def _column(self, name: str) -> int:
+        try:
+            return self._index[name]
+        except KeyError:
+            raise FileInvalid(
+                "the recording has no such signal", path=self.path, expected=", ".join(self.names), got=name
+            ) from None
+
+    def _locate(self, t_s: float) -> tuple[int, float]:
+        """The row at or before `t_s`, and how far `t_s` is on its way to the next one, 0 to less than 1."""
+        after = bisect_right(self._times, t_s)
+        if after == 0:
+            return 0, 0.0
+        if after == len(self._times):
+            return after - 1, 0.0
+        t0, t1 = self._times[after - 1], self._times[after]
+        return after - 1, (t_s - t0) / (t1 - t0)
+
+    @staticmethod
+    def _interpolate(column: array[float], row: int, fraction: float) -> float:
+        here = column[row]
+        return here if fraction == 0.0 else here + (column[row + 1] - here) * fraction
+
+
+class SignalPlayer:
+    """A track played from `start_ns` on, `speed` times as fast as recorded. Reading never changes it.
+
+    After the last row: `HOLD` stays on it; `LOOP` goes on from the first row, the two being the same instant (a recording
+    meant for looping ends on the values with which it begins); `ERROR` raises `UsedUp`.
+    """
+
+    def __init__(
+        self, track: SignalTrack, start_ns: int, *, speed: float = 1.0, at_end: WhenUsedUp = WhenUsedUp.HOLD
+    ) -> None:
+        if not (speed > 0 and math.isfinite(speed)):
+            raise UsageError("a recording cannot be played at that speed", expected="more than 0", got=str(speed))
+        self.track = track
+        self.start_ns = start_ns
+        self.speed = speed
+        self.at_end = at_end
+
+    def position_s(self, now_ns: int) -> float:
+        """Where in the recording `now_ns` is, in the recording's seconds; raises `UsedUp` under `ERROR`."""
+        t_s = (now_ns - self.start_ns) / NS_PER_S * self.speed
+        first, last = self.track.first_s, self.track.last_s
+        if t_s <= last:
+            return t_s
+        if self.at_end is WhenUsedUp.ERROR:
+            raise UsedUp("the recording is played out", path=self.track.path, got=f"{t_s:.3f} s of {last:.3f} s")
+        if self.at_end is WhenUsedUp.LOOP and last > first:
+            return first + math.fmod(t_s - first, last - first)
+        return last
+
+    def ended(self, now_ns: int) -> bool:
+        """Whether `now_ns` is past the last row (under `LOOP`: past its first time)."""
+        return (now_ns - self.start_ns) / NS_PER_S * self.speed > self.track.last_s
+
+    def at(self, now_ns: int, name: str) -> float:
+        """The signal `name` now; NaN where the recording has no value."""
+        return self.track.at(self.position_s(now_ns), name)
+
+    def values(self, now_ns: int) -> dict[str, float]:
+        """All signals now, of one instant."""
+        return self.track.values(self.position_s(now_ns))

@@ -13,6 +13,7 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from enum import Enum
 from typing import ClassVar, Generic, Protocol, TypeVar
 
@@ -85,6 +86,8 @@ class _End(Generic[T]):
         self.inbound: Connection[T] = inbound
         self.endpoint = endpoint
         self.max_pending = max_pending
+        self.on_arrival: Callable[[T], None] | None = None
+        """Told of every item at the moment it arrives, read or not (a tap). It may not feed, read or raise."""
         self._lost: FieldtwinError | None = None
         self._waiter: asyncio.Future[None] | None = None
 
@@ -96,6 +99,8 @@ class _End(Generic[T]):
     def feed(self, item: T) -> bool:
         """Something arrived. Returns False when nothing more should be taken from the medium for now."""
         self.inbound.write(item)
+        if self.on_arrival is not None:
+            self.on_arrival(item)
         self._wake()
         return len(self.inbound.data_stream) < self.max_pending
 

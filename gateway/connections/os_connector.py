@@ -1,0 +1,58 @@
+"""The plant's `Connector`: an endpoint's scheme decides which of the operating system's ends opens it.
+
+It must never know that a prototype exists: mapping an endpoint to an emulator's is done by whoever wraps it.
+"""
+
+from __future__ import annotations
+
+from gateway.core.connection import ByteConnection, CanConnection, Connector
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+
+
+class OsConnector(Connector):
+    """Opens serial ports, TCP streams and CAN buses of this computer.
+
+    Each kind of wire is imported when the first one is opened: a plant without CAN does not load python-can.
+    """
+
+    async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
+        """Open ``rtu:``, ``ascii:``, ``tcp:`` or ``rtu+tcp:``. Raises as `Connector` says."""
+        match endpoint.scheme:
+            case "rtu" | "ascii":
+                from gateway.connections.serial_line import SerialConnection
+
+                return await SerialConnection.open(endpoint)
+            case "tcp" | "rtu+tcp":
+                from gateway.connections.tcp import TcpConnection
+
+                return await TcpConnection.open(endpoint)
+            case "can":
+                raise UsageError("a CAN bus carries frames, not bytes", expected="rtu:, ascii:, tcp: or rtu+tcp:")
+            case "pty":
+                raise UsageError(
+                    f"{endpoint} is the listening side of a virtual serial port",
+                    expected=f"rtu:{endpoint.path} on the side that opens it",
+                )
+            case scheme:
+                raise UsageError(
+                    f"{endpoint}: {scheme}: cannot be opened here", expected="rtu:, ascii:, tcp: or rtu+tcp:"
+                )
+
+    async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
+        """Open ``can:socketcan/CHANNEL`` or ``can:fieldtwin/HOST:PORT``. Raises as `Connector` says."""
+        if not endpoint.is_can:
+            raise UsageError(f"{endpoint} is no CAN bus", expected="can:INTERFACE/CHANNEL")
+        match endpoint.interface:
+            case "socketcan":
+                from gateway.connections.can_end import SocketCanConnection
+
+                return await SocketCanConnection.open(endpoint, bitrate)
+            case "fieldtwin":
+                from gateway.connections.soft_bus import SoftBusConnection
+
+                return await SoftBusConnection.open(endpoint, bitrate)
+            case interface:
+                raise UsageError(
+                    f"{endpoint}: unknown kind of CAN interface {interface!r}", expected="socketcan or fieldtwin"
+                )

@@ -1,0 +1,234 @@
+"""Taps: observers on a `Connector` that see every chunk and frame both ways, and can do nothing else.
+
+A tap never changes, delays or drops what it sees; one that fails is taken off and reported, and the wire goes on.
+Received items are stamped when the medium delivers them, whether or not anybody reads them; sent ones when they have
+been handed to the medium (a write that fails or is cancelled was not sent).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TextIO, cast
+
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import Clock
+from gateway.core.connection import ByteConnection, CANConnection, CanConnection, Connector, Direction, Tap
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FieldtwinError, FileInvalid
+
+
+class TappedConnector(Connector):
+    """Opens what `inner` opens, and lets `taps` observe it.
+
+    Wrapped outermost, so that the taps are told the plant's endpoint whatever it is mapped to.
+    """
+
+    def __init__(self, inner: Connector, taps: Sequence[Tap], clock: Clock) -> None:
+        self._inner = inner
+        self._observers = _Observers(list(taps), clock)
+
+    @property
+    def failed_taps(self) -> int:
+        """Taps that raised and were taken off."""
+        return self._observers.failed
+
+    async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
+        return _TappedBytes(await self._inner.open_bytes(endpoint), endpoint, self._observers)
+
+    async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
+        return _TappedCan(await self._inner.open_can(endpoint, bitrate), endpoint, self._observers)
+
+
+class _Observers:
+    """The taps of a connector, and their clock."""
+
+    def __init__(self, taps: list[Tap], clock: Clock) -> None:
+        self._taps = taps
+        self._clock = clock
+        self.failed = 0
+
+    def saw(self, endpoint: Endpoint, direction: Direction, item: bytes | CanFrame) -> None:
+        t_ns = self._clock.monotonic_ns()
+        for tap in tuple(self._taps):
+            try:
+                if isinstance(item, CanFrame):
+                    tap.on_frame(endpoint, direction, t_ns, item)
+                else:
+                    tap.on_bytes(endpoint, direction, t_ns, item)
+            except Exception as e:  # an observer may not harm what it observes: off with it, and say so
+                self._taps.remove(tap)
+                self.failed += 1
+                asyncio.get_running_loop().call_exception_handler(
+                    {"message": f"a tap on {endpoint} failed and was taken off: {tap!r}", "exception": e}
+                )
+
+
+class _TappedBytes(ByteConnection):
+    """The same stream object as the inner connection's; only the calls pass through here."""
+
+    def __init__(self, inner: ByteConnection, endpoint: Endpoint, observers: _Observers) -> None:
+        super().__init__(inner.inbound, endpoint, inner.max_pending)
+        self._inner = inner
+        self._observers = observers
+        for chunk in inner.inbound.data_stream:  # arrived while it was being opened
+            observers.saw(endpoint, Direction.RECEIVED, chunk)
+        inner.on_arrival = lambda chunk: observers.saw(endpoint, Direction.RECEIVED, chunk)
+
+    @property
+    def lost(self) -> FieldtwinError | None:
+        return self._inner.lost
+
+    def feed(self, item: bytes) -> bool:
+        return self._inner.feed(item)
+
+    def feed_lost(self, error: FieldtwinError) -> None:
+        self._inner.feed_lost(error)
+
+    async def read(self) -> bytes:
+        return await self._inner.read()
+
+    def read_pending(self) -> bytes:
+        return self._inner.read_pending()
+
+    async def write(self, data: bytes) -> None:
+        await self._inner.write(data)
+        self._observers.saw(self.endpoint, Direction.SENT, data)
+
+    async def aclose(self) -> None:
+        await self._inner.aclose()
+
+
+class _TappedCan(CanConnection):
+    """As `_TappedBytes`, for frames. What an overrun dropped was not received, and is counted by the inner end."""
+
+    def __init__(self, inner: CanConnection, endpoint: Endpoint, observers: _Observers) -> None:
+        self._inner = inner  # before the base class, which sets `overruns`
+        self._observers = observers
+        super().__init__(cast(CANConnection, inner.inbound), endpoint, inner.max_pending)
+        for frame in inner.inbound.data_stream:
+            observers.saw(endpoint, Direction.RECEIVED, frame)
+        inner.on_arrival = lambda frame: observers.saw(endpoint, Direction.RECEIVED, frame)
+
+    @property
+    def lost(self) -> FieldtwinError | None:
+        return self._inner.lost
+
+    @property
+    def overruns(self) -> int:
+        return self._inner.overruns
+
+    @overruns.setter
+    def overruns(self, value: int) -> None:
+        self._inner.overruns = max(value, self._inner.overruns)  # it only grows; the base class starts it at 0
+
+    def feed(self, item: CanFrame) -> bool:
+        return self._inner.feed(item)
+
+    def feed_lost(self, error: FieldtwinError) -> None:
+        self._inner.feed_lost(error)
+
+    async def recv(self) -> CanFrame:
+        return await self._inner.recv()
+
+    async def send(self, frame: CanFrame) -> None:
+        await self._inner.send(frame)
+        self._observers.saw(self.endpoint, Direction.SENT, frame)
+
+    async def aclose(self) -> None:
+        await self._inner.aclose()
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """One chunk or frame, as a tap saw it."""
+
+    t_ns: int
+    endpoint: Endpoint
+    direction: Direction
+    item: bytes | CanFrame
+
+
+class CaptureTap(Tap):
+    """Keeps the last `capacity` chunks and frames in memory; `dropped` counts the older ones that had to go."""
+
+    def __init__(self, capacity: int = 10_000) -> None:
+        self._seen: deque[Captured] = deque(maxlen=capacity)
+        self.dropped = 0
+
+    @property
+    def captured(self) -> list[Captured]:
+        """What is kept, oldest first."""
+        return list(self._seen)
+
+    def stream(self, endpoint: Endpoint, direction: Direction) -> bytes:
+        """All bytes kept of one direction of one endpoint, in order: chunk borders mean nothing."""
+        kept = (c.item for c in self._seen if c.endpoint == endpoint and c.direction is direction)
+        return b"".join(item for item in kept if isinstance(item, bytes))
+
+    def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
+        self._keep(Captured(t_ns, endpoint, direction, bytes(data)))
+
+    def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
+        self._keep(Captured(t_ns, endpoint, direction, frame))
+
+    def _keep(self, captured: Captured) -> None:
+        if len(self._seen) == self._seen.maxlen:
+            self.dropped += 1
+        self._seen.append(captured)
+
+
+class TapFile(Tap):
+    """Writes JSON lines: ``{"t_ns", "endpoint", "direction", "hex"}``; a frame adds ``"frame"`` as candump writes it.
+
+    A line is in the operating system's hands when the call returns, so a file that ends with a crash is whole but for
+    that. At most `max_bytes` are written. `dropped` counts what was not, `error` says why if the disk did it: a capture
+    that ends early never ends the run.
+    """
+
+    def __init__(self, path: Path, max_bytes: int = 1 << 30) -> None:
+        """Start the file anew; raises `FileInvalid` when that is not possible."""
+        self.path = path
+        self.dropped = 0
+        self.error: OSError | None = None
+        self._room_bytes = max_bytes
+        try:
+            self._file: TextIO | None = path.open("w", encoding="ascii", buffering=1, newline="\n")
+        except OSError as e:
+            raise FileInvalid(f"cannot write the capture: {e.strerror or e}", path=str(path)) from e
+
+    def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
+        self._write({"t_ns": t_ns, "endpoint": str(endpoint), "direction": direction.value, "hex": data.hex()})
+
+    def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
+        line: dict[str, Any] = {"t_ns": t_ns, "endpoint": str(endpoint), "direction": direction.value}
+        line |= {"hex": frame.data.hex(), "frame": str(frame)}
+        if frame.error:
+            line["error"] = True  # candump's notation does not tell an error frame from a data frame
+        self._write(line)
+
+    def close(self) -> None:
+        """Finish the file. Closing twice does nothing; what comes afterwards is counted as dropped."""
+        file, self._file = self._file, None
+        if file is not None:
+            try:
+                file.close()
+            except OSError as e:
+                self.error = self.error or e
+
+    def _write(self, line: dict[str, Any]) -> None:
+        text = json.dumps(line, separators=(",", ":")) + "\n"
+        if self._file is None or len(text) > self._room_bytes:
+            self.dropped += 1
+            return
+        try:
+            self._file.write(text)
+            self._room_bytes -= len(text)
+        except OSError as e:
+            self.error = e
+            self.dropped += 1
+            self.close()

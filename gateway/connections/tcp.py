@@ -1,0 +1,183 @@
+"""A TCP connection as a `ByteConnection`.
+
+It must never know a protocol: where an ADU begins is not its business, and a segment's border means nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+from gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, Unreachable
+
+CHUNK = 4096
+"""Most bytes taken in one read; with `max_pending` it bounds the memory of a connection (4 MiB)."""
+
+WRITE_HIGH_WATER = 64 * 1024
+"""Bytes that may wait for the network before `write` waits too."""
+
+OPEN_TIMEOUT_S = 5.0
+CLOSE_LIMIT_S = 0.5
+
+# A peer that lost its power says nothing. Idle, it is asked after 10 s and given up 15 s later; with data
+# underway it is given up 20 s after the last acknowledgement (Modbus TCP Implementation Guide 4.2.2).
+KEEPALIVE_IDLE_S = 10
+KEEPALIVE_INTERVAL_S = 5
+KEEPALIVE_PROBES = 3
+UNACKNOWLEDGED_MS = 20_000
+
+
+class TcpConnection(ByteConnection):
+    """One end of a TCP stream.
+
+    Bounded: at most `max_pending` chunks of `CHUNK` bytes wait here, then the socket is not read until half of them are
+    gone and TCP holds the sender back. End of stream, reset, or no sign of life: `ConnectionLost` after what arrived.
+    """
+
+    def __init__(self, endpoint: Endpoint, max_pending: int = 1024) -> None:
+        """Not connected yet; use `open`."""
+        super().__init__(TCPConnection(), endpoint, max_pending)
+        self._wire = _Wire(self)
+
+    @classmethod
+    async def open(
+        cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024
+    ) -> TcpConnection:
+        """Connect to the endpoint's host and port, trying each address that the name has.
+
+        Raises `Unreachable` that says what failed: the name, the route, nobody listening, or no answer in time.
+        """
+        where = str(endpoint)
+        loop = asyncio.get_running_loop()
+        connection = cls(endpoint, max_pending)
+        try:
+            async with asyncio.timeout(timeout_s):
+                addresses = await _resolve(endpoint)
+                for n, address in enumerate(addresses, start=1):
+                    try:
+                        await loop.create_connection(lambda: connection._wire, address, endpoint.port)
+                        return connection
+                    except ConnectionRefusedError as e:
+                        if n == len(addresses):
+                            hint = f"the host answers and has no program on port {endpoint.port}"
+                            raise Unreachable("connection refused", where=where, hint=hint) from e
+                    except OSError as e:
+                        if n == len(addresses):
+                            raise Unreachable(f"cannot connect: {e.strerror or e}", where=where) from e
+        except TimeoutError as e:
+            raise Unreachable(f"no answer within {timeout_s:g} s", where=where) from e
+        raise Unreachable("the name has no address", where=where)
+
+    async def write(self, data: bytes) -> None:
+        """Hand `data` to the network, waiting while `WRITE_HIGH_WATER` bytes are unsent. Raises `ConnectionLost`."""
+        if self._lost is None and not self._wire.closing:
+            self._wire.transport.write(data)
+            await self._wire.room.wait()
+        if self._lost is not None:
+            raise self._lost
+        if self._wire.closing:
+            raise _ended(self.endpoint)
+
+    async def aclose(self) -> None:
+        """Send what was written (at most `CLOSE_LIMIT_S`), then close. Closing twice does nothing."""
+        self.feed_lost(closed_here(self.endpoint))
+        self.inbound.data_stream.clear()
+        self._wire.transport.close()
+        try:
+            async with asyncio.timeout(CLOSE_LIMIT_S):
+                await self._wire.gone.wait()
+        except TimeoutError:
+            self._wire.transport.abort()
+            await self._wire.gone.wait()
+
+    def on_room(self) -> None:
+        if self._wire.paused and len(self.inbound.data_stream) <= self.max_pending // 2:
+            self._wire.resume()
+
+
+class _Wire(asyncio.BufferedProtocol):
+    """What asyncio calls. A buffered protocol, because a plain one is handed up to 256 KiB a chunk."""
+
+    transport: asyncio.Transport
+
+    def __init__(self, connection: TcpConnection) -> None:
+        self._connection = connection
+        self._buffer = bytearray(CHUNK)
+        self.room = asyncio.Event()
+        self.room.set()
+        self.gone = asyncio.Event()
+        self.paused = False
+
+    @property
+    def closing(self) -> bool:
+        return self.transport.is_closing()
+
+    def resume(self) -> None:
+        self.paused = False
+        if not self.closing:
+            self.transport.resume_reading()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self.transport = transport
+        transport.set_write_buffer_limits(high=WRITE_HIGH_WATER)
+        _tune(transport.get_extra_info("socket"))
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        if self._connection.lost is None and not self._connection.feed(bytes(self._buffer[:nbytes])):
+            self.paused = True
+            self.transport.pause_reading()
+
+    def eof_received(self) -> bool:
+        self._connection.feed_lost(_ended(self._connection.endpoint))
+        return False
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if exc is None:
+            error = _ended(self._connection.endpoint)
+        else:
+            why = getattr(exc, "strerror", None) or str(exc)
+            error = ConnectionLost(f"the connection broke: {why}", where=str(self._connection.endpoint))
+        self._connection.feed_lost(error)
+        self.room.set()
+        self.gone.set()
+
+    def pause_writing(self) -> None:
+        self.room.clear()
+
+    def resume_writing(self) -> None:
+        self.room.set()
+
+
+def _ended(endpoint: Endpoint) -> ConnectionLost:
+    return ConnectionLost("the far side closed the connection", where=str(endpoint))
+
+
+async def _resolve(endpoint: Endpoint) -> list[str]:
+    """The addresses of the endpoint's host, each once, in the system's order of preference."""
+    loop = asyncio.get_running_loop()
+    try:
+        found = await loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as e:  # UnicodeError: a label of no or more than 63 characters
+        why = getattr(e, "strerror", None) or str(e)
+        raise Unreachable(f"the name {endpoint.host!r} does not resolve: {why}", where=str(endpoint)) from e
+    return list(dict.fromkeys(str(address[0]) for *_, address in found))
+
+
+def _tune(sock: socket.socket) -> None:
+    """Send at once (requests are small and wait for their reply), and notice a peer that is gone."""
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in (
+        ("TCP_KEEPIDLE", KEEPALIVE_IDLE_S),
+        ("TCP_KEEPINTVL", KEEPALIVE_INTERVAL_S),
+        ("TCP_KEEPCNT", KEEPALIVE_PROBES),
+        ("TCP_USER_TIMEOUT", UNACKNOWLEDGED_MS),
+    ):
+        if hasattr(socket, name):  # not every system has each of them
+            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

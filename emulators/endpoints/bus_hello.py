@@ -1,0 +1,68 @@
+"""The hello of the software CAN bus, the bus's and the emulators' side of it: two records before the first frame.
+
+Pure bytes; no sockets. A hello is as long as a frame's record (24 bytes) and its first byte has bit 7 set, which no
+frame's record has, so a reader of fixed-size records needs no second framing. Network byte order:
+
+    0  u8   80h
+    1  u8   protocol version, 1
+    2  u8   status (answer): 0 welcome, 1 wrong bit rate, 2 unknown version, 3 bus full
+    3  u8   options (request): bit 0, confirm each frame of mine when it was on the wire
+    4  u32  bit rate: wanted (0: whatever the bus has), in the answer the bus's own
+    8  u64  monotonic clock of the bus in ns (answer)
+    16 4s   "ftcb"
+    20 u16  transmit window (answer): unconfirmed frames that the bus takes without holding back the sender
+    22 u16  0
+
+The joining side speaks first. After a status other than 0 the bus closes.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+from gateway.core.canframe import RECORD_SIZE
+
+VERSION = 1
+WANTS_CONFIRMATIONS = 0x01
+
+_HELLO = struct.Struct("!BBBBIQ4sHH")
+_MARK = 0x80
+_MAGIC = b"ftcb"
+assert _HELLO.size == RECORD_SIZE
+
+
+class Status(IntEnum):
+    """The bus's verdict on a hello."""
+
+    WELCOME = 0
+    WRONG_BITRATE = 1
+    UNKNOWN_VERSION = 2
+    FULL = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Hello:
+    """Request and answer; fields that do not apply are 0."""
+
+    bitrate: int
+    version: int = VERSION
+    status: int = Status.WELCOME
+    options: int = 0
+    t_ns: int = 0
+    window: int = 0
+
+    def pack(self) -> bytes:
+        """The 24 bytes."""
+        return _HELLO.pack(
+            _MARK, self.version, self.status, self.options, self.bitrate, self.t_ns, _MAGIC, self.window, 0
+        )
+
+
+def unpack_hello(record: bytes) -> Hello | None:
+    """The hello in a record of 24 bytes, or None when it is none."""
+    mark, version, status, options, bitrate, t_ns, magic, window, _ = _HELLO.unpack(record)
+    if mark != _MARK or magic != _MAGIC:
+        return None
+    return Hello(bitrate, version, status, options, t_ns, window)

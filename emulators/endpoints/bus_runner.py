@@ -1,0 +1,178 @@
+"""The CAN bus model on an event loop: time passes, frames are handed to ports, senders are held back.
+
+Knows the loop's clock (wall or virtual) and nothing of sockets: the TCP server is one kind of port, an attached
+connection of the same process another.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, Protocol
+
+from emulators.wires.can_bus import CanBus
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import CANConnection, CanConnection, closed_here
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, FieldtwinError
+
+
+class BusPort(Protocol):
+    """Whoever hangs on the bus. Called from the loop; may not wait."""
+
+    def on_frame(self, frame: CanFrame) -> bool:
+        """A frame of another node ended at `frame.t_ns`. False: no room for it, it is lost here (and counted)."""
+        ...
+
+    def on_confirmed(self, frame: CanFrame) -> None:
+        """A frame of this node was on the wire; its place in the transmit queue is free."""
+        ...
+
+    def on_settled(self) -> None:
+        """No more frames for this instant."""
+        ...
+
+    def on_bus_closed(self, error: FieldtwinError) -> None:
+        """The bus is gone."""
+        ...
+
+
+class BusRunner:
+    """Runs a `CanBus` on the running loop. `paced`: frames take the time they take; otherwise none.
+
+    A late wake-up delays deliveries and never shifts the bus: frames keep their exact times (`frame.t_ns`).
+    """
+
+    def __init__(self, bitrate: int, *, paced: bool = True, queue_frames: int = 64, max_nodes: int = 128) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._bus = CanBus(bitrate, instant=not paced, queue_frames=queue_frames, max_nodes=max_nodes)
+        self._ports: dict[int, BusPort] = {}
+        self._timer: asyncio.TimerHandle | asyncio.Handle | None = None
+        self._due_ns = 0
+        self._closed: FieldtwinError | None = None
+
+    @property
+    def bitrate(self) -> int:
+        return self._bus.bitrate
+
+    @property
+    def queue_frames(self) -> int:
+        return self._bus.queue_frames
+
+    def now_ns(self) -> int:
+        """The loop's clock in ns."""
+        return int(self._loop.time() * NS_PER_S)
+
+    def join(self, port: BusPort, name: str = "") -> int:
+        """The port's node number. Raises `EndpointBusy` when the bus is full, or why the bus closed."""
+        if self._closed is not None:
+            raise self._closed
+        node = self._bus.join(self.now_ns(), name)
+        self._ports[node] = port
+        return node
+
+    def leave(self, node: int) -> None:
+        """The port hears nothing more; its queued frames still go out."""
+        if self._ports.pop(node, None) is not None:
+            self._bus.leave(node, self.now_ns())
+            self._schedule()
+
+    def submit(self, node: int, frame: CanFrame) -> bool:
+        """Queue a frame; False while the node's transmit queue is full: try again after `on_confirmed`."""
+        taken = self._bus.submit(node, frame, self.now_ns())
+        self._schedule()
+        return taken
+
+    def attach(self, endpoint: Endpoint, name: str = "", max_pending: int = 4096) -> AttachedConnection:
+        """A connection for a node of this process, on the very same bus."""
+        return AttachedConnection(self, endpoint, name, max_pending)
+
+    def stats(self) -> dict[str, Any]:
+        """`CanBus.stats` now."""
+        return self._bus.stats(self.now_ns())
+
+    def close(self, error: FieldtwinError) -> None:
+        """Stop the bus and tell every port; what was queued is lost."""
+        self._closed = error
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        ports, self._ports = self._ports, {}
+        for port in ports.values():
+            port.on_bus_closed(error)
+
+    def _schedule(self) -> None:
+        due_ns = self._bus.next_event_ns()
+        if due_ns is None or self._closed is not None:
+            return
+        if self._timer is not None:
+            if self._due_ns <= due_ns:
+                return  # it will look again then
+            self._timer.cancel()
+        self._due_ns = due_ns
+        if due_ns <= self.now_ns():
+            # Not at once: whoever submits in this turn of the loop takes part in the arbitration.
+            self._timer = self._loop.call_soon(self._pump)
+        else:
+            self._timer = self._loop.call_at(due_ns / NS_PER_S, self._pump)
+
+    def _pump(self) -> None:
+        self._timer = None
+        # The loop may fire a timer one clock resolution early; the frame's end is reached then all the same.
+        deliveries = self._bus.advance(max(self.now_ns(), self._due_ns))
+        touched: dict[int, BusPort] = {}
+        for delivery in deliveries:
+            for node in delivery.receivers:
+                if (port := self._ports.get(node)) is not None:
+                    touched[node] = port
+                    if not port.on_frame(delivery.frame):
+                        self._bus.count_overrun(node)
+            for node in delivery.senders:
+                if (port := self._ports.get(node)) is not None:
+                    touched[node] = port
+                    port.on_confirmed(delivery.frame)
+        for port in touched.values():
+            port.on_settled()
+        self._schedule()
+
+
+class AttachedConnection(CanConnection):
+    """A node of the same process. `recv` gets what the other nodes sent, stamped with its exact end of frame."""
+
+    def __init__(self, runner: BusRunner, endpoint: Endpoint, name: str, max_pending: int) -> None:
+        super().__init__(CANConnection(), endpoint, max_pending)
+        self._runner = runner
+        self._turn = asyncio.Lock()  # keeps the order of concurrent senders
+        self._room = asyncio.Event()
+        self._node = runner.join(self, name)
+
+    async def send(self, frame: CanFrame) -> None:
+        async with self._turn:
+            while True:
+                if self.lost is not None:
+                    raise self.lost
+                if self._runner.submit(self._node, frame):
+                    return
+                self._room.clear()
+                await self._room.wait()
+
+    async def aclose(self) -> None:
+        self._runner.leave(self._node)
+        self.feed_lost(closed_here(self.endpoint))
+        self.inbound.data_stream.clear()
+        self._room.set()
+
+    def on_frame(self, frame: CanFrame) -> bool:
+        before = self.overruns
+        self.feed(frame)
+        return self.overruns == before
+
+    def on_confirmed(self, frame: CanFrame) -> None:
+        self._room.set()
+
+    def on_settled(self) -> None:
+        """Nothing is gathered here."""
+
+    def on_bus_closed(self, error: FieldtwinError) -> None:
+        self.feed_lost(ConnectionLost(error.message, where=str(self.endpoint)))
+        self._room.set()

@@ -1,0 +1,247 @@
+"""The software CAN bus as a TCP server: each client is a node, each frame a record of 24 bytes.
+
+A client says hello (emulators/endpoints/bus_hello.py), then both sides send records (gateway/core/canframe.py). A full
+transmit queue stops reading from that client only, so TCP holds it back; a client that does not read its records loses
+frames alone, counted, and never stalls the bus. Confirmations are never dropped: a client that asked for them and does
+not read is not read from either.
+
+What runs on the bus, and what the frames mean, is not known here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+from typing import Any
+
+from emulators.endpoints.bus_hello import VERSION, WANTS_CONFIRMATIONS, Hello, Status, unpack_hello
+from emulators.endpoints.bus_runner import BusRunner
+from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
+from gateway.core.connection import CanConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, FieldtwinError, Unreachable, UsageError
+
+HELLO_TIMEOUT_S = 5.0
+CLOSE_TIMEOUT_S = 1.0
+
+
+class SoftBusServer:
+    """A CAN bus that any process can join. Make it with `open`."""
+
+    def __init__(self, runner: BusRunner, endpoint: Endpoint, max_outbound_frames: int) -> None:
+        self._runner = runner
+        self._endpoint = endpoint
+        self._max_outbound_bytes = max_outbound_frames * RECORD_SIZE
+        self._clients: set[_Client] = set()
+        self._server: asyncio.Server | None = None
+        self.turned_away = 0
+        """Clients that were refused or broke the protocol."""
+
+    @classmethod
+    async def open(
+        cls,
+        endpoint: Endpoint,
+        bitrate: int,
+        *,
+        paced: bool = True,
+        queue_frames: int = 64,
+        max_nodes: int = 128,
+        max_outbound_frames: int = 4096,
+    ) -> SoftBusServer:
+        """Listen on a ``can:fieldtwin/HOST:PORT`` endpoint; port 0 takes a free one (see `bound`).
+
+        `paced`: frames take their exact time at `bitrate` bit/s; otherwise they are delivered at once. `queue_frames`
+        bounds each node's transmit queue, `max_outbound_frames` what waits for a client that reads slowly.
+        Raises `EndpointBusy` when the port is in use, `Unreachable` when it cannot be opened, `UsageError` for another
+        kind of endpoint or an impossible bit rate.
+        """
+        if endpoint.interface != "fieldtwin":
+            raise UsageError(f"{endpoint} is no software CAN bus", expected="can:fieldtwin/HOST:PORT")
+        host, port = endpoint.address
+        runner = BusRunner(bitrate, paced=paced, queue_frames=queue_frames, max_nodes=max_nodes)
+        bus = cls(runner, endpoint, max_outbound_frames)
+        loop = asyncio.get_running_loop()
+        try:
+            server = await loop.create_server(lambda: _Client(bus, runner), host, port)
+        except OSError as e:
+            if e.errno == errno.EADDRINUSE:
+                raise EndpointBusy("the port of the software CAN bus is in use", where=str(endpoint)) from e
+            raise Unreachable(f"cannot listen: {e.strerror or e}", where=str(endpoint)) from e
+        bus._server = server
+        bus._endpoint = endpoint.with_address(host, int(server.sockets[0].getsockname()[1]))
+        return bus
+
+    @property
+    def bound(self) -> Endpoint:
+        """The endpoint with the port that it really has."""
+        return self._endpoint
+
+    @property
+    def bitrate(self) -> int:
+        return self._runner.bitrate
+
+    def attach(self, name: str = "", max_pending: int = 4096) -> CanConnection:
+        """A connection for a node in this process, on the same bus without TCP. `max_pending` bounds its receive queue."""
+        return self._runner.attach(self._endpoint, name, max_pending)
+
+    def bus_stats(self) -> dict[str, Any]:
+        """JSON-able: see `CanBus.stats` (frames, bits, load, overruns, nodes...), and ``turned_away``."""
+        return {**self._runner.stats(), "turned_away": self.turned_away}
+
+    async def aclose(self) -> None:
+        """Stop listening, end the bus for everybody. Closing twice does nothing."""
+        if self._server is None:
+            return
+        server, self._server = self._server, None
+        server.close()
+        self._runner.close(ConnectionLost("the software CAN bus closed", where=str(self._endpoint)))
+        gone = [client.gone for client in self._clients]
+        for client in list(self._clients):
+            client.close()
+        if gone:
+            await asyncio.wait(gone, timeout=CLOSE_TIMEOUT_S)
+            for client in list(self._clients):
+                client.abort()  # it does not take what was still to be sent
+            await asyncio.wait(gone)
+        await server.wait_closed()
+
+
+class _Client(asyncio.Protocol):
+    """One TCP client: a `BusPort` once it has said hello."""
+
+    def __init__(self, bus: SoftBusServer, runner: BusRunner) -> None:
+        self._bus = bus
+        self._runner = runner
+        self._loop = asyncio.get_running_loop()
+        self.gone: asyncio.Future[None] = self._loop.create_future()
+        self._inbound = bytearray()
+        self._outbound = bytearray()
+        self._node = 0  # 0 until welcome
+        self._confirms = False
+        self._reading = True
+        self._flooded = False  # it asked for confirmations and does not read them
+
+    # -- the transport's side -------------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=2 * self._bus._max_outbound_bytes, low=self._bus._max_outbound_bytes)
+        self._deadline = self._loop.call_later(HELLO_TIMEOUT_S, self._turn_away)
+        self._bus._clients.add(self)
+        if self._bus._server is None:  # accepted while the bus was closing
+            transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._deadline.cancel()
+        self._bus._clients.discard(self)
+        if self._node:
+            self._runner.leave(self._node)
+            self._node = 0
+        if not self.gone.done():
+            self.gone.set_result(None)
+
+    def data_received(self, data: bytes) -> None:
+        self._inbound += data
+        self._take()
+
+    def pause_writing(self) -> None:
+        self._flooded = self._confirms
+
+    def resume_writing(self) -> None:
+        self._flooded = False
+        self._take()
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def abort(self) -> None:
+        self._transport.abort()
+
+    # -- the bus's side -------------------------------------------------------------------------------------------
+
+    def on_frame(self, frame: CanFrame) -> bool:
+        waiting = self._transport.get_write_buffer_size() + len(self._outbound)
+        if waiting + RECORD_SIZE > self._bus._max_outbound_bytes:
+            return False
+        self._outbound += pack_record(frame)
+        return True
+
+    def on_confirmed(self, frame: CanFrame) -> None:
+        if self._confirms:
+            self._outbound += pack_record(frame, confirmed=True)
+
+    def on_settled(self) -> None:
+        if self._outbound:
+            self._transport.write(bytes(self._outbound))
+            self._outbound.clear()
+        if not self._reading:
+            self._take()
+
+    def on_bus_closed(self, error: FieldtwinError) -> None:
+        self._node = 0
+
+    # -- records --------------------------------------------------------------------------------------------------
+
+    def _take(self) -> None:
+        """Take whole records while the bus has room; stop reading when it has none."""
+        taken = 0
+        blocked = False
+        while len(self._inbound) - taken >= RECORD_SIZE and not self._transport.is_closing():
+            record = bytes(self._inbound[taken : taken + RECORD_SIZE])
+            if not self._node:
+                self._greet(unpack_hello(record))
+            elif self._flooded or not self._submit(record):
+                blocked = True
+                break
+            taken += RECORD_SIZE
+        del self._inbound[:taken]
+        if self._transport.is_closing():
+            return
+        if blocked and self._reading:
+            self._transport.pause_reading()
+        elif not blocked and not self._reading:
+            self._transport.resume_reading()
+        self._reading = not blocked
+
+    def _submit(self, record: bytes) -> bool:
+        try:
+            frame, confirmed = unpack_record(record)
+            if confirmed:
+                raise Desync("a confirmation from a node", got=str(frame))
+            return self._runner.submit(self._node, frame)
+        except (Desync, UsageError):  # not our protocol, or an error frame: nothing after it can be trusted
+            self._turn_away()
+            return True
+
+    def _greet(self, hello: Hello | None) -> None:
+        if hello is None:
+            self._turn_away()
+            return
+        status = Status.WELCOME
+        if hello.version != VERSION:
+            status = Status.UNKNOWN_VERSION
+        elif hello.bitrate not in (0, self._runner.bitrate):
+            status = Status.WRONG_BITRATE
+        else:
+            host, port = self._transport.get_extra_info("peername")[:2]
+            try:
+                self._node = self._runner.join(self, f"{host}:{port}")
+            except EndpointBusy:
+                status = Status.FULL
+            except ConnectionLost:  # the bus is closing, and so is this client
+                self._turn_away()
+                return
+        self._deadline.cancel()
+        self._confirms = bool(hello.options & WANTS_CONFIRMATIONS)
+        answer = Hello(
+            self._runner.bitrate, status=status, t_ns=self._runner.now_ns(), window=self._runner.queue_frames
+        )
+        self._transport.write(answer.pack())
+        if status is not Status.WELCOME:
+            self._bus.turned_away += 1
+            self._transport.close()
+
+    def _turn_away(self) -> None:
+        self._bus.turned_away += 1
+        self._transport.abort()

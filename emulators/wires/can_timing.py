@@ -1,0 +1,90 @@
+"""How long a classic CAN frame is on the wire, bit by bit (ISO 11898-1, 10.4 and 10.5).
+
+Pure arithmetic on one frame: this module knows no bus, no time and no other frame.
+
+A data frame with an 11-bit identifier and n bytes takes 47 + 8n bits unstuffed and at most 55 + 10n; with a 29-bit
+identifier 67 + 8n to 80 + 10n. Both include the interframe space of 3 bits.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from gateway.core.canframe import CanFrame
+
+CRC15_POLYNOMIAL = 0x4599
+"""x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1, without its highest term."""
+
+END_BITS = 10
+"""CRC delimiter, acknowledge slot and delimiter, and the 7 bits of end of frame: never stuffed."""
+
+INTERFRAME_BITS = 3
+"""Intermission: the bus is busy for these after the end of a frame, then anybody may start."""
+
+_STUFF_AFTER = 5
+
+
+def crc15(bits: str) -> int:
+    """CRC-15 of a string of ``0`` and ``1``: from start of frame to the last data bit, before stuffing."""
+    crc = 0
+    for bit in bits:
+        feedback = (crc >> 14) ^ (bit == "1")
+        crc = (crc << 1) & 0x7FFF
+        if feedback:
+            crc ^= CRC15_POLYNOMIAL
+    return crc
+
+
+def plain_bits(frame: CanFrame) -> str:
+    """The bits from start of frame to the end of the CRC sequence, dominant ``0``, before stuffing."""
+    rtr = "1" if frame.remote else "0"
+    if frame.extended:
+        base, extension = frame.can_id >> 18, frame.can_id & 0x3FFFF
+        head = f"0{base:011b}11{extension:018b}{rtr}00"  # SOF, base, SRR, IDE, extension, RTR, r1, r0
+    else:
+        head = f"0{frame.can_id:011b}{rtr}00"  # SOF, identifier, RTR, IDE, r0
+    data = "" if frame.remote else "".join(f"{byte:08b}" for byte in frame.data)
+    covered = f"{head}{frame.dlc:04b}{data}"
+    return f"{covered}{crc15(covered):015b}"
+
+
+def stuff(bits: str) -> str:
+    """Insert a complementary bit after every five equal ones, stuff bits counting as bits of the next run."""
+    out = []
+    run_of, run = "", 0
+    for bit in bits:
+        run = run + 1 if bit == run_of else 1
+        run_of = bit
+        out.append(bit)
+        if run == _STUFF_AFTER:
+            run_of, run = ("1" if bit == "0" else "0"), 1
+            out.append(run_of)
+    return "".join(out)
+
+
+def bits_to_end(frame: CanFrame) -> int:
+    """Bits from start of frame to the end of end-of-frame: when receivers have the frame and the sender its success."""
+    return _stuffed_length(frame.can_id, frame.data, frame.extended, frame.remote, frame.dlc) + END_BITS
+
+
+def bits_on_wire(frame: CanFrame) -> int:
+    """Bits that the frame keeps the bus busy: to the end of frame, and the interframe space."""
+    return bits_to_end(frame) + INTERFRAME_BITS
+
+
+@lru_cache(maxsize=4096)
+def _stuffed_length(can_id: int, data: bytes, extended: bool, remote: bool, dlc: int) -> int:
+    # Cached by content: process data repeats, and the same frame is asked about when it wins and when it ends.
+    return len(stuff(plain_bits(CanFrame(can_id, data, extended=extended, remote=remote, dlc=dlc))))
+
+
+def arbitration_key(frame: CanFrame) -> int:
+    """The arbitration field as a number, dominant bits low: of two frames that start together the lower key wins.
+
+    11-bit data before 11-bit remote before any 29-bit frame of the same base identifier (RTR, SRR and IDE are
+    recessive there); then the extension, then 29-bit data before 29-bit remote.
+    """
+    if frame.extended:
+        base, extension = frame.can_id >> 18, frame.can_id & 0x3FFFF
+        return base << 21 | 0b11 << 19 | extension << 1 | frame.remote
+    return frame.can_id << 21 | frame.remote << 20

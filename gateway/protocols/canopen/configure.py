@@ -1,0 +1,170 @@
+"""Configuring a node over SDO at start, as CiA 301 prescribes, and reading back what it then holds.
+
+Procedures over a master; they know object numbers of CiA 301 and nothing of any device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from gateway.core.errors import UsageError, VerifyFailed
+from gateway.protocols.canopen import cob_id as cob_ids
+from gateway.protocols.canopen.datatypes import DataType, decode, encode, size_of
+from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.canopen.pdo import MAX_ENTRIES, PdoMapping
+
+DEVICE_TYPE = 0x1000
+HEARTBEAT_PRODUCER = 0x1017
+IDENTITY = 0x1018
+TPDO_COMMUNICATION = 0x1800
+TPDO_MAPPING = 0x1A00
+TPDO_MAX = 512
+
+PDO_INVALID = 1 << 31
+"""Bit 31 of a PDO's COB-ID: the PDO does not exist (7.5.2.37)."""
+NO_RTR = 1 << 30
+"""Bit 30 of a TPDO's COB-ID: no remote frames for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What a node says that it is (1000h, 1018h). Vendor, product, revision, serial: None where it has no such entry."""
+
+    device_type: int
+    vendor: int | None
+    product: int | None
+    revision: int | None
+    serial: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class TpdoConfig:
+    """A TPDO as the node holds it. `cob_id` is the CAN-ID alone; `event_ms` is 0 when off, None when not supported."""
+
+    number: int
+    cob_id: int
+    enabled: bool
+    transmission_type: int
+    event_ms: int | None
+    mapping: PdoMapping
+
+
+async def read_number(master: CanopenMaster, node: int, index: int, subindex: int, data_type: DataType) -> int:
+    """Read an integer object. Raises what `sdo_upload` raises, and `LengthMismatch` when it has another size."""
+    data = await master.sdo_upload(node, index, subindex, length=size_of(data_type))
+    return int(decode(data_type, data))
+
+
+async def write_number(
+    master: CanopenMaster, node: int, index: int, subindex: int, data_type: DataType, value: int
+) -> None:
+    """Write an integer object. Raises what `sdo_download` raises, and `UsageError` when `value` does not fit."""
+    await master.sdo_download(node, index, subindex, encode(data_type, value))
+
+
+async def verify_number(
+    master: CanopenMaster, node: int, index: int, subindex: int, data_type: DataType, value: int
+) -> None:
+    """Read an integer object back; raises `VerifyFailed` when the node holds another value."""
+    held = await read_number(master, node, index, subindex, data_type)
+    if held != value:
+        where = f"node {node} {index:04X}h:{subindex:02X}"
+        raise VerifyFailed("the node took the value and holds another", expected=f"{value:X}h", got=f"{held:X}h").at(
+            where
+        )
+
+
+async def set_heartbeat_producer(master: CanopenMaster, node: int, ms: int) -> None:
+    """Set the producer heartbeat time (1017h, 7.5.2.18) in milliseconds, 0 to switch it off, and verify it."""
+    await write_number(master, node, HEARTBEAT_PRODUCER, 0, DataType.UNSIGNED16, ms)
+    await verify_number(master, node, HEARTBEAT_PRODUCER, 0, DataType.UNSIGNED16, ms)
+
+
+async def read_identity(master: CanopenMaster, node: int) -> Identity:
+    """Read device type and identity. Entries beyond the highest sub-index that the node has are None."""
+    u32 = DataType.UNSIGNED32
+    device_type = await read_number(master, node, DEVICE_TYPE, 0, u32)
+    highest = await read_number(master, node, IDENTITY, 0, DataType.UNSIGNED8)
+    parts = [await read_number(master, node, IDENTITY, sub, u32) if sub <= highest else None for sub in range(1, 5)]
+    return Identity(device_type, *parts)
+
+
+async def read_tpdo(master: CanopenMaster, node: int, number: int) -> TpdoConfig:
+    """Read TPDO `number` (from 1) with its mapping, for a driver that takes the node as it is."""
+    communication, mapping = _records(number)
+    word = await read_number(master, node, communication, 1, DataType.UNSIGNED32)
+    highest = await read_number(master, node, communication, 0, DataType.UNSIGNED8)
+    kind = await read_number(master, node, communication, 2, DataType.UNSIGNED8)
+    event = await read_number(master, node, communication, 5, DataType.UNSIGNED16) if highest >= 5 else None
+    return TpdoConfig(
+        number, word & 0x7FF, not word & PDO_INVALID, kind, event, await _read_mapping(master, node, mapping)
+    )
+
+
+async def configure_tpdo(
+    master: CanopenMaster,
+    node: int,
+    number: int,
+    mapping: Iterable[tuple[int, int, int]],
+    cob_id: int,
+    transmission_type: int = 254,
+    event_ms: int = 0,
+    inhibit_100us: int | None = None,
+) -> PdoMapping:
+    """Configure TPDO `number` (from 1) by the procedure of 7.5.2.38, verify it, and return its mapping.
+
+    `mapping` is (index, subindex, bits) in order, at most 64 bits. `cob_id` is the CAN-ID; whether remote frames are
+    allowed stays as the node has it. `event_ms` 0 switches the event timer off, `inhibit_100us` None leaves the inhibit
+    time alone. Raises `UsageError` before anything is sent, `SdoAborted` where the node refuses a step (the TPDO is then
+    left disabled), `VerifyFailed` where it holds something else in the end.
+    """
+    communication, mapped = _records(number)
+    wanted = PdoMapping.of(mapping)
+    cob_ids.check_pdo_cob_id(cob_id)
+    if not wanted.entries:
+        raise UsageError(f"TPDO {number} of node {node} maps nothing", expected="at least one object")
+    u8, u16, u32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
+    parameters = [(2, u8, transmission_type), (5, u16, event_ms)]
+    if inhibit_100us is not None:
+        parameters.insert(1, (3, u16, inhibit_100us))
+    for _, data_type, value in parameters:
+        encode(data_type, value)
+
+    # Bits 0 to 29 must not change while the PDO exists: first the old CAN-ID with bit 31, the new one at the end.
+    held = await read_number(master, node, communication, 1, u32)
+    final = cob_id | held & NO_RTR
+    await write_number(master, node, communication, 1, u32, held | PDO_INVALID)
+    await write_number(master, node, mapped, 0, u8, 0)
+    for sub, entry in enumerate(wanted.entries, 1):
+        await write_number(master, node, mapped, sub, u32, entry.word)
+    await write_number(master, node, mapped, 0, u8, len(wanted.entries))
+    for sub, data_type, value in parameters:
+        await write_number(master, node, communication, sub, data_type, value)
+    await write_number(master, node, communication, 1, u32, final)
+
+    await verify_number(master, node, communication, 1, u32, final)
+    for sub, data_type, value in parameters:
+        await verify_number(master, node, communication, sub, data_type, value)
+    found = await _read_mapping(master, node, mapped)
+    if found != wanted:
+        raise VerifyFailed(f"the mapping of TPDO {number}", expected=str(wanted), got=str(found)).at(f"node {node}")
+    return wanted
+
+
+async def _read_mapping(master: CanopenMaster, node: int, index: int) -> PdoMapping:
+    count = await read_number(master, node, index, 0, DataType.UNSIGNED8)
+    if count > MAX_ENTRIES:  # 254 and 255 announce a multiplexed PDO, which has no mapping to read
+        raise VerifyFailed("not the mapping of a plain PDO", expected="at most 64 objects", got=str(count)).at(
+            f"node {node} {index:04X}h"
+        )
+    return PdoMapping.from_words(
+        [await read_number(master, node, index, sub, DataType.UNSIGNED32) for sub in range(1, count + 1)]
+    )
+
+
+def _records(number: int) -> tuple[int, int]:
+    """Indices of a TPDO's communication and mapping record."""
+    if not 1 <= number <= TPDO_MAX:
+        raise UsageError("no such TPDO", expected=f"1 to {TPDO_MAX}", got=str(number))
+    return TPDO_COMMUNICATION + number - 1, TPDO_MAPPING + number - 1

@@ -1,0 +1,108 @@
+"""The heartbeat consumer (CiA 301, 7.2.8.2.2.2 and 7.2.8.3.2.2): who is alive, in which state, since when not.
+
+A pure object: heartbeats and `now` in, events out. Monitoring of a node starts at its first heartbeat (CO-036). A late
+heartbeat inside the consumer time is no event (CO-037). A boot-up counts as a sign of life of a node that is being
+monitored, and ends no time-out: only a heartbeat brings a lost node back (CO-038).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gateway.core.clock import NS_PER_MS
+from gateway.protocols.canopen import cob_id
+from gateway.protocols.canopen.nmt import NmtState, NodeEvent, NodeEventKind, heartbeat_state
+
+TWIN_BOOT_NS = 100 * NS_PER_MS
+"""No node boots twice within this time; two nodes with one id do (CO-042)."""
+
+
+@dataclass(slots=True)
+class _Node:
+    consumer_ns: int = 0
+    state: NmtState | None = None
+    monitored: bool = False
+    lost: bool = False
+    heard_ns: int = 0
+    booted_ns: int | None = None
+    boot_expected: bool = False
+
+    @property
+    def deadline_ns(self) -> int | None:
+        watching = self.consumer_ns and self.monitored and not self.lost
+        return self.heard_ns + self.consumer_ns if watching else None
+
+
+class HeartbeatConsumer:
+    """States of up to 127 nodes. `ignored` counts messages that are no heartbeat."""
+
+    def __init__(self) -> None:
+        self._nodes: dict[int, _Node] = {}
+        self.ignored = 0
+
+    def monitor(self, node: int, consumer_ms: int) -> None:
+        """Watch `node` from its next heartbeat on, or no longer (0). A node that is being watched stays so."""
+        known = self._node(cob_id.check_node(node))
+        known.consumer_ns = consumer_ms * NS_PER_MS
+
+    def state(self, node: int) -> NmtState | None:
+        """The last state heard, None if none was. A lost node keeps it: see `is_lost`."""
+        return self._nodes[node].state if node in self._nodes else None
+
+    def is_lost(self, node: int) -> bool:
+        """Whether the node's heartbeat is overdue."""
+        return node in self._nodes and self._nodes[node].lost
+
+    def expect_boot_up(self, node: int) -> None:
+        """The next boot-up of `node` (0: of every node) was asked for."""
+        for known in self._nodes.values() if node == cob_id.ALL_NODES else [self._node(node)]:
+            known.boot_expected = True
+
+    def observe(self, node: int, data: bytes, t_ns: int) -> tuple[NodeEvent, ...]:
+        """A message of `node` on 700h + node id came at `t_ns`."""
+        state = heartbeat_state(data)
+        if state is None:
+            self.ignored += 1
+            return ()
+        known = self._node(node)
+        events = list(self._overdue(node, known, t_ns))  # nobody may have checked in between
+        if state is NmtState.INITIALISING:
+            events += self._booted(node, known, data, t_ns)
+            return tuple(events)
+        changed = state is not known.state
+        known.state, known.monitored = state, True
+        known.heard_ns = max(known.heard_ns, t_ns)
+        if known.lost:
+            known.lost = False
+            events.append(NodeEvent(node, "heartbeat-back", state, data, t_ns))
+        if changed:
+            events.append(NodeEvent(node, "state", state, data, t_ns))
+        return tuple(events)
+
+    def check(self, now_ns: int) -> tuple[NodeEvent, ...]:
+        """Who became overdue by `now_ns`; each is told once."""
+        return tuple(event for node, known in self._nodes.items() for event in self._overdue(node, known, now_ns))
+
+    def next_deadline_ns(self) -> int | None:
+        """When `check` is due next, None while nobody is watched."""
+        deadlines = [d for known in self._nodes.values() if (d := known.deadline_ns) is not None]
+        return min(deadlines, default=None)
+
+    def _node(self, node: int) -> _Node:
+        return self._nodes.setdefault(node, _Node())
+
+    def _overdue(self, node: int, known: _Node, now_ns: int) -> tuple[NodeEvent, ...]:
+        deadline_ns = known.deadline_ns
+        if deadline_ns is None or now_ns <= deadline_ns:
+            return ()
+        known.lost = True
+        return (NodeEvent(node, "heartbeat-lost", known.state, b"", now_ns),)
+
+    def _booted(self, node: int, known: _Node, data: bytes, t_ns: int) -> list[NodeEvent]:
+        kinds: list[NodeEventKind] = ["boot-up"]
+        if known.booted_ns is not None and not known.boot_expected and t_ns - known.booted_ns < TWIN_BOOT_NS:
+            kinds.append("conflict")
+        unexpected = known.state is not None and not known.boot_expected
+        known.booted_ns, known.boot_expected, known.state = t_ns, False, NmtState.INITIALISING
+        known.heard_ns = max(known.heard_ns, t_ns)
+        return [NodeEvent(node, kind, known.state, data, t_ns, unexpected) for kind in kinds]

@@ -1,0 +1,237 @@
+"""The CANopen master on one bus: the one reader of a CanConnection, and what drivers ask of it.
+
+Thin asyncio around the pure parts (`sdo`, `heartbeat`, `nmt`, `emcy`). It knows no object of any device and no bus
+hardware; standard clauses stand where the parts are.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from gateway.core.connection import CanConnection
+from gateway.core.errors import ConnectionLost, FieldtwinError
+from gateway.protocols.canopen import cob_id, nmt
+from gateway.protocols.canopen.heartbeat import HeartbeatConsumer
+from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from gateway.protocols.canopen.sdo import SdoDownload, SdoTransfer, SdoUpload
+from gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
+
+PdoCallback = Callable[[bytes, int], None]
+"""Called with the PDO's data and when it came (monotonic, ns)."""
+
+EventCallback = Callable[[NodeEvent], None]
+
+
+def _nobody(event: NodeEvent) -> None:
+    pass
+
+
+class CanopenMaster:
+    """SDO client, NMT master, heartbeat consumer, PDO and EMCY receiver for the nodes of one bus.
+
+    `run` must be running for anything to be received. `on_event` may be set at any time; it and PDO callbacks are called
+    from `run`, must be quick, and end it with whatever they raise: an error of a callback is a bug and is not hidden.
+    """
+
+    def __init__(
+        self,
+        connection: CanConnection,
+        clock: Clock,
+        *,
+        sdo_timeout_s: float = 0.5,
+        on_event: EventCallback | None = None,
+    ) -> None:
+        self.counters = Counters()
+        self.on_event: EventCallback = on_event or _nobody
+        self._connection = connection
+        self._clock = clock
+        self._sdo_timeout_s = sdo_timeout_s
+        self._heartbeat = HeartbeatConsumer()
+        self._channels: dict[int, SdoChannel] = {}
+        self._pdos: dict[int, list[PdoCallback]] = {}
+        self._stopped: ConnectionLost | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_due_ns = 0
+
+    # -- what drivers ask -----------------------------------------------------------------------------------------
+
+    def add_node(self, node: int, *, heartbeat_consumer_ms: int = 0) -> None:
+        """Make `node` known; with a consumer time it is watched from its first heartbeat on."""
+        self._channel(cob_id.check_node(node))
+        self._heartbeat.monitor(node, heartbeat_consumer_ms)
+
+    def node_state(self, node: int) -> NmtState | None:
+        """The NMT state that the node last told, None if it never did."""
+        return self._heartbeat.state(node)
+
+    def heartbeat_lost(self, node: int) -> bool:
+        """Whether the node is watched and its heartbeat is overdue."""
+        return self._heartbeat.is_lost(node)
+
+    async def sdo_upload(
+        self, node: int, index: int, subindex: int, timeout_s: float | None = None, *, length: int | None = None
+    ) -> bytes:
+        """Read an object. `timeout_s` is for each reply; `length` is the object's size where known (CO-029).
+
+        One transfer a node at a time, in the order asked; nodes in parallel. A late reply is never taken for the reply
+        to a later request, for the same object neither (`late_replies` tells how). Raises `SdoAborted`, `ReplyTimeout`,
+        `Desync` or `ConnectionLost`.
+        """
+        return await self._transfer(SdoUpload(node, index, subindex, self._ns(timeout_s), length=length))
+
+    async def sdo_download(
+        self, node: int, index: int, subindex: int, data: bytes, timeout_s: float | None = None
+    ) -> None:
+        """Write an object. As `sdo_upload`; after a `ReplyTimeout` the node may have taken the value or not."""
+        await self._transfer(SdoDownload(node, index, subindex, self._ns(timeout_s), data))
+
+    async def nmt(self, command: NmtCommand, node: int) -> None:
+        """Send an NMT command to `node`, or to all (0). Unconfirmed: the node's heartbeat tells what came of it."""
+        frame = nmt.command_frame(command, node)
+        if command.boots:
+            self._heartbeat.expect_boot_up(node)
+        await self._send(frame)
+
+    def subscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:
+        """Call `callback` for each data frame with that CAN-ID. Raises `UsageError` for one that no PDO may have."""
+        self._pdos.setdefault(cob_id.check_pdo_cob_id(cob_id_), []).append(callback)
+
+    def unsubscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:
+        """Call `callback` no longer; nothing happens when it was not subscribed."""
+        callbacks = [known for known in self._pdos.pop(cob_id_, []) if known != callback]
+        if callbacks:
+            self._pdos[cob_id_] = callbacks
+
+    # -- the reader -----------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Receive and dispatch until cancelled or until the connection is lost; raises `ConnectionLost` then.
+
+        Heartbeats are checked here too, at their deadlines. Transfers that wait when it ends fail with `ConnectionLost`.
+        """
+        self._stop(None)
+        self._arm()
+        reason = ConnectionLost("the CANopen master was stopped", where=self._where())
+        try:
+            while True:
+                self._dispatch(await self._connection.recv())
+        except ConnectionLost as e:
+            reason = e
+            raise
+        except FieldtwinError as e:
+            reason = ConnectionLost(str(e), where=self._where())
+            raise reason from e
+        finally:
+            self._disarm()
+            self._stop(reason)
+
+    def _dispatch(self, frame: CanFrame) -> None:
+        """Give a frame to whom it concerns. Extended, remote and error frames are no CANopen of ours (CO-060)."""
+        self.counters.frames_in += 1
+        if frame.extended or frame.remote or frame.error:
+            self.counters.ignored += 1
+            return
+        t_ns = frame.t_ns or self._clock.monotonic_ns()
+        callbacks = self._pdos.get(frame.can_id)
+        base, node = frame.can_id & 0x780, frame.can_id & 0x7F
+        if callbacks is not None:
+            self.counters.pdos += 1
+            for callback in callbacks:
+                callback(frame.data, t_ns)
+        elif node == 0:
+            self.counters.ignored += 1  # NMT, SYNC and other broadcasts of somebody else
+        elif base == cob_id.SDO_RESPONSE_BASE:
+            self._on_sdo(node, frame, t_ns)
+        elif base == cob_id.HEARTBEAT_BASE:
+            self._on_heartbeat(node, frame.data, t_ns)
+        elif base == cob_id.EMCY_BASE:
+            self._on_emcy(node, frame.data, t_ns)
+        else:
+            self.counters.ignored += 1
+
+    def _on_sdo(self, node: int, frame: CanFrame, t_ns: int) -> None:
+        channel = self._channels.get(node)
+        if channel is None:
+            self.counters.ignored += 1
+        elif channel.deliver(frame):
+            self.on_event(NodeEvent(node, "conflict", self._heartbeat.state(node), frame.data, t_ns))
+
+    def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> None:
+        if nmt.heartbeat_state(data) is None:
+            self.counters.ignored += 1
+        else:
+            self.counters.heartbeats += 1
+        for event in self._heartbeat.observe(node, data, t_ns):
+            if event.kind == "boot-up" and node in self._channels:
+                self._channels[node].on_boot_up()
+            self.on_event(event)
+        self._arm()
+
+    def _on_emcy(self, node: int, data: bytes, t_ns: int) -> None:
+        if len(data) < 2:  # not even a code (CO-053)
+            self.counters.ignored += 1
+            return
+        self.counters.emcys += 1
+        self.on_event(NodeEvent(node, "emcy", self._heartbeat.state(node), data, t_ns))
+
+    # -- heartbeats that do not come ------------------------------------------------------------------------------
+
+    def _arm(self) -> None:
+        """See to it that somebody looks at the next deadline, or earlier."""
+        due_ns = self._heartbeat.next_deadline_ns()
+        if due_ns is None or (self._timer is not None and self._timer_due_ns <= due_ns):
+            return
+        self._disarm()
+        left_ns = max(due_ns - self._clock.monotonic_ns(), 0) + NS_PER_MS  # a loop may wake a little early
+        self._timer_due_ns = due_ns
+        self._timer = asyncio.get_running_loop().call_later(left_ns / NS_PER_S, self._on_deadline)
+
+    def _disarm(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _on_deadline(self) -> None:
+        """Check as of what has been read: a heartbeat that waits unread behind others is not late."""
+        self._timer = None
+        unread = self._connection.inbound.data_stream
+        now_ns = self._clock.monotonic_ns()
+        for event in self._heartbeat.check((unread[0].t_ns or now_ns) if unread else now_ns):
+            self.on_event(event)
+        self._arm()
+
+    # -- helpers --------------------------------------------------------------------------------------------------
+
+    async def _transfer(self, transfer: SdoTransfer) -> bytes:
+        try:
+            return await self._channel(transfer.node).run(transfer)
+        except ConnectionLost:
+            raise
+        except FieldtwinError as e:
+            raise e.at(f"{self._where()} node {transfer.node}") from e.__cause__
+
+    async def _send(self, frame: CanFrame) -> None:
+        await self._connection.send(frame)
+        self.counters.frames_out += 1
+
+    def _channel(self, node: int) -> SdoChannel:
+        channel = self._channels.get(node)
+        if channel is None:
+            channel = SdoChannel(node, self._send, self._clock, self.counters, self._ns(None))
+            channel.lose(self._stopped)
+            self._channels[node] = channel
+        return channel
+
+    def _stop(self, reason: ConnectionLost | None) -> None:
+        self._stopped = reason
+        for channel in self._channels.values():
+            channel.lose(reason)
+
+    def _ns(self, timeout_s: float | None) -> int:
+        return int((self._sdo_timeout_s if timeout_s is None else timeout_s) * NS_PER_S)
+
+    def _where(self) -> str:
+        return str(self._connection.endpoint)

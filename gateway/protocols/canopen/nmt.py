@@ -1,0 +1,78 @@
+"""NMT: commands, states, and the events that a master tells about its nodes (CiA 301, 7.2.8 and 7.3.2).
+
+Pure values; who sends and who receives is not known here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+from gateway.core.canframe import CanFrame
+from gateway.protocols.canopen import cob_id
+
+
+class NmtCommand(IntEnum):
+    """Command specifiers of the NMT node control services (7.2.8.3.1)."""
+
+    START = 0x01
+    STOP = 0x02
+    ENTER_PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+    @property
+    def boots(self) -> bool:
+        """Whether the node boots, and says so, after this command."""
+        return self in (NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION)
+
+
+class NmtState(IntEnum):
+    """The state as a heartbeat carries it (7.2.8.3.2.2); INITIALISING is the boot-up message."""
+
+    INITIALISING = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+NodeEventKind = Literal["boot-up", "heartbeat-lost", "heartbeat-back", "state", "emcy", "conflict"]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeEvent:
+    """Something happened to `node`.
+
+    `state` is what is known after it (None: never heard). `data` is the frame's data where a frame caused it. `t_ns`
+    is monotonic. `unexpected` marks a boot-up that this master did not ask for, of a node that it had heard before:
+    the node restarted and has lost its configuration (CO-035). A ``conflict`` means that two nodes seem to share this
+    node id (CO-042).
+    """
+
+    node: int
+    kind: NodeEventKind
+    state: NmtState | None
+    data: bytes
+    t_ns: int
+    unexpected: bool = False
+
+
+def command_frame(command: NmtCommand, node: int) -> CanFrame:
+    """The NMT frame that tells `node` (0: all nodes) to do `command`."""
+    if node != cob_id.ALL_NODES:
+        cob_id.check_node(node)
+    return CanFrame(cob_id.NMT, bytes([command, node]))
+
+
+def heartbeat_state(data: bytes) -> NmtState | None:
+    """The state in a heartbeat or boot-up message, or None where it is neither (CO-039).
+
+    Bit 7 set is a node guarding reply or nothing known; a length other than 1 is not a heartbeat.
+    """
+    if len(data) != 1 or data[0] not in _STATES:
+        return None
+    return _STATES[data[0]]
+
+
+_STATES = {int(state): state for state in NmtState}

@@ -1,0 +1,104 @@
+"""PDO mappings (CiA 301, 7.5.2.36 and 7.5.2.38): which objects lie where in the 8 bytes of a PDO.
+
+Pure: takes mapping entries as 1A00h-style values, cuts data into objects. Knows no data type: `datatypes` reads each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from gateway.core.errors import UsageError, WireError
+
+PDO_BITS = 64
+MAX_ENTRIES = 64
+
+
+class PdoLengthMismatch(WireError):
+    """A PDO came with other than the number of bytes that its mapping says."""
+
+
+@dataclass(frozen=True, slots=True)
+class PdoEntry:
+    """One mapped object: `bits` of index:subindex."""
+
+    index: int
+    subindex: int
+    bits: int
+
+    @classmethod
+    def from_word(cls, word: int) -> PdoEntry:
+        """From the UNSIGNED32 in the node: index in bits 31 to 16, subindex in 15 to 8, length in bits in 7 to 0."""
+        return cls(word >> 16 & 0xFFFF, word >> 8 & 0xFF, word & 0xFF)
+
+    @property
+    def word(self) -> int:
+        return self.index << 16 | self.subindex << 8 | self.bits
+
+    def __str__(self) -> str:
+        return f"{self.index:04X}h:{self.subindex:02X}/{self.bits}"
+
+
+@dataclass(frozen=True, slots=True)
+class PdoMapping:
+    """Mapped objects in their order. At most 64 bits together; `UsageError` otherwise."""
+
+    entries: tuple[PdoEntry, ...]
+
+    def __post_init__(self) -> None:
+        bad = [e for e in self.entries if not (0 < e.bits <= PDO_BITS and e.index <= 0xFFFF and e.subindex <= 0xFF)]
+        if bad or len(self.entries) > MAX_ENTRIES or self.bits > PDO_BITS:
+            raise UsageError(
+                "not a PDO mapping", expected=f"entries of 1 to 64 bits, {PDO_BITS} bits together", got=str(self)
+            )
+
+    @classmethod
+    def from_words(cls, words: Iterable[int]) -> PdoMapping:
+        """From the entries 1 to n of a mapping record (1600h, 1A00h...)."""
+        return cls(tuple(PdoEntry.from_word(word) for word in words))
+
+    @classmethod
+    def of(cls, objects: Iterable[tuple[int, int, int]]) -> PdoMapping:
+        """From (index, subindex, bits)."""
+        return cls(tuple(PdoEntry(*triple) for triple in objects))
+
+    @property
+    def bits(self) -> int:
+        return sum(entry.bits for entry in self.entries)
+
+    @property
+    def length(self) -> int:
+        """Bytes that the PDO has."""
+        return (self.bits + 7) // 8
+
+    def unpack(self, data: bytes, *, exact: bool = False) -> tuple[bytes, ...]:
+        """The bytes of each object in order, little-endian, the last one padded with zero bits.
+
+        Raises `PdoLengthMismatch` when `data` is too short: nothing of it may be used (CO-043). Of one that is too
+        long the first bytes are used, as the standard says for receivers; `exact` refuses it too.
+        """
+        if len(data) < self.length or (exact and len(data) > self.length):
+            raise PdoLengthMismatch(
+                f"a PDO of {self}", expected=f"{self.length} bytes", got=f"{len(data)} ({data.hex()})"
+            )
+        word, values = int.from_bytes(data, "little"), []
+        for entry in self.entries:
+            values.append((word & ((1 << entry.bits) - 1)).to_bytes((entry.bits + 7) // 8, "little"))
+            word >>= entry.bits
+        return tuple(values)
+
+    def pack(self, values: Sequence[bytes]) -> bytes:
+        """The PDO's data from the bytes of each object: the inverse of `unpack`."""
+        if len(values) != len(self.entries):
+            raise UsageError(f"values for a PDO of {self}", expected=f"{len(self.entries)}", got=f"{len(values)}")
+        word = shift = 0
+        for entry, value in zip(self.entries, values, strict=True):
+            number = int.from_bytes(value, "little")
+            if number >> entry.bits:
+                raise UsageError(f"a value of {entry} in a PDO", expected=f"{entry.bits} bits", got=value.hex())
+            word |= number << shift
+            shift += entry.bits
+        return word.to_bytes(self.length, "little")
+
+    def __str__(self) -> str:
+        return " ".join(str(entry) for entry in self.entries) or "nothing"

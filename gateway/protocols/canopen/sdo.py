@@ -1,0 +1,280 @@
+"""The SDO client's transfers, expedited and segmented (CiA 301, 7.2.4.3.1 to 7.2.4.3.8 and 7.2.4.3.17).
+
+A transfer is a pure object: `start` gives the request, `feed` takes what came and gives what to do next, `expire` ends
+it when its time is over. It knows no bus, no clock and no other transfer; which replies may belong to an *earlier*
+transfer is the business of `late_replies`. A block transfer would be one more subclass of `SdoTransfer`.
+
+What is never paired with a request: a frame that is not 8 bytes, of another COB-ID, remote, extended, or with another
+multiplexor (index and subindex). Such strays are counted, do not prolong the transfer, and end it when there are too
+many. Segments carry no multiplexor: there, anything that breaks the protocol aborts the transfer.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+from gateway.core.canframe import CanFrame
+from gateway.core.errors import Bug, Desync, FieldtwinError, ReplyTimeout, SdoAborted, UsageError
+from gateway.protocols.canopen import abort_codes, cob_id
+
+MAX_BYTES = 1 << 20
+"""No object that a gateway reads is larger; a node that sends segments for ever is stopped here."""
+
+MAX_STRAYS = 64
+"""A node that floods its SDO channel with something else is given up on (CO-025)."""
+
+_DOWNLOAD_SEGMENT_REPLY, _UPLOAD_SEGMENT_REPLY = 1, 0
+_UPLOAD_REPLY, _DOWNLOAD_REPLY, _ABORT = 2, 3, 4
+
+
+@dataclass(frozen=True, slots=True)
+class Send:
+    """The transfer goes on: send this."""
+
+    frame: CanFrame
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """The transfer succeeded. `data` is the object's value (upload) or empty (download)."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """The transfer is over. `abort` is to be sent first, unless it was the node that aborted."""
+
+    error: FieldtwinError
+    abort: CanFrame | None
+
+
+@dataclass(frozen=True, slots=True)
+class Stray:
+    """The frame does not belong to this transfer."""
+
+    why: str
+
+
+Step = Send | Done | Failed | Stray
+
+
+class SdoTransfer(ABC):
+    """One transfer of one object with one node. Once it is over, everything that is fed is a stray.
+
+    `timeout_ns` is for each reply and starts again with every reply that carries the transfer on (CO-022).
+    `answered` tells whether the node has replied to the initiate request (or aborted).
+    """
+
+    _reply: ClassVar[int]
+    _segment_reply: ClassVar[int]
+
+    def __init__(self, node: int, index: int, subindex: int, timeout_ns: int) -> None:
+        if not 0 <= index <= 0xFFFF or not 0 <= subindex <= 0xFF:
+            raise UsageError(
+                "no such object", expected="index 0 to FFFFh, subindex 0 to FFh", got=f"{index}:{subindex}"
+            )
+        self.node = cob_id.check_node(node)
+        self.index = index
+        self.subindex = subindex
+        self.timeout_ns = timeout_ns
+        self.deadline_ns = 0
+        self.answered = False
+        self.over = False
+        self.strays = 0
+        self._toggle = 0
+        self._multiplexor = index.to_bytes(2, "little") + bytes([subindex])
+
+    @property
+    def name(self) -> str:
+        """The object as people write it."""
+        return f"SDO {self.index:04X}h:{self.subindex:02X}"
+
+    def start(self, now_ns: int) -> CanFrame:
+        """The initiate request."""
+        self.deadline_ns = now_ns + self.timeout_ns
+        return self._frame(self._request())
+
+    def feed(self, frame: CanFrame, now_ns: int) -> Step:
+        """Take a frame that came at `now_ns`."""
+        if frame.can_id != cob_id.SDO_RESPONSE_BASE + self.node or frame.extended or frame.remote or frame.error:
+            return self._stray("another identifier or kind of frame")
+        if len(frame.data) != 8:
+            return self._stray("an SDO has 8 bytes")
+        if self.over:
+            return self._stray("the transfer is over")
+        specifier, ours = frame.data[0] >> 5, frame.data[1:4] == self._multiplexor
+        if specifier == _ABORT:
+            return self._aborted(frame.data) if ours else self._stray("an abort of another object")
+        if not self.answered:
+            if specifier != self._reply or not ours:
+                return self._stray("a reply to another request")
+            self.answered = True
+            return self._go_on(self._on_reply(frame.data), now_ns)
+        if specifier == self._segment_reply:
+            return self._go_on(self._on_segment_reply(frame.data), now_ns)
+        if specifier in (_UPLOAD_SEGMENT_REPLY, _DOWNLOAD_SEGMENT_REPLY) or (
+            specifier in (_UPLOAD_REPLY, _DOWNLOAD_REPLY) and ours
+        ):
+            return self._break(abort_codes.UNKNOWN_SPECIFIER, "a reply of another kind amid the segments", frame.data)
+        return self._stray("a reply to another request")
+
+    def expire(self, now_ns: int) -> Failed | None:
+        """The end of the transfer when its reply is overdue at `now_ns`, else None."""
+        if self.over or now_ns < self.deadline_ns:
+            return None
+        self.over = True
+        what = "between segments" if self.answered else "to the request"
+        error = ReplyTimeout(f"{self.name}: no reply {what} within {self.timeout_ns / 1e9:g} s")
+        return Failed(error, self.abort_frame(abort_codes.TIMED_OUT))
+
+    def abort_frame(self, code: int) -> CanFrame:
+        """The frame by which this client aborts the transfer."""
+        return self._frame(b"\x80" + self._multiplexor + code.to_bytes(4, "little"))
+
+    @abstractmethod
+    def _request(self) -> bytes: ...
+
+    @abstractmethod
+    def _on_reply(self, data: bytes) -> Step: ...
+
+    @abstractmethod
+    def _on_segment_reply(self, data: bytes) -> Step: ...
+
+    def _frame(self, data: bytes) -> CanFrame:
+        return CanFrame(cob_id.SDO_REQUEST_BASE + self.node, data.ljust(8, b"\0"))
+
+    def _go_on(self, step: Step, now_ns: int) -> Step:
+        if isinstance(step, Send):
+            self.deadline_ns = now_ns + self.timeout_ns
+        else:
+            self.over = True
+        return step
+
+    def _stray(self, why: str) -> Step:
+        self.strays += 1
+        if self.over or self.strays <= MAX_STRAYS:
+            return Stray(why)
+        return self._break(abort_codes.UNKNOWN_SPECIFIER, f"{self.strays} frames that are no reply", b"")
+
+    def _aborted(self, data: bytes) -> Failed:
+        self.answered = self.over = True
+        code = int.from_bytes(data[4:8], "little")
+        return Failed(SdoAborted(self.index, self.subindex, code, abort_codes.meaning(code)), None)
+
+    def _break(self, code: int, why: str, data: bytes) -> Failed:
+        """Give up because of what the node sent; the abort tells it why."""
+        self.over = True
+        error = Desync(f"{self.name}: {why}; {abort_codes.meaning(code)}", got=data.hex(" "))
+        return Failed(error, self.abort_frame(code))
+
+    def _toggled(self, data: bytes) -> bool:
+        """Whether the toggle bit is the one that is due (7.2.4.3.3, CO-001); if so the next one is the other."""
+        if (data[0] >> 4) & 1 != self._toggle:
+            return False
+        self._toggle ^= 1
+        return True
+
+
+class SdoUpload(SdoTransfer):
+    """Read an object. `length` is its size where the caller knows it: an expedited reply may leave it out (CO-029).
+
+    Without `length` such a reply gives all 4 bytes.
+    """
+
+    _reply = _UPLOAD_REPLY
+    _segment_reply = _UPLOAD_SEGMENT_REPLY
+
+    def __init__(
+        self,
+        node: int,
+        index: int,
+        subindex: int,
+        timeout_ns: int,
+        *,
+        length: int | None = None,
+        max_bytes: int = MAX_BYTES,
+    ) -> None:
+        super().__init__(node, index, subindex, timeout_ns)
+        self._length = length
+        self._max_bytes = max_bytes
+        self._indicated: int | None = None
+        self._received = bytearray()
+
+    def _request(self) -> bytes:
+        return b"\x40" + self._multiplexor
+
+    def _on_reply(self, data: bytes) -> Step:
+        expedited, sized = data[0] & 0x02, data[0] & 0x01
+        if expedited:
+            length = 4 - ((data[0] >> 2) & 3) if sized else min(4, 4 if self._length is None else self._length)
+            return Done(data[4 : 4 + length])
+        self._indicated = int.from_bytes(data[4:8], "little") if sized else None
+        if self._indicated is not None and self._indicated > self._max_bytes:
+            return self._break(abort_codes.OUT_OF_MEMORY, f"{self._indicated} bytes announced", data)
+        return Send(self._frame(b"\x60"))
+
+    def _on_segment_reply(self, data: bytes) -> Step:
+        if not self._toggled(data):
+            return self._break(abort_codes.TOGGLE_NOT_ALTERNATED, "a segment twice or out of turn", data)
+        last = data[0] & 0x01
+        segment = data[1 : 8 - ((data[0] >> 1) & 7)]
+        if not segment and not last:  # would never come to an end
+            return self._break(abort_codes.UNKNOWN_SPECIFIER, "a segment without data that is not the last", data)
+        self._received += segment
+        total, indicated = len(self._received), self._indicated
+        if total > self._max_bytes:
+            return self._break(abort_codes.OUT_OF_MEMORY, f"more than {self._max_bytes} bytes", data)
+        if indicated is not None and total > indicated:
+            return self._break(abort_codes.LENGTH_TOO_HIGH, f"{indicated} bytes announced, {total} sent", data)
+        if not last:
+            return Send(self._frame(bytes([0x60 | self._toggle << 4])))
+        if indicated is not None and total < indicated:
+            return self._break(abort_codes.LENGTH_TOO_LOW, f"{indicated} bytes announced, {total} sent", data)
+        return Done(bytes(self._received))
+
+
+class SdoDownload(SdoTransfer):
+    """Write an object: 1 to 4 bytes expedited, anything else segmented (nothing at all is one empty segment, CO-030)."""
+
+    _reply = _DOWNLOAD_REPLY
+    _segment_reply = _DOWNLOAD_SEGMENT_REPLY
+
+    def __init__(self, node: int, index: int, subindex: int, timeout_ns: int, data: bytes) -> None:
+        super().__init__(node, index, subindex, timeout_ns)
+        if len(data) > MAX_BYTES:
+            raise UsageError(
+                f"{self.name}: too much to write", expected=f"at most {MAX_BYTES} bytes", got=str(len(data))
+            )
+        self._data = bytes(data)
+        self._sent = 0
+        self._last_sent = False
+
+    @property
+    def _expedited(self) -> bool:
+        return 1 <= len(self._data) <= 4
+
+    def _request(self) -> bytes:
+        size = len(self._data)
+        if self._expedited:
+            return bytes([0x23 | (4 - size) << 2]) + self._multiplexor + self._data
+        return b"\x21" + self._multiplexor + size.to_bytes(4, "little")
+
+    def _on_reply(self, data: bytes) -> Step:
+        return Done(b"") if self._expedited else self._next_segment()
+
+    def _on_segment_reply(self, data: bytes) -> Step:
+        if not self._toggled(data):
+            return self._break(abort_codes.TOGGLE_NOT_ALTERNATED, "a segment acknowledged twice or out of turn", data)
+        return Done(b"") if self._last_sent else self._next_segment()
+
+    def _next_segment(self) -> Step:
+        if self._last_sent:
+            raise Bug("a segment after the last", where=self.name)
+        segment = self._data[self._sent : self._sent + 7]
+        self._sent += len(segment)
+        self._last_sent = self._sent == len(self._data)
+        command = self._toggle << 4 | (7 - len(segment)) << 1 | self._last_sent
+        return Send(self._frame(bytes([command]) + segment))

@@ -1,0 +1,226 @@
+"""One node's default SDO channel: one transfer at a time, and no reply paired with a request that it does not answer.
+
+Between the pure transfers (`sdo`), the bookkeeping of late replies (`late_replies`) and the master, which owns the bus
+and delivers what comes on 580h + node id. It decides nothing about objects.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted
+from gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
+from gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, SdoUpload, Send, Stray
+
+MAX_INBOX = 128
+"""Frames that wait for the transfer's task; a flood beyond that is dropped and counted."""
+
+
+@dataclass(slots=True)
+class Counters:
+    """What a master has seen and done since it was made.
+
+    Requests and replies are counted in frames, as a bus analyser would: each initiate and each segment that is sent,
+    each reply that carried a transfer on or ended it. Aborts that the node sent are in `sdo_aborts` only, aborts that
+    the master sent in `frames_out` only. `sdo_timeouts` are requests that got no reply; `sdo_probes` are the transfers
+    made to get past late replies. `ignored` are frames that were for nobody.
+    """
+
+    frames_in: int = 0
+    frames_out: int = 0
+    sdo_requests: int = 0
+    sdo_replies: int = 0
+    sdo_aborts: int = 0
+    sdo_timeouts: int = 0
+    sdo_probes: int = 0
+    pdos: int = 0
+    heartbeats: int = 0
+    emcys: int = 0
+    ignored: int = 0
+
+
+def is_final(data: bytes) -> bool:
+    """Whether an SDO reply leaves no transfer open in the node: an abort, or an expedited upload's reply."""
+    return len(data) == 8 and (data[0] >> 5 == 4 or (data[0] >> 5 == 2 and bool(data[0] & 0x02)))
+
+
+def multiplexor_of(data: bytes) -> Multiplexor:
+    """Index and subindex of an SDO that carries them."""
+    return int.from_bytes(data[1:3], "little"), data[3]
+
+
+class SdoChannel:
+    """The client's end of one channel. `deliver` is called by the bus's reader, `run` by whoever wants an object."""
+
+    def __init__(
+        self, node: int, send: Callable[[CanFrame], Awaitable[None]], clock: Clock, counters: Counters, timeout_ns: int
+    ) -> None:
+        self._node = node
+        self._send = send
+        self._clock = clock
+        self._counters = counters
+        self._timeout_ns = timeout_ns
+        self._turn = asyncio.Lock()
+        self._late = LateReplies()
+        self._active: SdoTransfer | None = None
+        self._inbox: deque[CanFrame] = deque()
+        self._arrived = asyncio.Event()
+        self._lost: ConnectionLost | None = None
+        self._last_answer: Multiplexor | None = None
+
+    def deliver(self, frame: CanFrame) -> bool:
+        """A frame came from the node. True when it repeats the last answer: two nodes with one id do that (CO-042)."""
+        active = self._active
+        repeated = self._is_foreign(frame, active)
+        if active is None or len(self._inbox) >= MAX_INBOX:
+            self._counters.ignored += 1
+        else:
+            self._inbox.append(frame)
+            self._arrived.set()
+        return repeated
+
+    def lose(self, error: ConnectionLost | None) -> None:
+        """Nobody reads the bus any more (None: again): what waits fails now, what comes later at once."""
+        self._lost = error
+        self._arrived.set()
+
+    def on_boot_up(self) -> None:
+        """The node booted: what it owed, it will never send."""
+        self._late.settle()
+        self._last_answer = None
+
+    async def run(self, transfer: SdoTransfer) -> bytes:
+        """Do `transfer` when its turn comes. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`."""
+        async with self._turn:
+            await self._settle(transfer)
+            return await self._run(transfer)
+
+    async def _settle(self, transfer: SdoTransfer) -> None:
+        """Make sure that no late reply can pass for one to `transfer` (see `late_replies`)."""
+        wanted = (transfer.index, transfer.subindex)
+        if not self._late.is_ambiguous(wanted):
+            return
+        self._counters.sdo_probes += 1
+        index, subindex = self._late.probe()
+        try:
+            await self._run(SdoUpload(self._node, index, subindex, self._timeout_ns))
+        except SdoAborted:
+            pass  # an answer, which is all that was wanted
+        except ReplyTimeout as e:
+            hint = (
+                f"an earlier request for {transfer.name} is unanswered, so {index:04X}h:{subindex:02X} was asked first"
+            )
+            raise ReplyTimeout(f"{transfer.name}: the node does not answer", hint=hint) from e
+        if self._late.is_ambiguous(wanted):
+            raise ReplyTimeout(f"{transfer.name}: an earlier reply is still outstanding")
+
+    async def _run(self, transfer: SdoTransfer) -> bytes:
+        """Drive one transfer to its end, leaving on record whether its answer may still come."""
+        if self._lost is not None:
+            raise self._again(self._lost)
+        request, complete = (transfer.index, transfer.subindex), False
+        self._inbox.clear()
+        self._active, self._last_answer = transfer, None
+        try:
+            data = await self._drive(transfer)
+            complete = True
+            self._last_answer = request
+            return data
+        except SdoAborted:
+            complete = True
+            raise
+        finally:
+            self._active = None
+            if transfer.answered:
+                self._late.answered(request)
+            if not complete:
+                self._late.unanswered(request)
+
+    async def _drive(self, transfer: SdoTransfer) -> bytes:
+        await self._request(transfer.start(self._clock.monotonic_ns()), transfer)
+        while True:
+            frame = await self._next_frame(transfer)
+            if frame is None:
+                self._counters.sdo_timeouts += 1
+                await self._fail(transfer.expire(transfer.deadline_ns))
+                continue
+            match transfer.feed(frame, self._clock.monotonic_ns()):
+                case Send(request):
+                    self._counters.sdo_replies += 1
+                    await self._request(request, transfer)
+                case Done(data):
+                    self._counters.sdo_replies += 1
+                    return data
+                case Failed() as failed:
+                    await self._fail(failed)
+                case Stray():
+                    self._counters.ignored += 1
+
+    async def _request(self, frame: CanFrame, transfer: SdoTransfer) -> None:
+        """Send within the time of the reply: a transmit queue that never empties must not block for ever (CO-063)."""
+        self._counters.sdo_requests += 1
+        try:
+            async with asyncio.timeout(self._left_s(transfer)):
+                await self._send(frame)
+        except TimeoutError as e:
+            self._counters.sdo_timeouts += 1
+            transfer.over = True
+            raise ReplyTimeout(f"{transfer.name}: the request could not be sent", hint="the bus takes no frames") from e
+
+    async def _fail(self, failed: Failed | None) -> None:
+        """Tell the node why, if it was us who gave up, and raise."""
+        if failed is None:
+            return
+        if isinstance(failed.error, SdoAborted):
+            self._counters.sdo_aborts += 1
+        if failed.abort is not None:
+            try:
+                async with asyncio.timeout(self._timeout_ns / NS_PER_S):
+                    await self._send(failed.abort)
+            except TimeoutError:
+                pass  # the abort is a courtesy: the next initiate request ends the old transfer as well
+        raise failed.error
+
+    async def _next_frame(self, transfer: SdoTransfer) -> CanFrame | None:
+        """The next frame for the transfer, None when its reply is overdue."""
+        while not self._inbox:
+            if self._lost is not None:
+                raise self._again(self._lost)
+            left_s = self._left_s(transfer)
+            if left_s <= 0:
+                return None
+            self._arrived.clear()
+            try:
+                async with asyncio.timeout(left_s):
+                    await self._arrived.wait()
+            except TimeoutError:
+                continue
+        return self._inbox.popleft()
+
+    def _left_s(self, transfer: SdoTransfer) -> float:
+        return (transfer.deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
+
+    def _is_foreign(self, frame: CanFrame, active: SdoTransfer | None) -> bool:
+        """Put a reply that answers no present request on record; True when it repeats the last answer."""
+        if len(frame.data) != 8 or frame.data[0] >> 5 not in (2, 3, 4):
+            return False
+        request = multiplexor_of(frame.data)
+        if active is not None and (active.index, active.subindex) == request:
+            return False
+        if self._late.is_ambiguous(request):
+            if is_final(frame.data):
+                self._late.answered(request)
+            return False
+        if request != self._last_answer:
+            return False
+        self._last_answer = None  # told once an answer
+        return True
+
+    def _again(self, lost: ConnectionLost) -> ConnectionLost:
+        """A fresh error for each caller: one instance would collect all their tracebacks."""
+        return ConnectionLost(lost.message, where=lost.where)

@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from typing import ClassVar, Protocol
 
 from gateway.core.connection import PROTOCOL, ByteConnection, CanConnection
-from gateway.core.errors import Bug, FileInvalid, UnknownCommand
+from gateway.core.errors import Bug, DeviceRefused, FileInvalid, NotAllowed, UnknownCommand
 from gateway.core.events import Consumer, Producer
 from gateway.core.values import COMMAND, DATA, Reason, TagValue
 from gateway.devices.config import DeviceConfig
@@ -78,8 +78,18 @@ class DeviceDriver(ABC):
             )
 
     async def send(self) -> None:
-        """Send: consume ; write. The consumer's queue must not be empty."""
-        await self._write(self.consumer.consume())
+        """Send: consume ; write. The consumer's queue must not be empty.
+
+        What the device or the configuration refused is gone; what the wire lost stays first in the queue.
+        """
+        item = self.consumer.consume()
+        try:
+            await self._write(item)
+        except (DeviceRefused, NotAllowed):
+            raise
+        except BaseException:  # a cancelled write may or may not have arrived: it is sent again under its own name
+            self.consumer.put_back(item)
+            raise
 
     async def receive(self, what: str) -> None:
         """Receive: read ; emit. `what` is a poll group, or whatever else the driver reads by name."""

@@ -109,17 +109,6 @@ class TransmitterDriver(RegisterDriver):
         self.outbox_free = free
         return free
 
-    async def send(self) -> None:
-        """Send: consume ; write. A message whose write failed stays first in the queue, under the same sequence."""
-        item = self.consumer.consume()
-        try:
-            await self._write(item)
-        except NotAllowed:
-            raise
-        except BaseException:
-            self.consumer.put_back(item)
-            raise
-
     async def _write(self, item: DATA) -> None:
         box = self._outbox
         if not 0 < len(item.data) <= box.bytes:

@@ -1,0 +1,64 @@
+"""Tasks that belong together, started and stopped in order.
+
+``asyncio.TaskGroup`` cancels in the order of a set, which differs from run to run; under virtual time that changes the
+trace. Here children are kept in a list, stopped in the order of their creation, and the first failure stops all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from types import TracebackType
+from typing import Any
+
+
+class Nursery:
+    """``async with Nursery() as nursery: nursery.start(coro, "name")``. On leaving, every child is cancelled and awaited.
+
+    `wait` returns when the first child ends: normally, or by raising what the child raised.
+    """
+
+    def __init__(self) -> None:
+        self._children: list[asyncio.Task[Any]] = []
+        self._ended = asyncio.Event()
+
+    def start(self, coro: Coroutine[Any, Any, Any], name: str) -> asyncio.Task[Any]:
+        """Run `coro` as a child named `name`."""
+        task = asyncio.get_running_loop().create_task(coro, name=name)
+        task.add_done_callback(self._on_done)
+        self._children.append(task)
+        return task
+
+    def _on_done(self, task: asyncio.Task[Any]) -> None:
+        self._ended.set()
+
+    async def wait(self) -> None:
+        """Until a child fails, or all have ended. Raises the first failure in order of creation."""
+        while any(not child.done() for child in self._children):
+            await self._ended.wait()
+            self._ended.clear()
+            self._raise_first()
+        self._raise_first()
+
+    def _raise_first(self) -> None:
+        for child in self._children:
+            if child.done() and not child.cancelled() and (error := child.exception()) is not None:
+                raise error
+
+    async def __aenter__(self) -> Nursery:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        failed: BaseException | None = None
+        for child in self._children:
+            child.cancel()
+            try:
+                await child
+            except asyncio.CancelledError:
+                pass  # that is what was asked for
+            except BaseException as e:  # kept, and raised below unless something else is on its way already
+                failed = failed or e
+        if failed is not None and error is None:
+            raise failed

@@ -1,0 +1,48 @@
+"""The audit log: every write, NMT command and refusal, one JSON line each, appended and never rewritten.
+
+Who asked (the PLC, the safe-state logic, the start-up configuration), what, the old and the new value, and how it ended.
+Secret tags are redacted. A log that cannot be written stops writes to the plant: what is not on record does not happen.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from gateway.core.clock import Clock
+from gateway.core.errors import Unreachable
+
+
+class AuditLog:
+    """Appends to `path`, which only its owner may read. Each entry is on disk before `write` returns its control."""
+
+    def __init__(self, path: Path, clock: Clock) -> None:
+        self._clock = clock
+        self._path = path
+        self.entries = 0
+        try:
+            descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        except OSError as e:
+            raise Unreachable(f"cannot open the audit log: {e.strerror}", where=str(path)) from e
+        self._file: BinaryIO = os.fdopen(descriptor, "ab", buffering=0)
+
+    def note(self, action: str, device: str, *, by: str, result: str, **details: Any) -> None:
+        """One entry. `action` is write, nmt, sdo or refuse; `result` is asked, done, refused or failed, with a reason."""
+        entry = {
+            "utc_ns": self._clock.utc_ns(),
+            "action": action,
+            "device": device,
+            "by": by,
+            "result": result,
+            **details,
+        }
+        try:
+            self._file.write(json.dumps(entry, separators=(",", ":"), default=str).encode() + b"\n")
+        except OSError as e:
+            raise Unreachable(f"cannot write the audit log: {e.strerror}", where=str(self._path)) from e
+        self.entries += 1
+
+    def close(self) -> None:
+        self._file.close()

@@ -1,0 +1,21 @@
+"""How long to leave somebody alone who did not answer: doubling, with a ceiling."""
+
+from __future__ import annotations
+
+
+class Backoff:
+    """Delays in seconds: `first_s`, twice that, and so on up to `limit_s`; `reset` after a success."""
+
+    def __init__(self, first_s: float = 0.5, limit_s: float = 10.0) -> None:
+        self._first_s = first_s
+        self._limit_s = limit_s
+        self.failures = 0
+
+    def next_s(self) -> float:
+        """Note a failure; the delay before the next try."""
+        delay = min(self._limit_s, self._first_s * 2.0 ** min(self.failures, 20))
+        self.failures += 1
+        return delay
+
+    def reset(self) -> None:
+        self.failures = 0

@@ -1,0 +1,79 @@
+"""The tag table: every tag's newest value, and the journal of what was published as good.
+
+A value that nobody refreshed for its device's `stale_after_ms` is bad when it is looked at, whoever last called it good.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
+
+JOURNAL = 100_000
+"""Published values that are kept until somebody fetches them; the oldest are dropped and counted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """A good value as it was published: number (from 1), tag, what the device sent, engineering value, source time."""
+
+    number: int
+    tag: str
+    raw: bytes
+    value: Scalar | None
+    t_ns: int
+
+
+class TagTable:
+    """Values by full tag name. `TagSink` for the drivers, a source for image, status and store."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._values: dict[str, TagValue] = {}
+        self._refreshed_ns: dict[str, int] = {}
+        self._stale_ns: dict[str, int] = {}
+        self._journal: deque[Published] = deque(maxlen=JOURNAL)
+        self.published = 0
+        self.journal_dropped = 0
+
+    def declare(self, names: list[str], stale_after_ms: int | None) -> None:
+        """Make tags known. A value not refreshed for `stale_after_ms` is bad; None for values read once (an identity)."""
+        for name in names:
+            self._values.setdefault(name, NEVER)
+            if stale_after_ms is not None:
+                self._stale_ns[name] = stale_after_ms * NS_PER_MS
+
+    @property
+    def names(self) -> list[str]:
+        return list(self._values)
+
+    def put(self, name: str, value: TagValue) -> None:
+        """The newest value of a tag. A good one is journalled when it is another sample or other bytes."""
+        before = self._values.get(name, NEVER)
+        self._values[name] = value
+        self._refreshed_ns[name] = self._clock.monotonic_ns()
+        if value.quality is Quality.GOOD and (value.t_ns != before.t_ns or value.raw != before.raw or not before.good):
+            self.published += 1
+            self.journal_dropped += len(self._journal) == JOURNAL
+            self._journal.append(Published(self.published, name, value.raw, value.value, value.t_ns))
+
+    def put_bad(self, names: list[str], reason: Reason) -> None:
+        """The tags are bad from now on; their last value and its time stay readable."""
+        for name in names:
+            before = self._values.get(name, NEVER)
+            if before.quality is not Quality.BAD or before.reason is not reason:
+                self._values[name] = replace(before, quality=Quality.BAD, reason=reason)
+
+    def current(self, name: str, now_ns: int) -> TagValue:
+        """The value of a tag as of `now_ns`: bad with reason STALE when it was not refreshed in time."""
+        value = self._values[name]
+        limit = self._stale_ns.get(name)
+        if limit is None or value.quality is Quality.BAD or now_ns - self._refreshed_ns.get(name, 0) <= limit:
+            return value
+        return replace(value, quality=Quality.BAD, reason=Reason.STALE)
+
+    def journal_since(self, number: int) -> list[Published]:
+        """What was published as good after entry `number`, as far as it is still kept."""
+        return [entry for entry in self._journal if entry.number > number]

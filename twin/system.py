@@ -1,0 +1,213 @@
+"""The system: what a system file says, resolved and checked as a whole. The plant and its prototype both start from it.
+
+Everything that can be found wrong without a wire is found here, with file, line and column: unknown buses and profiles, two
+devices on one address, tags that no profile has, programs bound to nothing. Nothing here knows what is emulated.
+"""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.profile import DeviceProfile, Tag, load_profile
+from gateway.core.yaml_file import Key, YamlFile, load, validate
+from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
+from twin.data_files import find
+from twin.system_schema import DeviceForm, PlcForm, SystemForm
+
+
+@dataclass(frozen=True)
+class System:
+    """A system, resolved. Dictionaries keep the file's order. `hash` tells one version of the file from another."""
+
+    name: str
+    path: Path
+    hash: str
+    buses: dict[str, BusConfig]
+    devices: dict[str, DeviceConfig]
+    plc: PlcForm
+    remote: str
+    file: YamlFile
+
+    def devices_on(self, bus: str) -> list[DeviceConfig]:
+        """The devices of a bus, in the file's order."""
+        return [d for d in self.devices.values() if d.bus == bus]
+
+
+def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
+    """Read a system by path or bare name. Raises `FileInvalid` or `UsageError`."""
+    path = find("systems", name, extra=profiles)
+    file = load(path)
+    form = validate(file, SystemForm)
+    buses = {n: _bus(file, n, b.url, b.timeout_ms, b.retries, b.bitrate) for n, b in form.buses.items()}
+    devices = {n: _device(file, n, d, buses, path, profiles) for n, d in form.devices.items()}
+    _check_addresses(file, devices)
+    system = System(
+        name=form.system,
+        path=path,
+        hash=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        buses=buses,
+        devices=devices,
+        plc=form.plc,
+        remote=form.remote,
+        file=file,
+    )
+    _check_programs(system)
+    return system
+
+
+def _bus(file: YamlFile, name: str, url: str, timeout_ms: int, retries: int, bitrate: int) -> BusConfig:
+    try:
+        endpoint = Endpoint.parse(url)
+        if endpoint.scheme == "pty":
+            raise UsageError("a pty is made by an emulator", expected="the plant's endpoint, such as rtu:/dev/ttyS0")
+    except UsageError as e:
+        raise file.error(("buses", name, "url"), e.message, expected=e.expected, got=e.got) from e
+    return BusConfig(name, endpoint, timeout_ms / 1000, retries, bitrate)
+
+
+def _device(
+    file: YamlFile, name: str, d: DeviceForm, buses: dict[str, BusConfig], path: Path, profiles: Iterable[Path]
+) -> DeviceConfig:
+    loc: tuple[Key, ...] = ("devices", name)
+    if d.bus not in buses:
+        raise file.error(
+            (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=_near(d.bus, buses)
+        )
+    try:
+        profile = load_profile(find("devices", d.profile, beside=path, extra=profiles))
+    except UsageError as e:
+        raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
+    is_can = buses[d.bus].endpoint.is_can
+    if is_can != (profile.protocol == "canopen"):
+        raise file.error((*loc, "bus"), f"a {profile.protocol} device on {buses[d.bus].endpoint}")
+    address, wanted = (d.node, "node") if is_can else (d.unit, "unit")
+    if address is None:
+        raise file.error(loc, f"the key {wanted!r} is missing", expected=f"the device's {wanted} id")
+    config = DeviceConfig(
+        name=name,
+        profile=profile,
+        bus=d.bus,
+        address=address,
+        poll={group: p.every_ms for group, p in d.poll.items()},
+        expect=dict(d.expect),
+        stale_after_ms=d.stale_after_ms,
+        writable=frozenset(d.writable),
+        safe=dict(d.safe),
+        heartbeat=Heartbeat(d.heartbeat.producer_ms, d.heartbeat.consumer_ms) if d.heartbeat else None,
+        tpdo1=Tpdo(tuple(d.tpdo1.map), d.tpdo1.event_ms) if d.tpdo1 else None,
+        start=d.start,
+    )
+    _check_device(file, loc, d, config)
+    return config
+
+
+def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:
+    """Every tag and poll group that the device's entry names must be in its profile, and fit its use."""
+    profile = config.profile
+    groups = [*profile.groups, *(["inbox"] if profile.inbox else [])]
+    for group in d.poll:
+        if group not in groups:
+            raise file.error(
+                (*loc, "poll", group), f"no poll group {group!r}", expected=", ".join(groups), hint=_near(group, groups)
+            )
+    mailbox = {"outbox", "inbox_ack"} if profile.inbox else set()
+    for i, tag in enumerate(d.writable):
+        if tag not in mailbox:
+            _writable(file, (*loc, "writable", i), profile, tag)
+    for tag, value in d.safe.items():
+        limits = _writable(file, (*loc, "safe", tag), profile, tag).limits
+        if tag not in d.writable:
+            raise file.error((*loc, "safe", tag), f"{tag!r} has a safe value and is not in `writable`")
+        if limits and not limits[0] <= value <= limits[1]:
+            raise file.error(
+                (*loc, "safe", tag),
+                f"the safe value of {tag!r}",
+                expected=f"{limits[0]:g} to {limits[1]:g}",
+                got=f"{value:g}",
+            )
+    for tag in d.expect:
+        _known(file, (*loc, "expect", tag), profile, tag)
+    for i, tag in enumerate(d.tpdo1.map if d.tpdo1 else []):
+        _known(file, (*loc, "tpdo1", "map", i), profile, tag)
+
+
+def _known(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, tag: str) -> Tag:
+    if tag not in profile.tags:
+        raise file.error(
+            loc, f"{profile.name} has no tag {tag!r}", expected=", ".join(profile.tags), hint=_near(tag, profile.tags)
+        )
+    return profile.tags[tag]
+
+
+def _writable(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, name: str) -> Tag:
+    tag = _known(file, loc, profile, name)
+    if not tag.writable:
+        raise file.error(loc, f"the tag {name!r} of {profile.name} is read-only")
+    return tag
+
+
+def _check_addresses(file: YamlFile, devices: dict[str, DeviceConfig]) -> None:
+    taken: dict[tuple[str, int], str] = {}
+    for name, device in devices.items():
+        key = (device.bus, device.address)
+        if key in taken:
+            what = "node" if device.profile.protocol == "canopen" else "unit"
+            raise file.error(
+                ("devices", name, what),
+                f"{name!r} has {what} {device.address} on {device.bus!r}, and so has {taken[key]!r}",
+                expected=f"a {what} id of its own",
+            )
+        taken[key] = name
+
+
+def _check_programs(system: System) -> None:
+    """Inputs and outputs of programs are tags or messages of devices, and an output is written by one program only."""
+    written: dict[str, str] = {}
+    for name, program in system.plc.programs.items():
+        loc: tuple[Key, ...] = ("plc", "programs", name)
+        for variable, form in program.inputs.items():
+            device, local = _split(system, (*loc, "inputs", variable, "tag"), form.tag)
+            names = [t.name for t in device.profile.tags.values() if t.readable and not t.is_text]
+            names += [*device.profile.messages, *(["inbox"] if device.profile.inbox else [])]
+            _in(system.file, (*loc, "inputs", variable, "tag"), device, local, names)
+        for variable, tag in program.outputs.items():
+            spot = (*loc, "outputs", variable)
+            device, local = _split(system, spot, tag)
+            names = [t.name for t in device.profile.tags.values() if t.writable]
+            names += ["outbox"] if device.profile.outbox else []
+            _in(system.file, spot, device, local, names)
+            if local not in device.writable:
+                raise system.file.error(spot, f"{tag!r} is not in `writable` of {device.name!r}")
+            if tag in written:
+                raise system.file.error(spot, f"{tag!r} is written by {written[tag]!r} already")
+            written[tag] = name
+
+
+def _split(system: System, loc: tuple[Key, ...], tag: str) -> tuple[DeviceConfig, str]:
+    device, _, local = tag.partition(".")
+    if device not in system.devices:
+        raise system.file.error(
+            loc, f"no device {device!r}", expected=", ".join(system.devices), hint=_near(device, system.devices)
+        )
+    return system.devices[device], local
+
+
+def _in(file: YamlFile, loc: tuple[Key, ...], device: DeviceConfig, local: str, names: list[str]) -> None:
+    if local not in names:
+        raise file.error(
+            loc,
+            f"{device.name!r} has no {local!r} for this use",
+            expected=", ".join(names) or "none",
+            hint=_near(local, names),
+        )
+
+
+def _near(word: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,192 @@
+"""A virtual serial port: the emulated device holds the pty's master end, the gateway opens a link to the other.
+
+Knows no protocol. What a real port does and a pty does not is made up for here: the port stays when nobody has it open
+(a spare descriptor of the far end is kept, or reading would fail with EIO), bytes pass unchanged (raw mode), and with
+`pace` a reply takes the time that the line would have needed. Parity does not exist on a pty.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import termios
+from pathlib import Path
+
+from emulators.wires.serial_line import SerialPacer
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from gateway.core.endpoint import Endpoint, SerialSettings
+from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+
+READ_SIZE = 4096
+FIFO_CHARS = 16
+"""A paced reply appears in pieces of this size, as out of a UART's FIFO: a timer a character would cost more."""
+
+
+class PtyEnd(ByteConnection):
+    """The device's end of a virtual serial port. Made by `open`.
+
+    `link` is the path for the other side, stable over restarts; `device` is the pty behind it. The other side may close
+    and reopen as often as it likes; what it did not read stays until it does, or flushes.
+    """
+
+    def __init__(self, link: Path, endpoint: Endpoint, pace: SerialSettings | None, master: int, spare: int) -> None:
+        super().__init__(RS232Connection(), endpoint)
+        self.link = link
+        self.device = os.ttyname(spare)
+        self._master = master
+        self._spare = spare
+        self._loop = asyncio.get_running_loop()
+        self._inward = SerialPacer(pace) if pace else None
+        self._outward = SerialPacer(pace) if pace else None
+        self._writing = asyncio.Lock()
+        self._room: asyncio.Future[None] | None = None
+        self._reading = False
+
+    @classmethod
+    async def open(cls, link: Path, endpoint: Endpoint, pace: SerialSettings | None = None) -> PtyEnd:
+        """Make the port and its link, replacing a link that is there. With `pace`, replies come at that line's speed.
+
+        Raises `EndpointBusy` where something that is no link stands in the way, `Unreachable` where none can be made.
+        """
+        try:
+            master, spare = os.openpty()
+        except OSError as e:
+            raise Unreachable(f"no pty to be had: {e.strerror}", where=str(endpoint)) from e
+        try:
+            os.set_blocking(master, False)
+            _make_raw(spare, pace)
+            end = cls(link, endpoint, pace, master, spare)
+            _replace_link(link, end.device, endpoint)
+        except BaseException:
+            os.close(master)
+            os.close(spare)
+            raise
+        end._resume_reading()
+        return end
+
+    async def write(self, data: bytes) -> None:
+        """Send `data`, one writer after the other; with pacing, return when the line would have carried it."""
+        async with self._writing:
+            if self._outward is None:
+                await self._hand_over(data)
+                return
+            start_ns = self._line_is_ours_ns()
+            for at in range(0, len(data), FIFO_CHARS):
+                piece = data[at : at + FIFO_CHARS]
+                await self._sleep_until_ns(self._outward.send(start_ns, len(piece)))
+                await self._hand_over(piece)
+
+    async def aclose(self) -> None:
+        """Close the port; remove the link unless somebody else's port took its place."""
+        if self.lost is None:
+            self.feed_lost(closed_here(self.endpoint))
+        self._close()
+
+    def on_room(self) -> None:
+        if not self._reading and self._master >= 0 and len(self.inbound.data_stream) < self.max_pending:
+            self._resume_reading()
+
+    # -- the line's time ------------------------------------------------------------------------------------------
+
+    def _now_ns(self) -> int:
+        return round(self._loop.time() * NS_PER_S)
+
+    def _line_is_ours_ns(self) -> int:
+        """From when on we may send: the pause of t3.5 after the last character that the other side sent."""
+        assert self._inward is not None
+        return max(self._now_ns(), self._inward.busy_until_ns + self._inward.t3_5_ns)
+
+    async def _sleep_until_ns(self, deadline_ns: int) -> None:
+        await asyncio.sleep(max(0, deadline_ns - self._now_ns()) / NS_PER_S)
+
+    # -- the operating system's side ------------------------------------------------------------------------------
+
+    def _resume_reading(self) -> None:
+        self._reading = True
+        self._loop.add_reader(self._master, self._on_readable)
+
+    def _on_readable(self) -> None:
+        try:
+            data = os.read(self._master, READ_SIZE)
+        except BlockingIOError:
+            return
+        except OSError as e:
+            self._fail(e)
+            return
+        if self._inward is not None:
+            self._inward.send(self._now_ns(), len(data))
+        if not self.feed(data):
+            self._reading = False
+            self._loop.remove_reader(self._master)
+
+    async def _hand_over(self, data: bytes) -> None:
+        while data:
+            if self._master < 0:
+                raise self.lost or closed_here(self.endpoint)
+            try:
+                data = data[os.write(self._master, data) :]
+            except BlockingIOError:
+                await self._wait_for_room()
+            except OSError as e:
+                raise self._fail(e) from e
+
+    async def _wait_for_room(self) -> None:
+        self._room = self._loop.create_future()
+        self._loop.add_writer(self._master, self._on_writable)
+        try:
+            await self._room
+        finally:
+            self._room = None
+            if self._master >= 0:
+                self._loop.remove_writer(self._master)
+
+    def _on_writable(self) -> None:
+        if self._room is not None and not self._room.done():
+            self._room.set_result(None)
+
+    def _fail(self, error: OSError) -> ConnectionLost:
+        what = errno.errorcode.get(error.errno or 0, "?")
+        lost = ConnectionLost(f"the virtual serial port broke: {error.strerror} ({what})", where=str(self.endpoint))
+        self.feed_lost(lost)
+        self._close()
+        return lost
+
+    def _close(self) -> None:
+        if self._master < 0:
+            return
+        self._loop.remove_reader(self._master)
+        self._loop.remove_writer(self._master)
+        self._on_writable()
+        os.close(self._master)
+        os.close(self._spare)
+        self._master = self._spare = -1
+        self._reading = False
+        try:
+            if os.readlink(self.link) == self.device:
+                self.link.unlink()
+        except OSError:
+            pass  # gone already, or no link any more: not ours to remove
+
+
+def _make_raw(descriptor: int, pace: SerialSettings | None) -> None:
+    """Bytes pass as they are: no echo, no lines, no flow control, no signals, no CR and LF games."""
+    speed = getattr(termios, f"B{pace.baudrate}", termios.B19200) if pace else termios.B19200
+    control = termios.tcgetattr(descriptor)[6]
+    control[termios.VMIN], control[termios.VTIME] = 1, 0
+    cflag = termios.CS8 | termios.CREAD | termios.CLOCAL
+    termios.tcsetattr(descriptor, termios.TCSANOW, [0, 0, cflag, 0, speed, speed, control])
+
+
+def _replace_link(link: Path, device: str, endpoint: Endpoint) -> None:
+    """Put the link in place in one step: whoever opens it meanwhile finds the old port or the new one."""
+    if os.path.lexists(link) and not link.is_symlink():
+        raise EndpointBusy("a file stands where the link to the virtual serial port goes", where=f"{endpoint}: {link}")
+    beside = link.with_name(f".{link.name}.{os.getpid()}")
+    try:
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(device)
+        beside.replace(link)
+    except OSError as e:
+        raise Unreachable(f"cannot make the link {link}: {e.strerror}", where=str(endpoint)) from e

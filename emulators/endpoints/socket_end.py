@@ -1,0 +1,210 @@
+"""The listening side of TCP: each client becomes a `ByteConnection`, served by a coroutine of its own.
+
+Knows no protocol. Bounded everywhere: so many clients, so many chunks a client, so many bytes on their way out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from collections.abc import Awaitable, Callable
+
+from gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+
+MAX_CLIENTS = 32
+MAX_PENDING_CHUNKS = 16
+"""A chunk is at most what asyncio reads at once (256 KiB): enough for any pipelining, bounded for a flood."""
+CLOSE_WITHIN_S = 1.0
+KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 3
+
+OnClient = Callable[[ByteConnection], Awaitable[None]]
+
+
+class SocketEnd(ByteConnection, asyncio.Protocol):
+    """One accepted client. A client that only stopped sending (half-close) still gets its answers."""
+
+    def __init__(self, listener: SocketListener, endpoint: Endpoint) -> None:
+        super().__init__(TCPConnection(), endpoint, MAX_PENDING_CHUNKS)
+        self.peer = ""
+        self.last_used_s = 0.0
+        """Loop time of the last byte in either direction."""
+        self._listener = listener
+        self._loop = asyncio.get_running_loop()
+        self._transport: asyncio.Transport | None = None
+        self._room: asyncio.Future[None] | None = None
+        self._full = False
+        self._closed = self._loop.create_future()
+
+    async def write(self, data: bytes) -> None:
+        self._raise_if_gone()
+        assert self._transport is not None
+        self.last_used_s = self._loop.time()
+        self._transport.write(data)
+        while self._full:
+            if self._room is None:
+                self._room = self._loop.create_future()
+            await asyncio.shield(self._room)
+            self._raise_if_gone()
+
+    async def aclose(self) -> None:
+        """Send what is buffered and close, within a second; what is not taken by then is dropped."""
+        self.feed_lost(closed_here(self.endpoint))
+        if self._transport is None or self._closed.done():
+            return
+        self._transport.close()
+        try:
+            async with asyncio.timeout(CLOSE_WITHIN_S):
+                await asyncio.shield(self._closed)
+        except TimeoutError:
+            self._transport.abort()
+            await asyncio.shield(self._closed)
+
+    def evict(self) -> None:
+        """Close at once, whatever is under way."""
+        if self._transport is not None:
+            self._transport.abort()
+
+    def on_room(self) -> None:
+        if self._transport is not None and len(self.inbound.data_stream) < self.max_pending:
+            self._transport.resume_reading()
+
+    def _raise_if_gone(self) -> None:
+        if self._transport is None or self._transport.is_closing():
+            raise self.lost or closed_here(self.endpoint)
+
+    # -- called by asyncio ----------------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        self.last_used_s = self._loop.time()
+        name = transport.get_extra_info("peername")
+        self.peer = f"{name[0]}:{name[1]}" if name else "?"
+        _keep_alive(transport.get_extra_info("socket"))
+        self._listener.connected(self)
+
+    def data_received(self, data: bytes) -> None:
+        self.last_used_s = self._loop.time()
+        if not self.feed(data) and self._transport is not None:
+            self._transport.pause_reading()
+
+    def eof_received(self) -> bool:
+        self.feed_lost(ConnectionLost("the client ended the connection", where=f"{self.endpoint}: {self.peer}"))
+        return True
+
+    def pause_writing(self) -> None:
+        self._full = True
+
+    def resume_writing(self) -> None:
+        self._full = False
+        if self._room is not None:
+            self._room.set_result(None)
+            self._room = None
+
+    def connection_lost(self, error: Exception | None) -> None:
+        reason = getattr(error, "strerror", None) or "closed"
+        self.feed_lost(ConnectionLost(f"the client is gone: {reason}", where=f"{self.endpoint}: {self.peer}"))
+        self.resume_writing()
+        if not self._closed.done():
+            self._closed.set_result(None)
+
+
+class SocketListener:
+    """Listens on an endpoint and runs `on_client(connection)` for each client; when that returns, the client is closed.
+
+    When `max_clients` are connected, the next one takes the place of the one that was silent for longest (TG 4.2.1).
+    """
+
+    def __init__(self, endpoint: Endpoint, on_client: OnClient, max_clients: int) -> None:
+        self.accepted = 0
+        self.evicted = 0
+        self.max_clients = max_clients
+        self._endpoint = endpoint
+        self._on_client = on_client
+        self._server: asyncio.Server | None = None
+        self._clients: list[SocketEnd] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    @classmethod
+    async def open(cls, endpoint: Endpoint, on_client: OnClient, max_clients: int = MAX_CLIENTS) -> SocketListener:
+        """Listen; port 0 takes a free one (`bound` says which). Raises `EndpointBusy` or `Unreachable`."""
+        listener = cls(endpoint, on_client, max_clients)
+        loop = asyncio.get_running_loop()
+        try:
+            # the first address only: a name with an IPv4 and an IPv6 address would get two different free ports
+            infos = await loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
+            host = str(infos[0][4][0])
+            listener._server = await loop.create_server(lambda: SocketEnd(listener, endpoint), host, endpoint.port)
+        except OSError as e:
+            if e.errno == errno.EADDRINUSE:
+                raise EndpointBusy("the port is in use", where=str(endpoint), hint="another instance?") from e
+            raise Unreachable(f"cannot listen: {e.strerror or e}", where=str(endpoint)) from e
+        return listener
+
+    @property
+    def bound(self) -> Endpoint:
+        """The endpoint with the port that is really listened on."""
+        if self._server is None or not self._server.sockets:
+            return self._endpoint
+        return self._endpoint.with_address(self._endpoint.host, self._server.sockets[0].getsockname()[1])
+
+    @property
+    def clients(self) -> tuple[SocketEnd, ...]:
+        """Who is connected, oldest first."""
+        return tuple(self._clients)
+
+    def connected(self, client: SocketEnd) -> None:
+        """A client was accepted."""
+        self.accepted += 1
+        if len(self._clients) >= self.max_clients:
+            idlest = min(self._clients, key=lambda c: c.last_used_s)
+            self.evicted += 1
+            self._clients.remove(idlest)
+            idlest.evict()
+        self._clients.append(client)
+        task = asyncio.get_running_loop().create_task(self._serve(client))
+        self._tasks.add(task)
+        task.add_done_callback(self._ended)
+
+    async def aclose(self) -> None:
+        """Stop listening, end every client's coroutine, close every client."""
+        if self._server is None:
+            return
+        server, self._server = self._server, None
+        server.close()
+        tasks = list(self._tasks)
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks)
+        await server.wait_closed()
+
+    async def _serve(self, client: SocketEnd) -> None:
+        try:
+            await self._on_client(client)
+        except ConnectionLost:
+            pass  # the ordinary end of a client
+        finally:
+            if client in self._clients:
+                self._clients.remove(client)
+            await client.aclose()
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None:  # one client's failure ends that client; it is reported, not swallowed
+            report = {"message": f"serving a client of {self.bound} failed", "exception": error, "task": task}
+            task.get_loop().call_exception_handler(report)
+
+
+def _keep_alive(sock: socket.socket) -> None:
+    """A client that vanished without a word is noticed in 25 s, not in two hours (row MB-064)."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    if hasattr(socket, "TCP_KEEPIDLE"):
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, KEEPALIVE_IDLE_S)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, KEEPALIVE_INTERVAL_S)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, KEEPALIVE_PROBES)

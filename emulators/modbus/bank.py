@@ -1,0 +1,155 @@
+"""The data behind a Modbus unit: four tables of cells, and what a unit may be refused.
+
+A bank knows addresses and integers. It never knows function codes, frames or engineering units.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+from gateway.core.errors import DeviceRefused, UsageError
+
+Table = Literal["coil", "discrete", "input", "holding"]
+Access = Literal["ro", "rw", "wo"]
+
+BIT_TABLES: frozenset[str] = frozenset({"coil", "discrete"})
+WRITABLE_TABLES: frozenset[str] = frozenset({"coil", "holding"})
+ADDRESSES = 0x10000
+"""Addresses of a table: 0000h to FFFFh as sent in a PDU (AP 4.4)."""
+
+
+class Refusal(DeviceRefused):
+    """The device says no; `code` is the exception code that goes into the reply (AP 7)."""
+
+    code: ClassVar[int] = 4
+
+
+class IllegalFunction(Refusal):
+    code = 1
+
+
+class IllegalAddress(Refusal):
+    code = 2
+
+
+class IllegalValue(Refusal):
+    code = 3
+
+
+class DeviceFailure(Refusal):
+    code = 4
+
+
+class Acknowledge(Refusal):
+    """Accepted, and it takes long: the master polls on (AP 7, code 05)."""
+
+    code = 5
+
+
+class Busy(Refusal):
+    code = 6
+
+
+class RegisterBank(ABC):
+    """What a unit reads and writes. Addresses are as sent (0 to 65535), bits are 0 or 1, registers 0 to 65535.
+
+    `read` and `write` may raise any `Refusal`; a refused write changes nothing. `now_ns` is the emulator's time, so
+    that a bank may be a function of time.
+    """
+
+    @abstractmethod
+    def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
+        """`count` cells from `address` on."""
+
+    @abstractmethod
+    def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
+        """Set cells from `address` on: all of them, or none and a `Refusal`."""
+
+    def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
+        """Raise what `read` would raise. For a bank whose reads have side effects: override it."""
+        self.read(table, address, count, now_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """`count` neighbouring cells that exist. `access` is the master's; discrete and input are never writable."""
+
+    table: Table
+    start: int
+    count: int
+    access: Access = "rw"
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or self.count < 1 or self.start + self.count > ADDRESSES:
+            raise UsageError(
+                f"span of the {self.table} table does not fit",
+                expected="addresses 0 to 65535, at least one",
+                got=f"{self.count} from {self.start}",
+            )
+
+
+OnWrite = Callable[[Table, int, tuple[int, ...], int], None]
+
+
+class MapBank(RegisterBank):
+    """Plain cells in declared spans, all zero at first. Gaps between spans do not exist: exception 02.
+
+    `on_write(table, address, values, now_ns)` is called for a write of the master that is otherwise fine, before any
+    cell changes; a `Refusal` raised there is the device's answer and nothing changes.
+    """
+
+    def __init__(self, spans: Iterable[Span], on_write: OnWrite | None = None) -> None:
+        self._cells: dict[tuple[Table, int], int] = {}
+        self._readable: set[tuple[Table, int]] = set()
+        self._writable: set[tuple[Table, int]] = set()
+        self._on_write = on_write
+        for span in spans:
+            self._declare(span)
+
+    def _declare(self, span: Span) -> None:
+        for address in range(span.start, span.start + span.count):
+            cell = (span.table, address)
+            if cell in self._cells:
+                raise UsageError("two spans hold the same cell", where=f"{span.table}:{address}")
+            self._cells[cell] = 0
+            if span.access != "wo":
+                self._readable.add(cell)
+            if span.access != "ro" and span.table in WRITABLE_TABLES:
+                self._writable.add(cell)
+
+    def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
+        cells = [(table, a) for a in range(address, address + count)]
+        self._require(cells, self._readable, "read")
+        return [self._cells[cell] for cell in cells]
+
+    def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
+        self._require([(table, a) for a in range(address, address + len(values))], self._writable, "written")
+        if self._on_write is not None:
+            self._on_write(table, address, tuple(values), now_ns)
+        self.poke(table, address, *values)
+
+    def peek(self, table: Table, address: int) -> int:
+        """The device's own view of a cell, whatever its access. Raises `IllegalAddress` where there is none."""
+        self._require([(table, address)], self._cells, "read")
+        return self._cells[table, address]
+
+    def poke(self, table: Table, address: int, *values: int) -> None:
+        """The device sets its own cells, read-only ones included. Raises `IllegalAddress` or `IllegalValue`."""
+        limit = 1 if table in BIT_TABLES else 0xFFFF
+        for value in values:
+            if not 0 <= value <= limit:
+                raise IllegalValue("value does not fit", expected=f"0 to {limit}", got=str(value), where=table)
+        cells = [(table, address + i) for i in range(len(values))]
+        self._require(cells, self._cells, "set")
+        self._cells.update(zip(cells, values, strict=True))
+
+    @staticmethod
+    def _require(
+        cells: list[tuple[Table, int]], allowed: dict[tuple[Table, int], int] | set[tuple[Table, int]], verb: str
+    ) -> None:
+        for table, address in cells:
+            if (table, address) not in allowed:
+                raise IllegalAddress(f"no cell that can be {verb}", where=f"{table}:{address}")

@@ -1,0 +1,104 @@
+"""Modbus TCP, server side, for one connection (MODBUS Messaging on TCP/IP Implementation Guide V1.0b, TG below).
+
+Pure: bytes in, response ADUs out, in the order of the requests. It never knows sockets, and no other connection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulators.modbus.rtu import Exchange
+from emulators.modbus.unit import ModbusUnit
+from gateway.core.errors import Desync, UsageError
+
+HEADER = 6
+"""Transaction id, protocol id and length: what precedes the bytes that the length counts (TG 3.1.3)."""
+MIN_LENGTH, MAX_LENGTH = 2, 254
+"""Unit id and function; unit id and the largest PDU of 253 bytes."""
+MAX_IN_FLIGHT = 16
+"""TG 4.4.2.2 names 1 to 16 as usual for a server."""
+ANY_UNIT = (0, 255)
+"""Unit ids that mean the device itself, where there is only one behind the address (TG 4.4.1.2)."""
+NO_PATH = 0x0A
+
+
+class MbapSlave:
+    """The units behind one connection. `units`: unit id -> unit.
+
+    With a single unit, ids 0 and 255 reach it too, and are echoed. A unit id that nobody has is answered with exception
+    0A, as a gateway does without a route. At most `max_in_flight` requests of those that came together are
+    executed; the rest gets exception 06.
+
+    `desync` says why nothing more is understood: a length that no ADU can have leaves no way to find the next one.
+    The connection is to be closed then; what is fed later is dropped.
+    """
+
+    def __init__(self, units: Mapping[int, ModbusUnit], max_in_flight: int = MAX_IN_FLIGHT) -> None:
+        for unit_id in units:
+            if not 0 <= unit_id <= 255:
+                raise UsageError("unit id", expected="0 to 255", got=str(unit_id))
+        self.units = dict(units)
+        self.max_in_flight = max_in_flight
+        self.desync: Desync | None = None
+        self.requests = 0
+        self.discarded = 0
+        """ADUs that were dropped: not Modbus, or too short for a function."""
+        self._buffer = bytearray()
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an ADU that is not whole."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes, now_ns: int) -> list[bytes]:
+        """Response ADUs to what is whole now, in order. Never raises, whatever comes."""
+        return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
+
+    def receive(self, data: bytes, now_ns: int) -> list[Exchange]:
+        """Like `feed`, with every request ADU, for taps and journals."""
+        if self.desync is not None:
+            return []
+        self._buffer += data
+        exchanges: list[Exchange] = []
+        while adu := self._next_adu():
+            self.requests += 1
+            busy = len(exchanges) >= self.max_in_flight
+            exchanges.append(Exchange(adu, self._execute(adu, busy, now_ns)))
+        return exchanges
+
+    def _next_adu(self) -> bytes | None:
+        while len(self._buffer) >= HEADER:
+            length = int.from_bytes(self._buffer[4:6], "big")
+            if length > MAX_LENGTH:
+                self.desync = Desync("MBAP length field", expected=f"{MIN_LENGTH} to {MAX_LENGTH}", got=str(length))
+                self.discarded += 1
+                self._buffer.clear()
+                return None
+            if len(self._buffer) < HEADER + length:
+                return None
+            adu = bytes(self._buffer[: HEADER + length])
+            del self._buffer[: HEADER + length]
+            if adu[2:4] == b"\x00\x00" and length >= MIN_LENGTH:
+                return adu
+            self.discarded += 1
+        return None
+
+    def _execute(self, adu: bytes, busy: bool, now_ns: int) -> bytes:
+        unit_id, pdu = adu[6], adu[7:]
+        unit = self._route(unit_id)
+        response: bytes | None
+        if unit is not None:
+            unit.heard(messages=1)
+            response = unit.refuse_busy(pdu) if busy else unit.respond(pdu, now_ns)
+        else:
+            response = bytes((pdu[0] | 0x80, NO_PATH)) if pdu[0] < 0x80 else None
+        if response is None:
+            return b""
+        return adu[:4] + (len(response) + 1).to_bytes(2, "big") + adu[6:7] + response
+
+    def _route(self, unit_id: int) -> ModbusUnit | None:
+        if unit_id in self.units:
+            return self.units[unit_id]
+        if unit_id in ANY_UNIT and len(self.units) == 1:
+            return next(iter(self.units.values()))
+        return None

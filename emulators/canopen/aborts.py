@@ -1,0 +1,62 @@
+"""SDO abort codes by name (CiA 301 v4.2, 7.2.4.3.17) and how the emulated node raises them.
+
+An abort is an ordinary `gateway.core.errors.SdoAborted`; the SDO server turns it into a frame.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from gateway.core.errors import SdoAborted
+
+
+class Abort(IntEnum):
+    """The codes that this node gives."""
+
+    TOGGLE = 0x05030000
+    TIMEOUT = 0x05040000
+    COMMAND = 0x05040001
+    OUT_OF_MEMORY = 0x05040005
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    MAPPING_TOO_LONG = 0x06040042
+    INCOMPATIBLE = 0x06040043
+    TOO_LONG = 0x06070012
+    TOO_SHORT = 0x06070013
+    NO_SUBINDEX = 0x06090011
+    VALUE = 0x06090030
+    VALUE_HIGH = 0x06090031
+    VALUE_LOW = 0x06090032
+    NOT_STORED = 0x08000020
+    DEVICE_STATE = 0x08000022
+    NO_DATA = 0x08000024
+
+
+_MEANING = {
+    Abort.TOGGLE: "toggle bit not alternated",
+    Abort.TIMEOUT: "SDO protocol timed out",
+    Abort.COMMAND: "command specifier not valid or unknown",
+    Abort.OUT_OF_MEMORY: "out of memory",
+    Abort.WRITE_ONLY: "read of a write-only object",
+    Abort.READ_ONLY: "write to a read-only object",
+    Abort.NO_OBJECT: "object does not exist",
+    Abort.NOT_MAPPABLE: "object cannot be mapped to the PDO",
+    Abort.MAPPING_TOO_LONG: "mapped objects exceed the PDO's length",
+    Abort.INCOMPATIBLE: "general parameter incompatibility",
+    Abort.TOO_LONG: "length of the parameter too high",
+    Abort.TOO_SHORT: "length of the parameter too low",
+    Abort.NO_SUBINDEX: "subindex does not exist",
+    Abort.VALUE: "invalid value for the parameter",
+    Abort.VALUE_HIGH: "value too high",
+    Abort.VALUE_LOW: "value too low",
+    Abort.NOT_STORED: "data cannot be stored",
+    Abort.DEVICE_STATE: "not in the present device state",
+    Abort.NO_DATA: "no data available",
+}
+
+
+def abort(index: int, subindex: int, code: Abort) -> SdoAborted:
+    """The error that refuses access to an object, for ``raise abort(...)``."""
+    return SdoAborted(index, subindex, int(code), _MEANING[code], where="emulated node")

@@ -1,0 +1,111 @@
+"""CANopen's basic data types as bytes: the emulator's own codec (CiA 301 v4.2, 7.1.6 and table 44).
+
+It must never be shared with a driver: a mistake made on both sides of a wire would cancel itself out.
+"""
+
+from __future__ import annotations
+
+import struct
+
+BOOLEAN = 0x01
+REAL32 = 0x08
+VISIBLE_STRING = 0x09
+OCTET_STRING = 0x0A
+UNICODE_STRING = 0x0B
+DOMAIN = 0x0F
+REAL64 = 0x11
+
+_SIGNED = {0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
+_UNSIGNED = {0x05: 8, 0x06: 16, 0x07: 32, 0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
+_REAL = {REAL32: "<f", REAL64: "<d"}
+_TIME_BYTES = {0x0C: 6, 0x0D: 6}
+"""TIME_OF_DAY and TIME_DIFFERENCE: 48 bits on the wire, opaque here."""
+
+
+def size_bytes(data_type: int) -> int | None:
+    """Bytes that a value of `data_type` takes in an SDO; None where each value has its own length."""
+    if data_type == BOOLEAN:
+        return 1
+    if data_type in _REAL:
+        return struct.calcsize(_REAL[data_type])
+    if data_type in _TIME_BYTES:
+        return _TIME_BYTES[data_type]
+    bits = _SIGNED.get(data_type) or _UNSIGNED.get(data_type)
+    return bits // 8 if bits else None
+
+
+def is_number(data_type: int) -> bool:
+    """Whether values have an order, so that limits mean something."""
+    return data_type == BOOLEAN or data_type in _SIGNED or data_type in _UNSIGNED or data_type in _REAL
+
+
+def decode(data_type: int, raw: bytes) -> int | float:
+    """The number in `raw`, which must have the type's size. Little endian, two's complement."""
+    if data_type in _REAL:
+        value: float = struct.unpack(_REAL[data_type], raw)[0]
+        return value
+    return int.from_bytes(raw, "little", signed=data_type in _SIGNED)
+
+
+def encode(data_type: int, value: int | float) -> bytes:
+    """The bytes of a number. Raises `ValueError` when it does not fit.
+
+    A signed type also takes the unsigned reading of its bits (0xFFFF for -1): data sheets write defaults so.
+    """
+    try:
+        if data_type in _REAL:
+            return struct.pack(_REAL[data_type], value)
+        whole = int(value)
+        size = size_bytes(data_type)
+        if size is None:
+            raise ValueError("the type holds no number")
+        return whole.to_bytes(size, "little", signed=data_type in _SIGNED and whole < 0)
+    except (OverflowError, struct.error) as e:
+        raise ValueError("the number does not fit the type") from e
+
+
+def parse_number(text: str) -> int:
+    """An integer as CiA 306 writes it: decimal, 0x hexadecimal, or octal with a leading zero. Raises `ValueError`."""
+    text = text.strip()
+    if text.lower().startswith(("0x", "-0x", "+0x")):
+        return int(text, 16)
+    digits = text.lstrip("+-")
+    if len(digits) > 1 and digits.startswith("0") and digits.isdigit():
+        return int(text, 8)
+    return int(text, 10)
+
+
+def encode_text(data_type: int, text: str) -> bytes:
+    """The bytes of a value as an electronic data sheet writes it (without $NODEID). Raises `ValueError`.
+
+    An empty text is a type's zero, or the empty string.
+    """
+    if data_type == VISIBLE_STRING:
+        return text.encode("latin-1", "replace")
+    if data_type == UNICODE_STRING:
+        return text.encode("utf-16-le")
+    size = size_bytes(data_type)
+    if size is None or data_type in _TIME_BYTES:
+        raw = _hex_bytes(text)
+        return raw if size is None else raw.ljust(size, b"\0")[:size]
+    if not text.strip():
+        return bytes(size)
+    if data_type in _REAL and not text.strip().lower().startswith("0x"):
+        return encode(data_type, float(text))
+    if data_type in _REAL:  # a hexadecimal number is the bit pattern
+        return _fit(parse_number(text), size)
+    return encode(data_type, parse_number(text))
+
+
+def _fit(value: int, size: int) -> bytes:
+    try:
+        return value.to_bytes(size, "little")
+    except OverflowError as e:
+        raise ValueError("the number does not fit the type") from e
+
+
+def _hex_bytes(text: str) -> bytes:
+    compact = text.replace(" ", "")
+    if compact.lower().startswith("0x"):  # written as a number: an odd digit is a nibble with its zero left out
+        compact = compact[2:].zfill(len(compact[2:]) + len(compact) % 2)
+    return bytes.fromhex(compact)

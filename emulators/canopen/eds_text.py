@@ -1,0 +1,93 @@
+"""The INI layer of an electronic data sheet (CiA 306-1, 4.2): sections of ``key=value`` lines, each with its line number.
+
+Tolerant where real files are sloppy (indentation, empty values, case, line ends, encodings), strict where a guess would
+be wrong (a section or a key given twice, a line that is nothing). It knows no objects.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from emulators.canopen.codec import parse_number
+from gateway.core.errors import FileInvalid
+
+MAX_LINES = 500_000
+"""More than any device has (65,536 objects), and a bound on what a wrong file can cost."""
+
+
+@dataclass(slots=True)
+class Section:
+    """One section. Keys are lower case; a value that is empty counts as absent."""
+
+    name: str
+    line: int
+    path: str
+    values: dict[str, tuple[str, int]] = field(default_factory=dict)
+
+    def text(self, key: str, default: str = "") -> str:
+        """The value of `key`, or `default` when it is absent or empty."""
+        return self.values.get(key.lower(), ("", 0))[0] or default
+
+    def number(self, key: str, default: int | None = None) -> int:
+        """The integer of `key`. Raises `FileInvalid` when it is no number, or absent without a default."""
+        text, line = self.values.get(key.lower(), ("", self.line))
+        if not text:
+            if default is None:
+                raise self.error(f"[{self.name}] has no {key}", key, expected="a number")
+            return default
+        try:
+            return parse_number(text)
+        except ValueError:
+            raise FileInvalid(
+                f"{key} of [{self.name}] is no number", path=self.path, line=line, expected="a number", got=text
+            ) from None
+
+    def error(self, message: str, key: str = "", *, expected: str = "", got: str = "") -> FileInvalid:
+        """An error that points at `key`, or at the section where the key is absent."""
+        line = self.values.get(key.lower(), ("", self.line))[1]
+        return FileInvalid(message, path=self.path, line=line, expected=expected, got=got)
+
+
+def decode_file(raw: bytes) -> str:
+    """Text of a data sheet: UTF-8 if it is that, else Windows-1252, which most tools write."""
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("cp1252", "replace")
+
+
+def parse_sections(text: str, path: str = "") -> dict[str, Section]:
+    """Sections by lower-case name, in the file's order. Raises `FileInvalid` with the line."""
+    sections: dict[str, Section] = {}
+    current: Section | None = None
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    if len(lines) > MAX_LINES:
+        raise FileInvalid("the file is too long", path=path, expected=f"at most {MAX_LINES} lines", got=str(len(lines)))
+    for number, line in enumerate(lines, start=1):
+        line = line.strip()
+        if not line or line.startswith(";"):
+            continue
+        if line.startswith("["):
+            name = line[1:].partition("]")[0].strip()
+            if not name or "]" not in line:
+                raise FileInvalid("a broken section header", path=path, line=number, expected="[name]", got=line)
+            if name.lower() in sections:
+                raise FileInvalid(f"section [{name}] is given twice", path=path, line=number)
+            current = sections[name.lower()] = Section(name, number, path)
+            continue
+        key, equals, value = line.partition("=")
+        if not equals or current is None:
+            expected = "[section]" if current is None else "key=value"
+            raise FileInvalid("not a line of a data sheet", path=path, line=number, expected=expected, got=line[:60])
+        key = key.strip().lower()
+        if key in current.values:
+            raise FileInvalid(f"{key} is given twice in [{current.name}]", path=path, line=number)
+        current.values[key] = (_without_comment(value).strip(), number)
+    return sections
+
+
+def _without_comment(value: str) -> str:
+    """Real files carry comments behind values; the standard wants them on lines of their own."""
+    for mark in (" ;", "\t;"):
+        value = value.partition(mark)[0]
+    return value

@@ -1,0 +1,158 @@
+"""Error control: heartbeat producer (1017h), heartbeat consumer (1016h, 1029h) and the answer to node guarding.
+
+CiA 301 v4.2, 7.2.8 and 7.5.2.19 to 20. A node that has no 1017h produces none; one whose producer is off and that has
+100Ch answers guarding requests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from emulators.canopen import emcy
+from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.service import Core, NmtState, Service
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_MS
+
+ERROR_CONTROL = 0x700
+
+
+class HeartbeatProducer(Service):
+    """Sends the state every 1017h milliseconds; a written period counts from that moment, its first beat at once."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._next_ns: int | None = None
+        self._toggle = 0
+
+    def owns(self, index: int) -> bool:
+        return index == 0x1017
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        self._next_ns = now_ns if self._period_ns() else None
+
+    def reset(self, now_ns: int) -> None:
+        """The boot-up message counts as the first heartbeat."""
+        self._toggle = 0
+        period_ns = self._period_ns()
+        self._next_ns = now_ns + period_ns if period_ns else None
+
+    def tick(self, now_ns: int) -> None:
+        if self._next_ns is None or now_ns < self._next_ns:
+            return
+        self._core.counters.heartbeats += 1
+        self._core.send(ERROR_CONTROL + self._core.node_id, bytes([self._core.state]), now_ns)
+        period_ns = self._period_ns()
+        self._next_ns += period_ns
+        if self._next_ns <= now_ns:  # late by more than a period: skip, never burst
+            self._next_ns = now_ns + period_ns
+
+    def wake_at_ns(self) -> int | None:
+        return self._next_ns
+
+    def guarded(self, now_ns: int) -> None:
+        """A remote frame asked for the state: answered with an alternating toggle bit where guarding is supported."""
+        if self._period_ns() or not self._core.data.has(0x100C):
+            self._core.counters.ignored += 1
+            return
+        self._core.send(ERROR_CONTROL + self._core.node_id, bytes([self._toggle << 7 | self._core.state]), now_ns)
+        self._toggle ^= 1
+
+    def _period_ns(self) -> int:
+        return self._core.data.number(0x1017) * NS_PER_MS
+
+
+@dataclass(slots=True)
+class _Watched:
+    period_ns: int
+    deadline_ns: int | None = None
+    lost: bool = False
+
+
+class HeartbeatConsumer(Service):
+    """Watches the nodes of 1016h, each from its first heartbeat on; a loss is EMCY 8130h and the reaction of 1029h."""
+
+    def __init__(self, core: Core, emergency: emcy.Emergency, change_state: Callable[[NmtState, int], None]) -> None:
+        self._core = core
+        self._emergency = emergency
+        self._change_state = change_state
+        self._watched: dict[int, _Watched] = {}
+
+    @property
+    def lost(self) -> tuple[int, ...]:
+        """Node ids whose heartbeat is missing."""
+        return tuple(sorted(node for node, watched in self._watched.items() if watched.lost))
+
+    def owns(self, index: int) -> bool:
+        return index == 0x1016
+
+    def check_write(self, index: int, subindex: int, raw: bytes) -> None:
+        node, period_ms = _split(int.from_bytes(raw, "little"))
+        others = [_split(self._core.data.number(0x1016, sub)) for sub in self._subs() if sub != subindex]
+        if period_ms and 1 <= node <= 127 and any(other == node and time for other, time in others):
+            raise abort(index, subindex, Abort.INCOMPATIBLE)
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        self._configure()
+        self._clear_if_all_heard(now_ns)  # the missing one may be watched no more
+
+    def reset(self, now_ns: int) -> None:
+        self._watched.clear()
+        self._configure()
+
+    def heard(self, frame: CanFrame, now_ns: int) -> None:
+        """An error control frame of another node."""
+        watched = self._watched.get(frame.can_id - ERROR_CONTROL)
+        if watched is None:
+            return
+        if len(frame.data) != 1 or frame.data[0] not in set(NmtState):
+            self._core.counters.ignored += 1
+        elif frame.data[0] == NmtState.INITIALISING:
+            watched.deadline_ns = None  # a boot-up is no heartbeat: watching starts anew with the first one
+        else:
+            watched.deadline_ns = now_ns + watched.period_ns
+            watched.lost = False
+            self._clear_if_all_heard(now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        for watched in self._watched.values():
+            if watched.deadline_ns is not None and now_ns >= watched.deadline_ns:
+                watched.deadline_ns = None
+                watched.lost = True
+                self._emergency.raise_error(emcy.HEARTBEAT_LOST, now_ns, register=emcy.COMMUNICATION)
+                self._react(now_ns)
+
+    def wake_at_ns(self) -> int | None:
+        return min((w.deadline_ns for w in self._watched.values() if w.deadline_ns is not None), default=None)
+
+    def _clear_if_all_heard(self, now_ns: int) -> None:
+        if not self.lost:
+            self._emergency.clear_error(emcy.HEARTBEAT_LOST, now_ns)
+
+    def _react(self, now_ns: int) -> None:
+        """1029h:01: 0 leaves OPERATIONAL for PRE-OPERATIONAL, 1 changes nothing, 2 stops (CiA 301, 7.5.2.32)."""
+        reaction = self._core.data.number(0x1029, 1)
+        if reaction == 0 and self._core.operational:
+            self._change_state(NmtState.PRE_OPERATIONAL, now_ns)
+        elif reaction == 2:
+            self._change_state(NmtState.STOPPED, now_ns)
+
+    def _subs(self) -> list[int]:
+        found = self._core.data.dictionary.objects.get(0x1016)
+        return [sub for sub in found.entries if sub] if found else []
+
+    def _configure(self) -> None:
+        """Entries that stayed as they were keep their watch."""
+        wanted = dict(_split(self._core.data.number(0x1016, sub)) for sub in self._subs())
+        before, self._watched = self._watched, {}
+        for node, period_ms in wanted.items():
+            if period_ms and 1 <= node <= 127:
+                kept = before.get(node)
+                same = kept is not None and kept.period_ns == period_ms * NS_PER_MS
+                self._watched[node] = kept if kept is not None and same else _Watched(period_ms * NS_PER_MS)
+
+
+def _split(value: int) -> tuple[int, int]:
+    """Node id and milliseconds of a consumer heartbeat time."""
+    return value >> 16 & 0xFF, value & 0xFFFF

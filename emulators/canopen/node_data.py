@@ -1,0 +1,127 @@
+"""The live values of one emulated node: bytes by (index, subindex), with what reset restores and 1010h stores.
+
+Generic rules only (existence, access, length, limits). What a certain object *means* belongs to the services; this
+module must never know the bus nor the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+
+from emulators.canopen import codec
+from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.dictionary import Dictionary, Entry, Key
+from gateway.core.errors import UsageError
+
+COMMUNICATION = range(0x1000, 0x2000)
+_NEVER_STORED = frozenset({0x1001, 0x1003, 0x1010, 0x1011})
+
+
+class Group(IntEnum):
+    """The parameter groups of 1010h and 1011h by subindex (CiA 301, 7.5.2.13)."""
+
+    ALL = 1
+    COMMUNICATION = 2
+    APPLICATION = 3
+
+    def holds(self, index: int) -> bool:
+        if self is Group.ALL:
+            return True
+        return (index in COMMUNICATION) == (self is Group.COMMUNICATION)
+
+
+class NodeData:
+    """Values of one node. `factory` replaces defaults of the data sheet (a serial number); keys must exist."""
+
+    def __init__(self, dictionary: Dictionary, node_id: int, factory: Mapping[Key, bytes] | None = None) -> None:
+        self.dictionary = dictionary
+        self.node_id = node_id
+        self._factory: dict[Key, bytes] = {entry.key: entry.initial(node_id) for entry in dictionary.entries()}
+        for key, raw in (factory or {}).items():
+            self._sized(key, raw)
+            self._factory[key] = raw
+        self._stored: dict[Key, bytes] = {}
+        self._live: dict[Key, bytes] = dict(self._factory)
+
+    def find(self, index: int, subindex: int) -> Entry:
+        """The entry; raises `SdoAborted` with 06020000 or 06090011 when there is none."""
+        entry = self.dictionary.entry(index, subindex)
+        if entry is None:
+            missing_object = index not in self.dictionary
+            raise abort(index, subindex, Abort.NO_OBJECT if missing_object else Abort.NO_SUBINDEX)
+        return entry
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        return (index, subindex) in self._live
+
+    def get(self, index: int, subindex: int = 0) -> bytes:
+        """The live value. The entry must exist."""
+        return self._live[index, subindex]
+
+    def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
+        """The live value as an unsigned integer, or `default` when the node has no such entry."""
+        raw = self._live.get((index, subindex))
+        return default if raw is None else int.from_bytes(raw, "little")
+
+    def put(self, index: int, subindex: int, raw: bytes) -> bool:
+        """Set a value from inside the device, whatever its access. Returns whether it changed.
+
+        Raises `UsageError` when there is no such entry or the length is not its type's.
+        """
+        key = (index, subindex)
+        self._sized(key, raw)
+        changed = self._live[key] != raw
+        self._live[key] = bytes(raw)
+        return changed
+
+    def put_number(self, index: int, subindex: int, value: int) -> None:
+        """`put` for an unsigned value; does nothing when the node has no such entry."""
+        entry = self.dictionary.entry(index, subindex)
+        if entry is not None and entry.size is not None:
+            self.put(index, subindex, value.to_bytes(entry.size, "little"))
+
+    def check_value(self, entry: Entry, raw: bytes) -> None:
+        """Length and limits of a value from the bus. Raises `SdoAborted` (06070012/13, 06090031/32)."""
+        self.check_size(entry, len(raw))
+        if not codec.is_number(entry.data_type):
+            return
+        value = codec.decode(entry.data_type, raw)
+        high = 1 if entry.data_type == codec.BOOLEAN and entry.high is None else entry.high
+        # Written so that a NaN is inside no limits.
+        if high is not None and not value <= high:
+            raise abort(entry.index, entry.subindex, Abort.VALUE_HIGH)
+        if entry.low is not None and not value >= entry.low:
+            raise abort(entry.index, entry.subindex, Abort.VALUE_LOW)
+
+    @staticmethod
+    def check_size(entry: Entry, size: int) -> None:
+        """The length of a value from the bus. Raises `SdoAborted` (06070012/13)."""
+        if entry.size is not None and size != entry.size:
+            raise abort(entry.index, entry.subindex, Abort.TOO_LONG if size > entry.size else Abort.TOO_SHORT)
+
+    def reset(self, *, communication_only: bool) -> None:
+        """Power-on values: what was stored, else the factory's (CiA 301, 7.3.2.2.1)."""
+        for key, raw in self._factory.items():
+            if not communication_only or key[0] in COMMUNICATION:
+                self._live[key] = self._stored.get(key, raw)
+
+    def store(self, group: Group) -> None:
+        """Keep the live values of the group's writable entries over resets (1010h)."""
+        for entry in self.dictionary.entries():
+            if entry.writable and group.holds(entry.index) and entry.index not in _NEVER_STORED:
+                self._stored[entry.key] = self._live[entry.key]
+
+    def forget(self, group: Group) -> None:
+        """Make the factory's values the power-on values again (1011h). Live values stay until a reset."""
+        self._stored = {key: raw for key, raw in self._stored.items() if not group.holds(key[0])}
+
+    def _sized(self, key: Key, raw: bytes) -> None:
+        entry = self.dictionary.entry(*key)
+        where = f"object {key[0]:04X}h:{key[1]:02X}"
+        if entry is None:
+            raise UsageError("the emulated node has no such object", where=where, got=self.dictionary.path)
+        if entry.size is not None and len(raw) != entry.size:
+            raise UsageError(
+                "a value of the wrong length", where=where, expected=f"{entry.size} bytes", got=f"{len(raw)} bytes"
+            )

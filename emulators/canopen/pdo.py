@@ -1,0 +1,156 @@
+"""What TPDOs and RPDOs have in common: communication and mapping parameters, and the rules for changing them.
+
+CiA 301 v4.2, 7.5.2.35 to 7.5.2.38. A PDO is changed in five steps: invalidate it (bit 31 of its COB-ID), set the
+mapping's subindex 0 to zero, write the entries, set subindex 0, make it valid again. Anything else is refused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.dictionary import Key
+from emulators.canopen.node_data import NodeData
+from gateway.core.clock import NS_PER_MS
+
+COB_ID, TYPE, INHIBIT, EVENT, SYNC_START = 1, 2, 3, 5, 6
+"""Subindices of a communication parameter record."""
+
+INVALID = 1 << 31
+NO_REMOTE = 1 << 30
+EXTENDED = 1 << 29
+INHIBIT_UNIT_NS = 100_000
+MAX_BITS = 64
+MAPPING_OFFSET = 0x200
+
+_RESTRICTED = (
+    range(0x080),
+    range(0x101, 0x181),
+    range(0x581, 0x600),
+    range(0x601, 0x680),
+    range(0x6E0, 0x700),
+    range(0x701, 0x800),
+)
+"""CAN identifiers that no PDO may use (CiA 301, table 41)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mapped:
+    """One mapping entry: an object and its length in bits."""
+
+    index: int
+    subindex: int
+    bits: int
+
+    @classmethod
+    def from_value(cls, value: int) -> Mapped:
+        return cls(value >> 16, value >> 8 & 0xFF, value & 0xFF)
+
+    @property
+    def key(self) -> Key:
+        return self.index, self.subindex
+
+
+class PdoParameters:
+    """A view of one PDO's parameters in the live values. `index` is that of its communication parameter record."""
+
+    def __init__(self, data: NodeData, index: int) -> None:
+        self._data = data
+        self.index = index
+        self.map_index = index + MAPPING_OFFSET
+        self.transmit = index >= 0x1800
+
+    @property
+    def cob(self) -> int:
+        """The raw COB-ID entry; a PDO without one does not exist."""
+        return self._data.number(self.index, COB_ID, INVALID)
+
+    @property
+    def can_id(self) -> int:
+        return self.cob & 0x7FF
+
+    @property
+    def valid(self) -> bool:
+        """Exists, on an 11-bit identifier (29-bit ones are not supported)."""
+        return not self.cob & (INVALID | EXTENDED)
+
+    @property
+    def remote_allowed(self) -> bool:
+        return not self.cob & NO_REMOTE
+
+    @property
+    def type(self) -> int:
+        return self._data.number(self.index, TYPE, 255)
+
+    @property
+    def inhibit_ns(self) -> int:
+        return self._data.number(self.index, INHIBIT) * INHIBIT_UNIT_NS
+
+    @property
+    def event_ns(self) -> int:
+        return self._data.number(self.index, EVENT) * NS_PER_MS
+
+    @property
+    def sync_start(self) -> int:
+        return self._data.number(self.index, SYNC_START)
+
+    def mapping(self) -> list[Mapped]:
+        """The entries in use; a count beyond what fits is not followed (a data sheet can default to nonsense)."""
+        count = self._data.number(self.map_index)
+        entries = [Mapped.from_value(self._data.number(self.map_index, sub)) for sub in range(1, count + 1)]
+        return entries if sum(entry.bits for entry in entries) <= MAX_BITS else []
+
+    def check_communication(self, subindex: int, raw: bytes) -> None:
+        """Whether a communication parameter may take this value. Raises `SdoAborted`."""
+        value = int.from_bytes(raw, "little")
+        if subindex == COB_ID:
+            self._check_cob(value)
+        elif subindex == TYPE:
+            reserved = range(241, 254) if not self.transmit else range(241, 252)
+            if value in reserved:
+                raise abort(self.index, subindex, Abort.VALUE)
+        elif subindex in (INHIBIT, SYNC_START) and self.valid:
+            raise abort(self.index, subindex, Abort.VALUE)
+
+    def check_mapping(self, subindex: int, raw: bytes) -> None:
+        """Whether a mapping parameter may take this value. Raises `SdoAborted`."""
+        value = int.from_bytes(raw, "little")
+        if self.valid or (subindex != 0 and self._data.number(self.map_index) != 0):
+            raise abort(self.map_index, subindex, Abort.DEVICE_STATE)
+        if subindex != 0:
+            if value:
+                self._check_mapped(subindex, Mapped.from_value(value))
+            return
+        if any(not self._data.has(self.map_index, sub) for sub in range(1, value + 1)):
+            raise abort(self.map_index, 0, Abort.MAPPING_TOO_LONG)
+        entries = [Mapped.from_value(self._data.number(self.map_index, sub)) for sub in range(1, value + 1)]
+        for entry in entries:
+            self._check_mapped(0, entry)
+        if sum(entry.bits for entry in entries) > MAX_BITS:
+            raise abort(self.map_index, 0, Abort.MAPPING_TOO_LONG)
+
+    def _check_cob(self, value: int) -> None:
+        if value & INVALID:
+            return
+        changed_while_valid = self.valid and (value ^ self.cob) & 0x3FFFFFFF
+        restricted = any((value & 0x7FF) in ids for ids in _RESTRICTED)
+        if changed_while_valid or value & 0x3FFFF800 or restricted:
+            raise abort(self.index, COB_ID, Abort.VALUE)
+
+    def _check_mapped(self, subindex: int, mapped: Mapped) -> None:
+        dictionary = self._data.dictionary
+        if not self.transmit and mapped.subindex == 0 and mapped.index in dictionary.dummies:
+            return
+        entry = dictionary.entry(*mapped.key)
+        if entry is None:
+            raise abort(self.map_index, subindex, Abort.NO_OBJECT)
+        directions = ("ro", "rw", "rwr", "const") if self.transmit else ("wo", "rw", "rww")
+        size = entry.size
+        lengths = () if size is None else (1, 8) if entry.data_type == 0x01 else (8 * size,)
+        if not entry.mappable or entry.access not in directions or mapped.bits not in lengths:
+            raise abort(self.map_index, subindex, Abort.NOT_MAPPABLE)
+
+
+def pdo_indices(data: NodeData, first: int) -> list[int]:
+    """The communication parameter records that the node has among the 512 from `first` on."""
+    return [index for index in sorted(data.dictionary.objects) if first <= index < first + 0x200]

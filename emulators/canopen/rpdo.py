@@ -1,0 +1,108 @@
+"""Receive PDOs: taking values off the bus (CiA 301 v4.2, 7.2.2 and 7.5.2.35 to 36).
+
+Applied at once with transmission types 254 and 255, at the next SYNC with 0 to 240. Too short a PDO is EMCY 8210h and not
+applied; of too long a one the first bytes count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from emulators.canopen import emcy
+from emulators.canopen.dictionary import Key
+from emulators.canopen.pdo import COB_ID, MAPPING_OFFSET, PdoParameters, pdo_indices
+from emulators.canopen.service import Core, Service
+from gateway.core.errors import SdoAborted
+
+_FIRST = 0x1400
+
+
+@dataclass(slots=True)
+class _Rpdo:
+    parameters: PdoParameters
+    waiting: bytes | None = None
+    """Received, to be applied at the next SYNC; a newer one replaces it."""
+
+
+class Rpdos(Service):
+    """All RPDOs of a node. `changed` is told which values a PDO changed."""
+
+    def __init__(self, core: Core, emergency: emcy.Emergency, changed: Callable[[list[Key], int], None]) -> None:
+        self._core = core
+        self._emergency = emergency
+        self._changed = changed
+        self._rpdos = [_Rpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
+
+    def owns(self, index: int) -> bool:
+        return _FIRST <= index < _FIRST + 2 * MAPPING_OFFSET
+
+    def check_write(self, index: int, subindex: int, raw: bytes) -> None:
+        parameters = PdoParameters(self._core.data, index if index < 0x1600 else index - MAPPING_OFFSET)
+        if index == parameters.index:
+            parameters.check_communication(subindex, raw)
+        else:
+            parameters.check_mapping(subindex, raw)
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        for rpdo in self._rpdos:
+            if rpdo.parameters.index == index and subindex == COB_ID:
+                rpdo.waiting = None
+
+    def reset(self, now_ns: int) -> None:
+        self._forget()
+
+    def state_changed(self, now_ns: int) -> None:
+        self._forget()
+
+    def receive(self, can_id: int, payload: bytes, now_ns: int) -> bool:
+        """A data frame. Returns whether it is an RPDO of ours, applied or not."""
+        mine = [r for r in self._rpdos if r.parameters.valid and r.parameters.can_id == can_id]
+        for rpdo in mine:
+            if not self._core.operational:
+                self._core.counters.ignored += 1
+                continue
+            needed = (sum(mapped.bits for mapped in rpdo.parameters.mapping()) + 7) // 8
+            if len(payload) < needed:
+                self._core.counters.rpdos_refused += 1
+                self._emergency.report(emcy.PDO_TOO_SHORT, now_ns, register=emcy.COMMUNICATION)
+            elif rpdo.parameters.type <= 240:
+                rpdo.waiting = payload
+            else:
+                self._apply(rpdo, payload, now_ns)
+        return bool(mine)
+
+    def on_sync(self, now_ns: int) -> None:
+        """A SYNC in OPERATIONAL: what waited is applied."""
+        for rpdo in self._rpdos:
+            if rpdo.waiting is not None:
+                payload, rpdo.waiting = rpdo.waiting, None
+                self._apply(rpdo, payload, now_ns)
+
+    def _forget(self) -> None:
+        for rpdo in self._rpdos:
+            rpdo.waiting = None
+
+    def _apply(self, rpdo: _Rpdo, payload: bytes, now_ns: int) -> None:
+        """All values or none: one outside its limits refuses the whole PDO, counted."""
+        data = self._core.data
+        packed, position = int.from_bytes(payload, "little"), 0
+        values: list[tuple[Key, bytes]] = []
+        for mapped in rpdo.parameters.mapping():
+            value = packed >> position & ((1 << mapped.bits) - 1)
+            position += mapped.bits
+            entry = data.dictionary.entry(*mapped.key)
+            if entry is None or entry.size is None:
+                continue  # a dummy: room that nobody reads
+            raw = value.to_bytes(max(entry.size, (mapped.bits + 7) // 8), "little")[: entry.size]
+            try:
+                data.check_value(entry, raw)
+            except SdoAborted:
+                self._core.counters.rpdos_refused += 1
+                return
+            values.append((mapped.key, raw))
+        self._core.counters.rpdos += 1
+        changed = [key for key, raw in values if data.put(*key, raw)]
+        for key, raw in values:
+            self._core.note(now_ns, "rpdo", *key, raw)
+        self._changed(changed, now_ns)

@@ -1,0 +1,161 @@
+"""What the node's communication objects have in common: the core that they share and the hooks that they fill.
+
+A service is the behaviour behind some indices (heartbeat behind 1016h and 1017h, the TPDOs behind 1800h...). Services
+know the core, never the SDO server nor each other, save where one is given to another's constructor.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from typing import Protocol
+
+from emulators.canopen.node_data import NodeData
+from gateway.core.canframe import CanFrame
+
+
+class NmtState(IntEnum):
+    """NMT states; the values are those of a heartbeat (CiA 301, 7.3.2.2 and 7.2.8.2.2)."""
+
+    INITIALISING = 0
+    STOPPED = 4
+    OPERATIONAL = 5
+    PRE_OPERATIONAL = 127
+
+
+@dataclass(slots=True)
+class NodeCounters:
+    """What a node did since it was made; never reset by NMT.
+
+    `sdo_requests` are request frames that were taken (a client's abort is none), `sdo_replies` the frames that answered
+    them, aborts among them: without block transfers the two are equal. `sdo_aborts` are all aborts sent, those after a
+    timeout included, which answer nothing. `ignored` are frames for this node that the standard tells it to ignore.
+    """
+
+    frames_in: int = 0
+    frames_out: int = 0
+    nmt_commands: int = 0
+    heartbeats: int = 0
+    sdo_requests: int = 0
+    sdo_replies: int = 0
+    sdo_aborts: int = 0
+    tpdos: int = 0
+    rpdos: int = 0
+    rpdos_refused: int = 0
+    syncs: int = 0
+    emcys: int = 0
+    emcys_dropped: int = 0
+    ignored: int = 0
+
+    def as_dict(self) -> dict[str, int]:
+        """By name, for a summary."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+@dataclass(frozen=True, slots=True)
+class SentPdo:
+    """One TPDO that left the node."""
+
+    t_ns: int
+    cob_id: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Something about the node changed: `what` is ``nmt``, ``write`` (SDO), ``rpdo``, ``set`` (the device itself) or
+    ``emcy``. `index`, `subindex` and `data` are the object and its new bytes; for ``nmt`` the state, for ``emcy`` the
+    8 bytes of the message, with index 0.
+    """
+
+    t_ns: int
+    what: str
+    index: int
+    subindex: int
+    data: bytes
+
+
+class Source(Protocol):
+    """Values that change by themselves: a recorded or computed signal."""
+
+    def __call__(self, now_ns: int, /) -> dict[tuple[int, int], bytes]:
+        """On-wire bytes by (index, subindex) at `now_ns`. Must be cheap: asked for every TPDO and SDO read.
+
+        Being asked is no event: what the source plays is sent by event timer, SYNC or remote frame. A change that is
+        to be sent by itself is told with `CanopenNode.set_value`.
+        """
+        ...
+
+
+class Core:
+    """State that all services share: values, NMT state, frames to send, counters and journals."""
+
+    def __init__(self, data: NodeData, node_id: int, source: Source | None, journal_size: int) -> None:
+        self.data = data
+        self.node_id = node_id
+        self.state = NmtState.INITIALISING
+        self.counters = NodeCounters()
+        self.journal: deque[SentPdo] = deque(maxlen=journal_size)
+        self.changes: deque[Change] = deque(maxlen=journal_size)
+        self._source = source
+        self._out: list[CanFrame] = []
+
+    @property
+    def communicating(self) -> bool:
+        """Whether SDO, SYNC and EMCY are allowed: PRE-OPERATIONAL or OPERATIONAL (CiA 301, table 37)."""
+        return self.state in (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL)
+
+    @property
+    def operational(self) -> bool:
+        return self.state is NmtState.OPERATIONAL
+
+    def send(self, can_id: int, data: bytes, now_ns: int) -> None:
+        """Queue a frame for this turn's output."""
+        self._out.append(CanFrame(can_id, data, t_ns=now_ns))
+        self.counters.frames_out += 1
+
+    def take_output(self) -> list[CanFrame]:
+        """The frames of this turn, in the order of sending."""
+        out, self._out = self._out, []
+        return out
+
+    def refresh(self, now_ns: int) -> None:
+        """Take the source's values of `now_ns`. Raises `UsageError` when they do not fit the dictionary."""
+        if self._source is not None:
+            for (index, subindex), raw in self._source(now_ns).items():
+                self.data.put(index, subindex, raw)
+
+    def note(self, now_ns: int, what: str, index: int, subindex: int, data: bytes) -> None:
+        """One line in the journal of changes."""
+        self.changes.append(Change(now_ns, what, index, subindex, data))
+
+
+class Service:
+    """The hooks; each does nothing by default. `check_*` raise `SdoAborted` to refuse."""
+
+    def owns(self, index: int) -> bool:
+        """Whether `check_*` and `wrote` are to be called for `index`."""
+        return False
+
+    def check_read(self, index: int, subindex: int) -> None:
+        """Before a client's read."""
+
+    def check_write(self, index: int, subindex: int, raw: bytes) -> None:
+        """Before a client's write, after length and limits were found good. Live values are still the old ones."""
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        """After a client's write."""
+
+    def reset(self, now_ns: int) -> None:
+        """After reset node or reset communication: values are back at power-on."""
+
+    def state_changed(self, now_ns: int) -> None:
+        """After a change of NMT state, except the one to INITIALISING."""
+
+    def tick(self, now_ns: int) -> None:
+        """Do what is due."""
+
+    def wake_at_ns(self) -> int | None:
+        """When `tick` has something to do next; None for never."""
+        return None

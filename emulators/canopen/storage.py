@@ -1,0 +1,44 @@
+"""Store parameters (1010h) and restore default parameters (1011h): CiA 301 v4.2, 7.5.2.13 and 14.
+
+What is stored lives as long as the emulated node does. Restored defaults take effect at the next reset.
+"""
+
+from __future__ import annotations
+
+from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.node_data import Group
+from emulators.canopen.service import Core, Service
+
+STORE, RESTORE = 0x1010, 0x1011
+_SIGNATURES = {STORE: b"save", RESTORE: b"load"}
+_ON_COMMAND = 1
+"""Reads as: stores on command, not by itself."""
+
+
+class Storage(Service):
+    """Acts only on the signatures ``save`` and ``load``; reads tell what is supported."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+
+    def owns(self, index: int) -> bool:
+        return index in _SIGNATURES
+
+    def check_write(self, index: int, subindex: int, raw: bytes) -> None:
+        if raw != _SIGNATURES[index] or subindex not in {int(group) for group in Group}:
+            raise abort(index, subindex, Abort.NOT_STORED)
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        self._announce()  # the signature itself is no value to be read back
+        if index == STORE:
+            self._core.data.store(Group(subindex))
+        else:
+            self._core.data.forget(Group(subindex))
+
+    def reset(self, now_ns: int) -> None:
+        self._announce()
+
+    def _announce(self) -> None:
+        for index in _SIGNATURES:
+            for group in Group:
+                self._core.data.put_number(index, group, _ON_COMMAND)

@@ -1,0 +1,170 @@
+"""Transmit PDOs: when each is sent and with what (CiA 301 v4.2, 7.2.2 and 7.5.2.37).
+
+Transmission types: 0 at the SYNC after an event, 1 to 240 every n-th SYNC, 252 sampled at SYNC and 253 fresh on a remote
+frame, 254 and 255 on an event. Events are: the event timer, a mapped value changed, the PDO became active. Inhibit time
+and event timer bind event-driven PDOs only, and both are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from emulators.canopen.dictionary import Key
+from emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, TYPE, PdoParameters, pdo_indices
+from emulators.canopen.service import Core, SentPdo, Service
+
+SAMPLED, REMOTE = 252, 253
+_FIRST = 0x1800
+
+
+@dataclass(slots=True)
+class _Tpdo:
+    parameters: PdoParameters
+    pending: bool = False
+    event_at_ns: int | None = None
+    free_at_ns: int = 0
+    """End of the inhibit time."""
+    syncs: int = 0
+    started: bool = False
+    """The SYNC whose counter equals the start value came by."""
+    sample: bytes | None = None
+
+    @property
+    def event_driven(self) -> bool:
+        return self.parameters.type >= 254
+
+    def due_ns(self) -> int | None:
+        """When an event-driven PDO is to be sent next."""
+        if not self.event_driven or not self.parameters.valid:
+            return None
+        if self.pending:
+            return self.free_at_ns
+        return None if self.event_at_ns is None else max(self.event_at_ns, self.free_at_ns)
+
+
+class Tpdos(Service):
+    """All TPDOs of a node."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._tpdos = [_Tpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
+
+    def owns(self, index: int) -> bool:
+        return _FIRST <= index < _FIRST + 2 * MAPPING_OFFSET
+
+    def check_write(self, index: int, subindex: int, raw: bytes) -> None:
+        parameters = PdoParameters(self._core.data, index if index < 0x1A00 else index - MAPPING_OFFSET)
+        if index == parameters.index:
+            parameters.check_communication(subindex, raw)
+        else:
+            parameters.check_mapping(subindex, raw)
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        for tpdo in self._tpdos:
+            if tpdo.parameters.index != index:
+                continue
+            if subindex in (COB_ID, TYPE):
+                self._activate(tpdo, now_ns)
+            elif subindex == EVENT:
+                event_ns = tpdo.parameters.event_ns
+                tpdo.event_at_ns = now_ns + event_ns if event_ns and self._core.operational else None
+
+    def reset(self, now_ns: int) -> None:
+        for tpdo in self._tpdos:
+            tpdo.free_at_ns = 0
+            self._activate(tpdo, now_ns)
+
+    def state_changed(self, now_ns: int) -> None:
+        for tpdo in self._tpdos:
+            self._activate(tpdo, now_ns)
+
+    def changed(self, keys: Iterable[Key], now_ns: int) -> None:
+        """Values changed inside the device: the event of those PDOs that map them."""
+        keys = set(keys)
+        for tpdo in self._tpdos:
+            if self._core.operational and any(mapped.key in keys for mapped in tpdo.parameters.mapping()):
+                tpdo.pending = True
+
+    def tick(self, now_ns: int) -> None:
+        if not self._core.operational:
+            return
+        for tpdo in self._tpdos:
+            due_ns = tpdo.due_ns()
+            if due_ns is not None and now_ns >= due_ns:
+                self._send_event(tpdo, now_ns)
+
+    def wake_at_ns(self) -> int | None:
+        if not self._core.operational:
+            return None
+        return min((due for tpdo in self._tpdos if (due := tpdo.due_ns()) is not None), default=None)
+
+    def on_sync(self, counter: int | None, now_ns: int) -> None:
+        """A SYNC in OPERATIONAL; `counter` is its own where it carries one."""
+        for tpdo in self._tpdos:
+            if tpdo.parameters.valid:
+                self._on_sync(tpdo, counter, now_ns)
+
+    def on_remote(self, can_id: int, now_ns: int) -> bool:
+        """A remote frame. Returns whether it asked for a TPDO of ours; an answer is queued where one is allowed."""
+        for tpdo in self._tpdos:
+            parameters = tpdo.parameters
+            if parameters.valid and parameters.can_id == can_id:
+                if parameters.remote_allowed and self._core.operational:
+                    self._transmit(tpdo, tpdo.sample if parameters.type == SAMPLED else None, now_ns)
+                return True
+        return False
+
+    def _activate(self, tpdo: _Tpdo, now_ns: int) -> None:
+        """Counters start anew; becoming active is an event. The inhibit time of what was sent goes on."""
+        active = self._core.operational and tpdo.parameters.valid
+        tpdo.pending = active
+        tpdo.event_at_ns = None
+        tpdo.syncs = 0
+        tpdo.started = False
+        tpdo.sample = None
+
+    def _on_sync(self, tpdo: _Tpdo, counter: int | None, now_ns: int) -> None:
+        kind = tpdo.parameters.type
+        if kind == 0:
+            if tpdo.pending:
+                tpdo.pending = False
+                self._transmit(tpdo, None, now_ns)
+        elif kind == SAMPLED:
+            tpdo.sample = self._build(tpdo, now_ns)
+        elif kind <= 240:
+            start = tpdo.parameters.sync_start
+            if counter is not None and start and not tpdo.started and counter != start:
+                return
+            tpdo.started = True
+            tpdo.syncs += 1
+            if tpdo.syncs >= kind:
+                tpdo.syncs = 0
+                self._transmit(tpdo, None, now_ns)
+
+    def _send_event(self, tpdo: _Tpdo, now_ns: int) -> None:
+        event_ns = tpdo.parameters.event_ns
+        on_time = not tpdo.pending and tpdo.event_at_ns is not None
+        # The timer's grid is kept, so that lateness does not add up; after any other event it starts anew.
+        next_ns = (tpdo.event_at_ns or 0) + event_ns if on_time else now_ns + event_ns
+        tpdo.event_at_ns = (next_ns if next_ns > now_ns else now_ns + event_ns) if event_ns else None
+        tpdo.pending = False
+        tpdo.free_at_ns = now_ns + tpdo.parameters.inhibit_ns
+        self._transmit(tpdo, None, now_ns)
+
+    def _transmit(self, tpdo: _Tpdo, data: bytes | None, now_ns: int) -> None:
+        data = self._build(tpdo, now_ns) if data is None else data
+        if not data:
+            return  # nothing mapped: the PDO carries nothing and is not sent
+        can_id = tpdo.parameters.can_id
+        self._core.counters.tpdos += 1
+        self._core.journal.append(SentPdo(now_ns, can_id, data))
+        self._core.send(can_id, data, now_ns)
+
+    def _build(self, tpdo: _Tpdo, now_ns: int) -> bytes:
+        self._core.refresh(now_ns)
+        packed, position = 0, 0
+        for mapped in tpdo.parameters.mapping():
+            packed |= (self._core.data.number(*mapped.key) & ((1 << mapped.bits) - 1)) << position
+            position += mapped.bits
+        return packed.to_bytes((position + 7) // 8, "little")

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import socket
 from typing import Any
 
 from emulators.endpoints.bus_hello import VERSION, WANTS_CONFIRMATIONS, Hello, Status, unpack_hello
@@ -23,6 +24,8 @@ from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, FieldtwinE
 
 HELLO_TIMEOUT_S = 5.0
 CLOSE_TIMEOUT_S = 1.0
+SEND_BUFFER_BYTES = 64 * 1024
+"""The kernel's buffer per client. Left alone it grows to megabytes: minutes of frames that a slow client reads late."""
 
 
 class SoftBusServer:
@@ -126,6 +129,8 @@ class _Client(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
+        connection: socket.socket = transport.get_extra_info("socket")
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         transport.set_write_buffer_limits(high=2 * self._bus._max_outbound_bytes, low=self._bus._max_outbound_bytes)
         self._deadline = self._loop.call_later(HELLO_TIMEOUT_S, self._turn_away)
         self._bus._clients.add(self)

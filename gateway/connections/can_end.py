@@ -1,0 +1,190 @@
+"""A kernel CAN interface (SocketCAN), through python-can.
+
+The kernel owns the interface: it must exist, be up, and run at the bit rate that the system file names; all three are
+checked and nothing is set. Frames come by `add_reader`, no threads. What the frames mean is not known here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+
+import can
+
+from gateway.connections.can_link import CanLink, query_link
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import CANConnection, CanConnection, closed_here
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, Desync, Unreachable, UsageError, WireError
+from gateway.wallclock import WallClock
+
+FRAMES_PER_TURN = 256
+"""Frames taken from the kernel before the loop serves others; what is left keeps the descriptor readable."""
+
+FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.001, 0.05
+SEND_TIMEOUT_S = 2.0
+"""A transmit queue that stays full for so long has nobody who acknowledges, or a bus that is off."""
+
+
+class SocketCanConnection(CanConnection):
+    """One socket on a kernel CAN interface. Make it with `open`.
+
+    Error frames are received as frames with `error` set. `t_ns` is the kernel's time of reception, monotonic.
+    """
+
+    def __init__(self, endpoint: Endpoint, bus: can.BusABC, max_pending: int = 4096) -> None:
+        super().__init__(CANConnection(), endpoint, max_pending)
+        self.malformed = 0
+        """What the kernel delivered and is no classic frame (CAN FD)."""
+        self.tx_retries = 0
+        """Attempts to send that met a full transmit queue."""
+        self._bus = bus
+        self._clock = WallClock()
+        self._turn = asyncio.Lock()  # keeps the order of concurrent senders, through back-off too
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(bus.fileno(), self._on_readable)
+
+    @classmethod
+    async def open(cls, endpoint: Endpoint, bitrate: int, *, max_pending: int = 4096) -> SocketCanConnection:
+        """Join ``can:socketcan/IFACE``.
+
+        Raises `Unreachable` where the kernel has no SocketCAN, no such interface, or it is down; `UsageError` where it
+        runs at another bit rate than `bitrate` (bit/s; a virtual interface has none and takes any).
+        """
+        if endpoint.interface != "socketcan":
+            raise UsageError(f"{endpoint} is no kernel CAN interface", expected="can:socketcan/IFACE")
+        _check(endpoint, bitrate)
+        try:
+            bus = can.Bus(interface="socketcan", channel=endpoint.path, receive_own_messages=False, ignore_config=True)
+        except (OSError, can.CanError) as e:
+            raise _unreachable(endpoint, e) from e
+        return cls(endpoint, bus, max_pending)
+
+    async def send(self, frame: CanFrame) -> None:
+        """Give `frame` to the kernel, backing off while its transmit queue is full (ENOBUFS).
+
+        Raises `ConnectionLost` when the interface is gone, `WireError` when the queue stays full for `SEND_TIMEOUT_S`.
+        """
+        if frame.error:
+            raise UsageError("an error frame cannot be sent", got=str(frame), where=str(self.endpoint))
+        message = can.Message(
+            arbitration_id=frame.can_id,
+            is_extended_id=frame.extended,
+            is_remote_frame=frame.remote,
+            dlc=frame.dlc,
+            data=frame.data,
+        )
+        async with self._turn:
+            deadline = self._loop.time() + SEND_TIMEOUT_S
+            backoff_s = FIRST_BACKOFF_S
+            while not self._try_send(message):
+                self.tx_retries += 1
+                if self._loop.time() >= deadline:
+                    raise WireError(
+                        f"the transmit queue stayed full for {SEND_TIMEOUT_S:g} s",
+                        where=str(self.endpoint),
+                        hint="does another node acknowledge? is the bus off, the bit rate right, the cable in?",
+                    )
+                await asyncio.sleep(backoff_s)
+                backoff_s = min(2 * backoff_s, LAST_BACKOFF_S)
+
+    def _try_send(self, message: can.Message) -> bool:
+        if self._lost is not None:
+            raise self._lost
+        try:
+            self._bus.send(message, timeout=0)
+        except can.CanOperationError as e:
+            # python-can gives no number where the socket is not writable: full as well.
+            if e.error_code in (errno.ENOBUFS, errno.EAGAIN, None):
+                return False
+            raise self._end(e) from e
+        return True
+
+    async def aclose(self) -> None:
+        """Close the socket; frames that the kernel has are still sent."""
+        self._stop(closed_here(self.endpoint))
+        self.inbound.data_stream.clear()
+
+    def _on_readable(self) -> None:
+        try:
+            for _ in range(FRAMES_PER_TURN):
+                message = self._bus.recv(0)
+                if message is None:
+                    return
+                self._take(message)
+        except (OSError, can.CanError) as e:
+            self._end(e)
+
+    def _take(self, message: can.Message) -> None:
+        if message.is_fd:
+            self.malformed += 1
+            return
+        # The kernel stamps in UTC; its age is what carries over to the monotonic clock.
+        age_ns = max(0, self._clock.utc_ns() - int(message.timestamp * NS_PER_S))
+        try:
+            frame = CanFrame(
+                message.arbitration_id,
+                b"" if message.is_remote_frame else bytes(message.data),
+                extended=message.is_extended_id,
+                remote=message.is_remote_frame,
+                error=message.is_error_frame,
+                dlc=message.dlc,
+                t_ns=self._clock.monotonic_ns() - age_ns,
+            )
+        except Desync:
+            self.malformed += 1
+            return
+        self.feed(frame)
+
+    def _end(self, error: Exception) -> ConnectionLost:
+        lost = ConnectionLost(f"the CAN interface is gone: {error}", where=str(self.endpoint), hint=_up(self.endpoint))
+        self._stop(lost)
+        return lost
+
+    def _stop(self, reason: ConnectionLost) -> None:
+        if self._lost is None:
+            self._loop.remove_reader(self._bus.fileno())
+            self._bus.shutdown()
+        self.feed_lost(reason)
+
+
+def _check(endpoint: Endpoint, bitrate: int) -> None:
+    """Refuse an interface that is not there, no CAN, down, or at another bit rate, before python-can opens a socket."""
+    try:
+        link: CanLink = query_link(endpoint.path)
+    except AttributeError as e:  # a platform without netlink
+        raise _unreachable(endpoint, OSError(errno.EAFNOSUPPORT, "this operating system has no SocketCAN")) from e
+    except OSError as e:
+        raise _unreachable(endpoint, e) from e
+    if not link.is_can:
+        raise Unreachable(f"{endpoint.path} is no CAN interface", where=str(endpoint), hint="ip -brief link show")
+    if not link.is_up:
+        raise Unreachable(f"{endpoint.path} is down", where=str(endpoint), hint=_up(endpoint))
+    if link.bitrate and bitrate and link.bitrate != bitrate:
+        raise UsageError(
+            f"{endpoint.path} runs at another bit rate",
+            expected=f"{bitrate} bit/s",
+            got=f"{link.bitrate} bit/s",
+            where=str(endpoint),
+            hint=f"ip link set {endpoint.path} down && ip link set {endpoint.path} type can bitrate {bitrate}",
+        )
+
+
+def _unreachable(endpoint: Endpoint, error: Exception) -> Unreachable:
+    number = getattr(error, "errno", None) or getattr(error, "error_code", None)
+    if number == errno.EAFNOSUPPORT:
+        text, hint = (
+            "this kernel has no SocketCAN",
+            "modprobe can_raw, or use the software bus: can:fieldtwin/HOST:PORT",
+        )
+    elif number in (errno.ENODEV, errno.ENXIO):
+        text = f"there is no interface {endpoint.path}"
+        hint = "ip -brief link show; for a virtual one: ip link add vcan0 type vcan && ip link set vcan0 up"
+    else:
+        text, hint = f"cannot open {endpoint.path}: {error}", _up(endpoint)
+    return Unreachable(text, where=str(endpoint), hint=hint)
+
+
+def _up(endpoint: Endpoint) -> str:
+    return f"ip link set {endpoint.path} up"

@@ -1,0 +1,369 @@
+"""The software CAN bus, from the plant's side: an asyncio end, and an interface of python-can.
+
+The bus is a TCP server somewhere; a frame is a record of 24 bytes (gateway/core/canframe.py). What models the bus there,
+and who else is on it, is not known here.
+
+`SoftBus` is registered with python-can as ``fieldtwin``, so any program that uses python-can joins the bus:
+``python -m can.logger -i fieldtwin -c HOST:PORT``, ``canopen.Network.connect(interface="fieldtwin", channel=...)``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import select
+import socket
+import threading
+from dataclasses import replace
+
+import can
+from can.typechecking import CanFilters
+
+from gateway.connections.soft_bus_hello import Welcome, ask, read_answer
+from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import CANConnection, CanConnection, closed_here
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, Desync, FieldtwinError, Unreachable, UsageError
+from gateway.wallclock import WallClock
+
+OPEN_TIMEOUT_S = 5.0
+CLOSE_TIMEOUT_S = 1.0
+
+
+class SoftBusConnection(CanConnection):
+    """One node on a software CAN bus. Make it with `open`.
+
+    Received frames carry the bus's exact end of frame as `t_ns`, on this host's monotonic clock.
+    """
+
+    def __init__(self, endpoint: Endpoint, max_pending: int = 4096) -> None:
+        super().__init__(CANConnection(), endpoint, max_pending)
+        self.bitrate = 0
+        self.confirmed = 0
+        """Own frames that the bus reported as sent."""
+        self._wire: _Wire | None = None
+        self._window = 1
+        self._in_flight = 0
+        self._offset_ns = 0
+        self._turn = asyncio.Lock()  # keeps the order of concurrent senders
+        self._progress = asyncio.Event()
+
+    @classmethod
+    async def open(cls, endpoint: Endpoint, bitrate: int, *, max_pending: int = 4096) -> SoftBusConnection:
+        """Join the bus at ``can:fieldtwin/HOST:PORT``, which must run at `bitrate` bit/s (0: whatever it has).
+
+        Raises `Unreachable` when nobody is there (or no bus), `UsageError` when it runs at another bit rate,
+        `EndpointBusy` when it is full.
+        """
+        host, port = endpoint.address
+        where = str(endpoint)
+        connection = cls(endpoint, max_pending)
+        loop = asyncio.get_running_loop()
+        wire = _Wire(connection)
+        try:
+            async with asyncio.timeout(OPEN_TIMEOUT_S):
+                await loop.create_connection(lambda: wire, host, port)
+                asked_ns = _loop_ns(loop)
+                wire.write(ask(bitrate, confirmations=True))
+                answer, answered_ns = await wire.answer
+            welcome = read_answer(answer, bitrate, where)
+        except TimeoutError as e:
+            await wire.aclose()
+            raise Unreachable(f"no answer within {OPEN_TIMEOUT_S:g} s", where=where) from e
+        except OSError as e:
+            raise _nobody(e, where) from e
+        except BaseException:
+            await wire.aclose()
+            raise
+        connection._join(wire, welcome, welcome.clock_offset_ns(asked_ns, answered_ns))
+        return connection
+
+    def _join(self, wire: _Wire, welcome: Welcome, offset_ns: int) -> None:
+        self._wire = wire
+        self.bitrate = welcome.bitrate
+        self._window = welcome.window
+        self._offset_ns = offset_ns
+        wire.take_frames()
+
+    async def send(self, frame: CanFrame) -> None:
+        """Hand `frame` to the bus's transmit queue, waiting while it is full. Raises `ConnectionLost`.
+
+        A node has at most the bus's transmit window of unconfirmed frames under way, so what is sent next is never
+        behind seconds of frames in socket buffers.
+        """
+        if frame.error:
+            raise UsageError("an error frame cannot be sent", got=str(frame), where=str(self.endpoint))
+        async with self._turn:
+            while self._lost is None and self._in_flight >= self._window:
+                self._progress.clear()
+                await self._progress.wait()
+            if self._lost is not None:
+                raise self._lost
+            assert self._wire is not None
+            self._in_flight += 1
+            self._wire.write(pack_record(frame))
+
+    async def aclose(self) -> None:
+        """Leave the bus once it has sent what was handed to it (waiting `CLOSE_TIMEOUT_S` at most)."""
+        try:
+            async with asyncio.timeout(CLOSE_TIMEOUT_S):
+                while self._lost is None and self._in_flight:
+                    self._progress.clear()
+                    await self._progress.wait()
+        except TimeoutError:
+            pass  # a slow bus: the rest is in its hands
+        self.feed_lost(closed_here(self.endpoint))
+        self._progress.set()
+        self.inbound.data_stream.clear()
+        if self._wire is not None:
+            await self._wire.aclose()
+
+    def on_record(self, record: bytes) -> None:
+        """One record from the bus. Raises `Desync` when it is none."""
+        frame, confirmed = unpack_record(record)
+        if confirmed:
+            self.confirmed += 1
+            self._in_flight -= 1
+            self._progress.set()
+        elif self._lost is None:
+            self.feed(replace(frame, t_ns=frame.t_ns + self._offset_ns) if self._offset_ns else frame)
+
+    def on_lost(self, error: FieldtwinError) -> None:
+        """The bus is gone."""
+        self.feed_lost(error)
+        self._progress.set()
+
+
+class _Wire(asyncio.Protocol):
+    """The TCP connection: cuts the stream into records; the first is the answer to the hello."""
+
+    def __init__(self, connection: SoftBusConnection) -> None:
+        loop = asyncio.get_running_loop()
+        self._connection = connection
+        self._loop = loop
+        self._buffer = bytearray()
+        self._joined = False
+        self._transport: asyncio.Transport | None = None
+        self.answer: asyncio.Future[tuple[bytes, int]] = loop.create_future()
+        self._gone: asyncio.Future[None] = loop.create_future()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+
+    def data_received(self, data: bytes) -> None:
+        self._buffer += data
+        if not self.answer.done() and len(self._buffer) >= RECORD_SIZE:
+            self.answer.set_result((bytes(self._buffer[:RECORD_SIZE]), _loop_ns(self._loop)))
+            del self._buffer[:RECORD_SIZE]
+        if self._joined:
+            self.take_frames()
+
+    def take_frames(self) -> None:
+        """Hand over whole records, from now on as they come."""
+        self._joined = True
+        whole = len(self._buffer) - len(self._buffer) % RECORD_SIZE
+        records = bytes(self._buffer[:whole])
+        del self._buffer[:whole]
+        try:
+            for start in range(0, whole, RECORD_SIZE):
+                self._connection.on_record(records[start : start + RECORD_SIZE])
+        except Desync as e:
+            self._connection.on_lost(ConnectionLost(f"the bus broke its protocol: {e}", where=self._where()))
+            self._abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        reason = f"the software CAN bus is gone: {exc}" if exc else "the software CAN bus closed"
+        error = ConnectionLost(reason, where=self._where())
+        if not self.answer.done():
+            # Something that is no bus, or a bus that is just closing: either way nobody to talk to.
+            self.answer.set_result((bytes(self._buffer), 0))
+        self._connection.on_lost(error)
+        if not self._gone.done():
+            self._gone.set_result(None)
+
+    def write(self, data: bytes) -> None:
+        assert self._transport is not None
+        self._transport.write(data)
+
+    async def aclose(self) -> None:
+        if self._transport is None:
+            return
+        self._transport.close()
+        await asyncio.wait([self._gone], timeout=CLOSE_TIMEOUT_S)
+        self._abort()
+        await asyncio.wait([self._gone])
+
+    def _abort(self) -> None:
+        if self._transport is not None:
+            self._transport.abort()
+
+    def _where(self) -> str:
+        return str(self._connection.endpoint)
+
+
+class SoftBus(can.BusABC):
+    """python-can's interface ``fieldtwin``. `channel` is ``HOST:PORT`` of a software CAN bus.
+
+    `bitrate` (bit/s) is checked against the bus's; 0 takes the bus's. With `receive_own_messages` own frames come back,
+    ``is_rx`` false, when they were on the wire. Time stamps are seconds since 1970, from the bus's exact end of frame.
+    `recv` takes exactly one record from the socket, so its descriptor stays readable while more wait; `fileno` serves
+    `can.Notifier` with a loop. Here, at python-can's border, errors are python-can's: `CanInitializationError` when the
+    bus cannot be joined, `CanOperationError` when it is gone, `CanTimeoutError` when it takes no more frames.
+
+    A program that asks for its own messages and never receives is held back by the bus.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        can_filters: CanFilters | None = None,
+        *,
+        bitrate: int = 0,
+        receive_own_messages: bool = False,
+        timeout: float = OPEN_TIMEOUT_S,
+        fd: bool = False,
+        single_handle: bool = True,  # what python-can's programs pass to every interface; every handle is single here
+    ) -> None:
+        if fd:
+            raise can.CanInitializationError("the software CAN bus is a classic one: no CAN FD")
+        clock = WallClock()
+        self._clock = clock
+        self._partial = b""
+        self._unsent = b""
+        self._sending = threading.Lock()
+        try:
+            host, port = Endpoint.parse(f"can:fieldtwin/{channel}").address
+            self._socket = socket.create_connection((host, port), timeout)
+        except UsageError as e:
+            raise can.CanInitializationError(str(e)) from e
+        except OSError as e:
+            raise can.CanInitializationError(str(_nobody(e, f"can:fieldtwin/{channel}"))) from e
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            asked_ns = clock.monotonic_ns()
+            self._socket.sendall(ask(bitrate, confirmations=receive_own_messages))
+            welcome = read_answer(self._read_answer(), bitrate, f"can:fieldtwin/{channel}")
+            offset_ns = welcome.clock_offset_ns(asked_ns, clock.monotonic_ns())
+            self._utc_minus_bus_ns = offset_ns + clock.utc_ns() - clock.monotonic_ns()
+            self._socket.setblocking(False)
+        except (OSError, FieldtwinError) as e:
+            self._socket.close()
+            raise can.CanInitializationError(str(e)) from e
+        self.channel_info = f"fieldtwin bus {channel} at {welcome.bitrate} bit/s"
+        self._channel = channel
+        super().__init__(channel, can_filters)
+
+    def _read_answer(self) -> bytes:
+        answer = b""
+        while len(answer) < RECORD_SIZE and (more := self._socket.recv(RECORD_SIZE - len(answer))):
+            answer += more
+        return answer
+
+    def fileno(self) -> int:
+        """The socket's descriptor, for `select` and `add_reader`; -1 after `shutdown`."""
+        return self._socket.fileno()
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        try:
+            if not select.select([self._socket], [], [], timeout)[0]:
+                return None, False
+            # Never more than the rest of one record: what follows must keep the descriptor readable.
+            data = self._socket.recv(RECORD_SIZE - len(self._partial))
+        except BlockingIOError:
+            return None, False  # another thread was quicker
+        except (OSError, ValueError) as e:  # ValueError: shut down by another thread
+            raise can.CanOperationError(f"the software CAN bus is gone: {e}") from e
+        if not data:
+            raise can.CanOperationError("the software CAN bus closed")
+        self._partial += data
+        if len(self._partial) < RECORD_SIZE:
+            return None, False
+        record, self._partial = self._partial, b""
+        try:
+            frame, own = unpack_record(record)
+        except Desync as e:
+            raise can.CanOperationError(str(e)) from e
+        return self._message(frame, own), False
+
+    def _message(self, frame: CanFrame, own: bool) -> can.Message:
+        return can.Message(
+            timestamp=(frame.t_ns + self._utc_minus_bus_ns) / NS_PER_S,
+            arbitration_id=frame.can_id,
+            is_extended_id=frame.extended,
+            is_remote_frame=frame.remote,
+            is_error_frame=frame.error,
+            channel=self._channel,
+            dlc=frame.dlc,
+            data=frame.data,
+            is_rx=not own,
+        )
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Hand `msg` to the bus, waiting up to `timeout` seconds while it takes no more (None: as long as it takes)."""
+        record = pack_record(_frame_of(msg))
+        deadline_ns = None if timeout is None else self._clock.monotonic_ns() + int(timeout * NS_PER_S)
+        with self._sending:
+            self._flush(deadline_ns)  # a record that a time-out cut in two comes first
+            self._unsent = record
+            try:
+                self._flush(deadline_ns)
+            except can.CanTimeoutError:
+                if len(self._unsent) == RECORD_SIZE:
+                    self._unsent = b""  # not a byte of it left: it was not sent
+                    raise
+
+    def _flush(self, deadline_ns: int | None) -> None:
+        while self._unsent:
+            left_s = None if deadline_ns is None else max(0, deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
+            try:
+                if not select.select([], [self._socket], [], left_s)[1]:
+                    raise can.CanTimeoutError("the software CAN bus takes no more frames now")
+                self._unsent = self._unsent[self._socket.send(self._unsent) :]
+            except BlockingIOError:
+                pass  # filled up between select and send
+            except (OSError, ValueError) as e:
+                raise can.CanOperationError(f"the software CAN bus is gone: {e}") from e
+
+    def shutdown(self) -> None:
+        """Leave the bus once it has taken what was sent (waiting `CLOSE_TIMEOUT_S` at most). Twice does nothing."""
+        if self._is_shutdown:
+            return
+        super().shutdown()
+        deadline_ns = self._clock.monotonic_ns() + int(CLOSE_TIMEOUT_S * NS_PER_S)
+        try:
+            # Closing with unread records would reset the connection, and the bus would lose what it has not read yet.
+            self._socket.shutdown(socket.SHUT_WR)
+            self._socket.setblocking(True)
+            while (left_ns := deadline_ns - self._clock.monotonic_ns()) > 0:
+                self._socket.settimeout(left_ns / NS_PER_S)
+                if not self._socket.recv(65536):
+                    break
+        except OSError:
+            pass  # the bus was gone already, or is slow
+        self._socket.close()
+
+
+def _frame_of(msg: can.Message) -> CanFrame:
+    if msg.is_error_frame or msg.is_fd:
+        raise can.CanOperationError("only classic data and remote frames can be sent")
+    try:
+        return CanFrame(
+            msg.arbitration_id,
+            b"" if msg.is_remote_frame else bytes(msg.data),
+            extended=msg.is_extended_id,
+            remote=msg.is_remote_frame,
+            dlc=msg.dlc if msg.is_remote_frame else -1,
+        )
+    except Desync as e:
+        raise can.CanOperationError(str(e)) from e
+
+
+def _nobody(error: OSError, where: str) -> Unreachable:
+    return Unreachable(
+        f"no software CAN bus: {error.strerror or error}", where=where, hint="start one: fieldtwin can-bus"
+    )
+
+
+def _loop_ns(loop: asyncio.AbstractEventLoop) -> int:
+    return int(loop.time() * NS_PER_S)

@@ -1,0 +1,78 @@
+"""Joining the software CAN bus: the request, and what the bus's answer means. Bytes only, no sockets.
+
+A hello is a record of 24 bytes like any other on that wire; bit 7 of its first byte tells it from a frame's. In network
+byte order: mark 80h, version, status, options, bit rate u32, the bus's monotonic clock u64 (ns), ``ftcb``, transmit
+window u16, two zero bytes. The joining side speaks first; bit rate 0 means whatever the bus has.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from gateway.core.canframe import RECORD_SIZE
+from gateway.core.errors import EndpointBusy, Unreachable, UsageError
+
+_LAYOUT = struct.Struct("!BBBBIQ4sHxx")
+_MARK = 0x80
+_VERSION = 1
+_CONFIRM = 0x01
+_MAGIC = b"ftcb"
+
+_WELCOME, _WRONG_BITRATE, _UNKNOWN_VERSION, _FULL = range(4)
+
+
+@dataclass(frozen=True, slots=True)
+class Welcome:
+    """What the bus told: its bit rate, how many unconfirmed frames it takes, and its clock when it answered."""
+
+    bitrate: int
+    window: int
+    bus_ns: int
+
+    def clock_offset_ns(self, asked_ns: int, answered_ns: int) -> int:
+        """What to add to the bus's time stamps to get this host's monotonic time.
+
+        `asked_ns` and `answered_ns` are this host's clock around the hello. Zero on one host, where all processes share
+        a clock; otherwise right to half the round trip.
+        """
+        if asked_ns <= self.bus_ns <= answered_ns:
+            return 0
+        return (asked_ns + answered_ns) // 2 - self.bus_ns
+
+
+def ask(bitrate: int, *, confirmations: bool) -> bytes:
+    """The request to join a bus of `bitrate` bit/s (0: any), with or without a confirmation of each own frame."""
+    return _LAYOUT.pack(_MARK, _VERSION, 0, _CONFIRM if confirmations else 0, bitrate, 0, _MAGIC, 0)
+
+
+def read_answer(record: bytes, wanted_bitrate: int, where: str) -> Welcome:
+    """The bus's answer to `ask`. `where` names the endpoint in errors.
+
+    Raises `UsageError` for a wrong bit rate, `EndpointBusy` when the bus is full, `Unreachable` when the other end is of
+    another version or no software CAN bus at all.
+    """
+    if len(record) != RECORD_SIZE:
+        raise Unreachable("what answers there is no software CAN bus", got=f"{len(record)} bytes", where=where)
+    mark, version, status, _, bitrate, bus_ns, magic, window = _LAYOUT.unpack(record)
+    if mark != _MARK or magic != _MAGIC:
+        raise Unreachable("what answers there is no software CAN bus", got=record.hex(), where=where)
+    if status == _WRONG_BITRATE:
+        raise UsageError(
+            "the software CAN bus runs at another bit rate",
+            expected=f"{wanted_bitrate} bit/s",
+            got=f"{bitrate} bit/s",
+            where=where,
+            hint="set the bit rate of the bus in the system file, or start the bus with that one",
+        )
+    if status == _FULL:
+        raise EndpointBusy("the software CAN bus has no room for another node", where=where)
+    if status != _WELCOME or version != _VERSION:
+        raise Unreachable(
+            "the software CAN bus speaks another version",
+            expected=f"version {_VERSION}",
+            got=f"version {version}, status {status}",
+            where=where,
+            hint="run the same fieldtwin on both sides",
+        )
+    return Welcome(bitrate, max(window, 1), bus_ns)

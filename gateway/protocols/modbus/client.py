@@ -1,0 +1,326 @@
+"""The Modbus client: one connection, one exchange at a time, one attempt each.
+
+Thin: it moves bytes between a `ByteConnection` and a pure `Transaction`, keeps the line's silences and counts. It never
+retries, reconnects or scales: that is the runtime's and the drivers' business. It opens nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import ByteConnection, closed_here
+from gateway.core.endpoint import SerialSettings
+from gateway.core.errors import (
+    ConnectionLost,
+    CrcError,
+    Desync,
+    FieldtwinError,
+    ModbusExceptionReply,
+    ReplyTimeout,
+    UsageError,
+    VerifyFailed,
+)
+from gateway.protocols.modbus.framing import Framer
+from gateway.protocols.modbus.line import LineSilence
+from gateway.protocols.modbus.mbap import MbapFramer
+from gateway.protocols.modbus.replies import BitsReply, RegistersReply, Reply, WriteReply
+from gateway.protocols.modbus.request import Request
+from gateway.protocols.modbus.requests import (
+    BitTable,
+    MaskWriteRegister,
+    ReadBits,
+    ReadRegisters,
+    ReadWriteRegisters,
+    RegisterTable,
+    WriteCoil,
+    WriteCoils,
+    WriteRegister,
+    WriteRegisters,
+)
+from gateway.protocols.modbus.rtu import RtuFramer
+from gateway.protocols.modbus.transaction import Transaction
+
+R = TypeVar("R", bound=Reply)
+
+Framing = Literal["rtu", "mbap"]
+
+
+@dataclass(slots=True)
+class ClientCounters:
+    """What happened on this connection since it was opened.
+
+    Every request sent ends in exactly one of the others: requests = broadcasts + replies + exceptions + timeouts +
+    crc_errors + desyncs + verify_failures + abandoned, plus the one under way. `replies` are normal replies only;
+    `abandoned` were cancelled or lost with the connection. Bytes: `late_bytes` answered no request that was waiting
+    (late, duplicate), `noise_bytes` were no part of our replies.
+    """
+
+    requests: int = 0
+    broadcasts: int = 0
+    replies: int = 0
+    exceptions: int = 0
+    timeouts: int = 0
+    crc_errors: int = 0
+    desyncs: int = 0
+    verify_failures: int = 0
+    abandoned: int = 0
+    late_bytes: int = 0
+    noise_bytes: int = 0
+    foreign_frames: int = 0
+
+
+class ModbusClient:
+    """A Modbus client (master) on `connection`, which it owns from now on.
+
+    `serial` gives an RTU line its character time: silences, and deadlines that leave out the time on the wire.
+    Without it (RTU inside TCP) frames need no silence. `timeout_s` is how long a unit may take to answer. `echo` and
+    `strict` are as in `RtuFramer` and mean nothing to MBAP.
+    """
+
+    def __init__(
+        self,
+        connection: ByteConnection,
+        clock: Clock,
+        *,
+        framing: Framing,
+        serial: SerialSettings | None = None,
+        timeout_s: float = 1.0,
+        echo: bool = False,
+        strict: bool = False,
+    ) -> None:
+        self._connection = connection
+        self._clock = clock
+        self._char_time_ns = round(serial.char_time_s * NS_PER_S) if serial is not None and framing == "rtu" else 0
+        self._framer = _make_framer(framing, self._char_time_ns, echo, strict)
+        self._line = LineSilence(
+            t35_ns=self._framer.t35_ns if isinstance(self._framer, RtuFramer) else 0,
+            settle_ns=self._framer.gap_ns,
+            quarantines=not self._framer.confirms_transmission,
+        )
+        self._timeout_s = _checked_timeout(timeout_s)
+        self._turn = asyncio.Lock()
+        self._closed = False
+        self.counters = ClientCounters()
+
+    @property
+    def closed(self) -> bool:
+        """Whether no request can be sent any more: closed on this side, or lost."""
+        return self._closed or self._connection.lost is not None
+
+    async def aclose(self) -> None:
+        """Close the connection; an exchange under way ends with `ConnectionLost`. Closing twice does nothing."""
+        self._closed = True
+        await self._connection.aclose()
+
+    # -- requests ------------------------------------------------------------------------------------------------
+
+    async def read_registers(
+        self, unit: int, table: RegisterTable, address: int, count: int, timeout_s: float | None = None
+    ) -> RegistersReply:
+        """Read 1 to 125 holding (03h) or input (04h) registers. Errors as `execute`."""
+        return await self.execute(unit, ReadRegisters(table, address, count), timeout_s)
+
+    async def read_bits(
+        self, unit: int, table: BitTable, address: int, count: int, timeout_s: float | None = None
+    ) -> BitsReply:
+        """Read 1 to 2000 coils (01h) or discrete inputs (02h). Errors as `execute`."""
+        return await self.execute(unit, ReadBits(table, address, count), timeout_s)
+
+    async def write_register(self, unit: int, address: int, value: int, timeout_s: float | None = None) -> WriteReply:
+        """Write one holding register (06h). Errors as `execute`."""
+        return await self.execute(unit, WriteRegister(address, value), timeout_s)
+
+    async def write_registers(
+        self, unit: int, address: int, values: Sequence[int], timeout_s: float | None = None
+    ) -> WriteReply:
+        """Write 1 to 123 holding registers in one request (10h). Errors as `execute`."""
+        return await self.execute(unit, WriteRegisters(address, tuple(values)), timeout_s)
+
+    async def write_coil(self, unit: int, address: int, value: bool, timeout_s: float | None = None) -> WriteReply:
+        """Write one coil (05h). Errors as `execute`."""
+        return await self.execute(unit, WriteCoil(address, value), timeout_s)
+
+    async def write_coils(
+        self, unit: int, address: int, values: Sequence[bool], timeout_s: float | None = None
+    ) -> WriteReply:
+        """Write 1 to 1968 coils in one request (0Fh). Errors as `execute`."""
+        return await self.execute(unit, WriteCoils(address, tuple(values)), timeout_s)
+
+    async def mask_write(
+        self, unit: int, address: int, and_mask: int, or_mask: int, timeout_s: float | None = None
+    ) -> WriteReply:
+        """Change single bits of a holding register inside the device (16h). Errors as `execute`."""
+        return await self.execute(unit, MaskWriteRegister(address, and_mask, or_mask), timeout_s)
+
+    async def read_write_registers(
+        self,
+        unit: int,
+        read_address: int,
+        read_count: int,
+        write_address: int,
+        values: Sequence[int],
+        timeout_s: float | None = None,
+    ) -> RegistersReply:
+        """Write, then read holding registers in one request (17h). Errors as `execute`."""
+        request = ReadWriteRegisters(read_address, read_count, write_address, tuple(values))
+        return await self.execute(unit, request, timeout_s)
+
+    async def execute(self, unit: int, request: Request[R], timeout_s: float | None = None) -> R:
+        """Send `request` once and return its reply. Waits for its turn and for the line to be silent before.
+
+        `timeout_s` counts from the end of transmission, the reply's own time on the wire comes on top. Raises `ReplyTimeout`, `CrcError`, `Desync`,
+        `ModbusExceptionReply` or `VerifyFailed`; `UsageError` before anything is sent; `ConnectionLost` when the
+        client has become useless. Cancelling it is safe: its reply is never taken for another's.
+        """
+        timeout_ns = round(_checked_timeout(self._timeout_s if timeout_s is None else timeout_s) * NS_PER_S)
+        if not 0 <= unit <= 255:
+            raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
+        broadcast = unit == 0 and self._framer.has_broadcast
+        if broadcast:
+            request.unanswered(0)  # refuses what cannot be broadcast
+        async with self._turn:
+            if self._closed:
+                raise closed_here(self._connection.endpoint)
+            await self._await_silence()
+            transaction = Transaction(
+                self._framer, unit, request, timeout_ns=timeout_ns, char_time_ns=self._char_time_ns
+            )
+            if broadcast:
+                return await self._broadcast(transaction, request)
+            return await self._exchange(transaction, timeout_ns)
+
+    # -- one exchange --------------------------------------------------------------------------------------------
+
+    async def _exchange(self, transaction: Transaction[R], timeout_ns: int) -> R:
+        before = (self._framer.late_bytes, self._framer.noise_bytes, self._framer.foreign_frames)
+        counters, line = self.counters, self._line
+        counters.requests += 1
+        settled = False
+        try:
+            reply = await self._send_and_await(transaction)
+            counters.replies += 1
+            settled = True
+            line.answered(reply.t_ns, transaction.sent_ns)
+            return reply
+        except ModbusExceptionReply as e:
+            counters.exceptions += 1
+            settled = True
+            line.answered(self._clock.monotonic_ns(), transaction.sent_ns)
+            self._place(e)
+            raise
+        except CrcError as e:
+            counters.crc_errors += 1
+            # Told before the deadline, it was our reply, whole and damaged; at the deadline it was garbage.
+            settled = self._clock.monotonic_ns() < transaction.deadline_ns
+            line.damaged(self._clock.monotonic_ns())
+            self._place(e)
+            raise
+        except (Desync, ReplyTimeout, VerifyFailed) as e:
+            self._count(e)
+            self._place(e)
+            raise
+        except BaseException:
+            counters.abandoned += 1
+            raise
+        finally:
+            if not settled:
+                line.given_up(self._clock.monotonic_ns(), transaction.sent_ns, timeout_ns)
+            late, noise, foreign = before
+            counters.late_bytes += self._framer.late_bytes - late
+            counters.noise_bytes += self._framer.noise_bytes - noise
+            counters.foreign_frames += self._framer.foreign_frames - foreign
+
+    async def _send_and_await(self, transaction: Transaction[R]) -> R:
+        clock, connection = self._clock, self._connection
+        await connection.write(transaction.start(clock.monotonic_ns()))
+        transaction.handed_over(clock.monotonic_ns())
+        while True:
+            data = connection.read_pending() or await self._read_until(transaction.wake_ns)
+            now_ns = clock.monotonic_ns()
+            reply = transaction.feed(data, now_ns) if data else transaction.poll(now_ns)
+            if reply is not None:
+                return reply
+
+    async def _broadcast(self, transaction: Transaction[R], request: Request[R]) -> R:
+        self.counters.requests += 1
+        try:
+            await self._connection.write(transaction.start(self._clock.monotonic_ns()))
+        except BaseException:
+            self.counters.abandoned += 1
+            raise
+        finally:
+            transaction.handed_over(self._clock.monotonic_ns())
+            self._line.broadcast(transaction.sent_ns)
+        self.counters.broadcasts += 1
+        return request.unanswered(transaction.sent_ns)
+
+    # -- the line between exchanges ------------------------------------------------------------------------------
+
+    async def _await_silence(self) -> None:
+        """Return when a request may be sent; what arrives before that is nobody's and is drained.
+
+        Raises `Desync` when the line does not become silent, `ConnectionLost` when it is gone.
+        """
+        since_ns = now_ns = self._clock.monotonic_ns()
+        self._drain(self._connection.read_pending(), now_ns, live=False)
+        while (clear_ns := self._line.clear_ns(now_ns)) > now_ns:
+            if now_ns >= self._line.babble_ns(since_ns):
+                where = str(self._connection.endpoint)
+                raise Desync("the line is never silent", where=where, hint="another master, or a unit that babbles")
+            data = await self._read_until(clear_ns)
+            now_ns = self._clock.monotonic_ns()
+            self._drain(data, now_ns, live=True)
+        lost = self._connection.lost
+        if lost is not None:
+            raise ConnectionLost(lost.message, where=lost.where)
+        self._line.silent()
+
+    def _drain(self, data: bytes, now_ns: int, *, live: bool) -> None:
+        if data:
+            before = self._framer.late_bytes, self._framer.noise_bytes
+            self._framer.drained(data)
+            self.counters.late_bytes += self._framer.late_bytes - before[0]
+            self.counters.noise_bytes += self._framer.noise_bytes - before[1]
+            self._line.heard(now_ns, live=live)
+
+    async def _read_until(self, deadline_ns: int) -> bytes:
+        """What arrives next, or nothing at `deadline_ns`."""
+        left_s = max(0.0, (deadline_ns - self._clock.monotonic_ns()) / NS_PER_S)
+        try:
+            async with asyncio.timeout(left_s):
+                return await self._connection.read()
+        except TimeoutError:
+            return self._connection.read_pending()
+
+    # -- small things --------------------------------------------------------------------------------------------
+
+    def _count(self, error: FieldtwinError) -> None:
+        if isinstance(error, Desync):
+            self.counters.desyncs += 1
+        elif isinstance(error, ReplyTimeout):
+            self.counters.timeouts += 1
+        else:
+            self.counters.verify_failures += 1
+
+    def _place(self, error: FieldtwinError) -> None:
+        error.at(str(self._connection.endpoint))
+
+
+def _make_framer(framing: str, char_time_ns: int, echo: bool, strict: bool) -> Framer:
+    if framing == "mbap":
+        return MbapFramer()
+    if framing != "rtu":
+        raise UsageError(f"unknown Modbus framing {framing!r}", expected="rtu or mbap")
+    if strict and not char_time_ns:
+        raise UsageError("strict RTU timing needs the baud rate and frame of the line")
+    return RtuFramer(echo=echo, strict=strict, char_time_ns=char_time_ns)
+
+
+def _checked_timeout(timeout_s: float) -> float:
+    if not 0.0 < timeout_s <= 3600.0:
+        raise UsageError("Modbus timeout out of range", expected="over 0 to 3600 s", got=f"{timeout_s} s")
+    return timeout_s

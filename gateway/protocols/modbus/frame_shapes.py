@@ -1,0 +1,68 @@
+"""How long RTU frames of anybody can be: what it takes to step over a frame that is not ours.
+
+On a serial line every frame of every unit arrives, requests of another master included, and nothing but function code
+and byte count tells where one ends (AP 6). Pure arithmetic on a frame's first bytes; no check sums here.
+"""
+
+from __future__ import annotations
+
+MAX_FRAME = 256
+"""Bytes of the longest RTU frame (SL 2.5.1)."""
+
+MIN_FRAME = 4
+"""Unit, function, check sum."""
+
+_FIXED: dict[int, tuple[int, ...]] = {
+    0x01: (8,),
+    0x02: (8,),
+    0x03: (8,),
+    0x04: (8,),
+    0x05: (8,),
+    0x06: (8,),
+    0x07: (4, 5),
+    0x08: (8,),
+    0x0B: (4, 8),
+    0x0C: (4,),
+    0x0F: (8,),
+    0x10: (8,),
+    0x11: (4,),
+    0x16: (10,),
+    0x18: (6,),
+    0x2B: (7,),
+}
+"""Requests and replies whose length the function alone tells."""
+
+_COUNTED: dict[int, tuple[tuple[int, int], ...]] = {
+    0x01: ((2, 5),),
+    0x02: ((2, 5),),
+    0x03: ((2, 5),),
+    0x04: ((2, 5),),
+    0x0C: ((2, 5),),
+    0x0F: ((6, 9),),
+    0x10: ((6, 9),),
+    0x11: ((2, 5),),
+    0x14: ((2, 5),),
+    0x15: ((2, 5),),
+    0x17: ((2, 5), (10, 13)),
+}
+"""Position of a byte count, and the frame's length without the bytes counted."""
+
+_EVEN = frozenset({0x03, 0x04, 0x10, 0x17})
+
+
+def frame_lengths(head: bytes | bytearray) -> tuple[list[int], bool]:
+    """Lengths that a frame beginning with `head` can have, ascending, and whether more bytes could add one.
+
+    `head` holds at least two bytes (unit, function). ([], False): no frame that we know begins like this.
+    """
+    function = head[1]
+    if function & 0x80:
+        return ([5], False) if function & 0x7F else ([], False)
+    lengths = set(_FIXED.get(function, ()))
+    open_ended = False
+    for at, rest in _COUNTED.get(function, ()):
+        if len(head) <= at:
+            open_ended = True
+        elif head[at] and rest + head[at] <= MAX_FRAME and not (function in _EVEN and head[at] % 2):
+            lengths.add(rest + head[at])
+    return sorted(lengths), open_ended

@@ -1,0 +1,55 @@
+"""What a framing is: request PDU in, frame out; bytes in, the one awaited reply PDU out.
+
+`RtuFramer` (in rtu) and `MbapFramer` (in mbap) implement it; ASCII, UDP and TLS have the same shape. A framing decides which bytes are the
+reply, and whether they arrived whole; what the reply says is the request's to judge. No clock: `now_ns` is passed.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from gateway.core.errors import WireError
+from gateway.protocols.modbus.request import Request
+
+
+class Framer(ABC):
+    """One wire's framing. One request at a time: `begin`, then `feed` until it returns, raises, or time is up.
+
+    `late_bytes` counts what belonged to an earlier exchange or came twice, `noise_bytes` what belonged to none and
+    `foreign_frames` the whole frames of somebody else. All three only grow.
+    """
+
+    confirms_transmission: bool = False
+    """Whether a reply names its request, so that a late one needs no quarantine."""
+
+    has_broadcast: bool = False
+    """Whether unit 0 addresses everybody and nobody answers (SL 2.1); else it is a unit like any other (TG 4.4.1.2)."""
+
+    gap_ns: int = 0
+    """How long the wire must be silent before `settle` is called; 0: never."""
+
+    def __init__(self) -> None:
+        self.late_bytes = 0
+        self.noise_bytes = 0
+        self.foreign_frames = 0
+
+    @abstractmethod
+    def begin(self, unit: int, request: Request[Any]) -> bytes:
+        """The frame of `request`; from now on its reply is awaited. Forgets the exchange before."""
+
+    @abstractmethod
+    def feed(self, data: bytes, now_ns: int) -> bytes | None:
+        """Take what arrived; the reply PDU as soon as it is complete. Raises `CrcError` or `Desync`."""
+
+    def settle(self) -> bytes | None:
+        """The wire has been silent for `gap_ns`: stop waiting for the rest of what is not our reply. As `feed`."""
+        return None
+
+    @abstractmethod
+    def overdue(self, waited_s: float) -> WireError:
+        """Time is up: the error that describes what came instead of a reply. `ReplyTimeout` where nothing did."""
+
+    @abstractmethod
+    def drained(self, data: bytes) -> None:
+        """Bytes that arrived while no reply was awaited: count them, and keep step with the stream."""

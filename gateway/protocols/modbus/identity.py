@@ -1,0 +1,144 @@
+"""The requests that ask a device about itself: 07h, 08h, 11h and 2Bh/0Eh (AP 6.7, 6.8, 6.13, 6.21)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gateway.core.errors import Desync, UsageError
+from gateway.protocols.modbus import pdus
+from gateway.protocols.modbus.replies import (
+    DeviceIdentificationReply,
+    DiagnosticsReply,
+    ExceptionStatusReply,
+    ServerIdReply,
+)
+from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
+from gateway.protocols.modbus.requests import check_range
+
+_FORCE_LISTEN_ONLY = 4
+_MEI_DEVICE_IDENTIFICATION = 0x0E
+_IDENTIFICATION_HEAD = 7  # function, MEI type, read code, conformity, more follows, next object id, number of objects
+
+
+@dataclass(frozen=True, slots=True)
+class ReadExceptionStatus(Request[ExceptionStatusReply]):
+    """Function 07h, serial line only."""
+
+    @property
+    def function(self) -> int:
+        return 0x07
+
+    def encode(self) -> bytes:
+        return pdus.encode_exception_status()
+
+    def nominal_length(self) -> int:
+        return 2
+
+    def reply_length(self, head: bytes) -> int:
+        return 2
+
+    def decode(self, pdu: bytes, t_ns: int) -> ExceptionStatusReply:
+        return ExceptionStatusReply(pdu[1], bytes(pdu[1:]), t_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostics(Request[DiagnosticsReply]):
+    """Function 08h with one data word: loopback (sub-function 0) and the counters (0Bh to 12h).
+
+    Force listen only (4) has no reply and is not sent by this request. Encoded here: pymodbus has a class per
+    sub-function, all of this one shape.
+    """
+
+    sub_function: int
+    value: int = 0
+
+    def __post_init__(self) -> None:
+        check_range("diagnostics sub-function", self.sub_function, 0, 0xFFFF)
+        if self.sub_function == _FORCE_LISTEN_ONLY:
+            raise UsageError("diagnostics sub-function 4 (force listen only) has no reply")
+        check_range("diagnostics data", self.value, 0, 0xFFFF)
+
+    @property
+    def function(self) -> int:
+        return 0x08
+
+    def encode(self) -> bytes:
+        return bytes([0x08]) + self.sub_function.to_bytes(2, "big") + self.value.to_bytes(2, "big")
+
+    def nominal_length(self) -> int:
+        return 5
+
+    def reply_length(self, head: bytes) -> int:
+        return 5
+
+    def decode(self, pdu: bytes, t_ns: int) -> DiagnosticsReply:
+        if pdu[1:3] != self.encode()[1:3]:
+            raise Desync("a reply to another diagnostics sub-function", got=bytes(pdu).hex(" "))
+        value = int.from_bytes(pdu[3:5], "big")
+        if self.sub_function == 0 and value != self.value:
+            raise Desync("the loopback came back changed", expected=f"{self.value:04X}h", got=f"{value:04X}h")
+        return DiagnosticsReply(value, bytes(pdu[1:]), t_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportServerId(Request[ServerIdReply]):
+    """Function 11h, serial line only."""
+
+    @property
+    def function(self) -> int:
+        return 0x11
+
+    def encode(self) -> bytes:
+        return pdus.encode_report_server_id()
+
+    def reply_length(self, head: bytes) -> int:
+        if len(head) < 2:
+            return NEED_MORE
+        return 2 + head[1] if 2 + head[1] <= MAX_PDU else IMPOSSIBLE
+
+    def decode(self, pdu: bytes, t_ns: int) -> ServerIdReply:
+        return ServerIdReply(bytes(pdu[2:]), t_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class ReadDeviceIdentification(Request[DeviceIdentificationReply]):
+    """Function 2Bh/0Eh, one answer of a series. `read_code`: 1 basic, 2 regular, 3 extended, 4 the one `object_id`."""
+
+    read_code: int = 1
+    object_id: int = 0
+
+    def __post_init__(self) -> None:
+        check_range("read device id code", self.read_code, 1, 4)
+        check_range("object id", self.object_id, 0, 0xFF)
+
+    @property
+    def function(self) -> int:
+        return 0x2B
+
+    def encode(self) -> bytes:
+        return pdus.encode_device_identification(self.read_code, self.object_id)
+
+    def reply_length(self, head: bytes) -> int:
+        if len(head) >= 3 and (head[1], head[2]) != (_MEI_DEVICE_IDENTIFICATION, self.read_code):
+            return IMPOSSIBLE
+        if len(head) < _IDENTIFICATION_HEAD:
+            return NEED_MORE
+        end = _IDENTIFICATION_HEAD
+        for _ in range(head[6]):
+            if end + 2 > MAX_PDU:
+                return IMPOSSIBLE
+            if len(head) < end + 2:
+                return NEED_MORE
+            end += 2 + head[end + 1]
+        return end if end <= MAX_PDU else IMPOSSIBLE
+
+    def decode(self, pdu: bytes, t_ns: int) -> DeviceIdentificationReply:
+        objects, at = [], _IDENTIFICATION_HEAD
+        for _ in range(pdu[6]):
+            size = pdu[at + 1]
+            objects.append((pdu[at], bytes(pdu[at + 2 : at + 2 + size])))
+            at += 2 + size
+        more = pdu[4] == 0xFF
+        if more and pdu[5] <= self.object_id and self.read_code != 4:
+            raise Desync("device identification goes round in circles", got=short_hex(pdu))
+        return DeviceIdentificationReply(tuple(objects), pdu[3], more, pdu[5], bytes(pdu[1:]), t_ns)

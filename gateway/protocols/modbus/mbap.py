@@ -1,0 +1,113 @@
+"""Modbus over TCP: the MBAP header (TG 3.1.3), read from a stream whose chunk borders mean nothing.
+
+A reply is told by its transaction id, so a late one is recognised and thrown away. A header that cannot be right (its
+length out of bounds) or an ADU that never ends leaves no border to count from: then the stream is searched for the
+header of the reply awaited. Nothing here knows sockets.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+from gateway.core.errors import ReplyTimeout, WireError
+from gateway.protocols.modbus.framing import Framer
+from gateway.protocols.modbus.request import MAX_PDU, Request
+
+_HEADER = struct.Struct(">HHHB")  # transaction id, protocol id, length, unit id; the length counts from the unit id
+_BEFORE_LENGTH_COUNTS = 6
+_MIN_LENGTH = 2
+_MAX_LENGTH = MAX_PDU + 1
+
+
+class MbapFramer(Framer):
+    """MBAP framing of one stream. Replies must carry our transaction id, protocol id 0 and our unit id."""
+
+    confirms_transmission = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._buffer = bytearray()
+        self._transaction = 0
+        self._unit = 0
+        self._awaiting = False
+        self._lost = False
+        self._seen = ""
+
+    def begin(self, unit: int, request: Request[Any]) -> bytes:
+        self._transaction = self._transaction % 0xFFFF + 1  # 0 is what broken servers always answer (case MB-056)
+        self._unit = unit
+        self._awaiting = True
+        self._seen = ""
+        # The rest of an ADU that has been incomplete for a whole exchange may never come; search instead of counting.
+        self._lost = self._lost or bool(self._buffer)
+        pdu = request.encode()
+        return _HEADER.pack(self._transaction, 0, len(pdu) + 1, unit) + pdu
+
+    def feed(self, data: bytes, now_ns: int) -> bytes | None:
+        self._buffer += data
+        while (adu := self._next_adu()) is not None:
+            transaction, protocol, _, unit = _HEADER.unpack_from(adu)
+            if self._awaiting and (transaction, protocol, unit) == (self._transaction, 0, self._unit):
+                self._awaiting = False
+                self._drop_rest()
+                return bytes(adu[_HEADER.size :])
+            self._seen = f"an ADU with transaction {transaction}, protocol {protocol}, unit {unit}"
+            self.foreign_frames += 1
+            self.late_bytes += len(adu)
+        return None
+
+    def drained(self, data: bytes) -> None:
+        self._awaiting = False
+        self.feed(data, 0)
+
+    def overdue(self, waited_s: float) -> WireError:
+        self._awaiting = False
+        got = self._seen or (f"{len(self._buffer)} bytes of an unfinished ADU" if self._buffer else "")
+        return ReplyTimeout(
+            f"no reply within {waited_s:g} s", expected=f"transaction {self._transaction}, unit {self._unit}", got=got
+        )
+
+    def _next_adu(self) -> bytearray | None:
+        """Cut the next whole ADU off the buffer, whoever's it is."""
+        while True:
+            if self._lost and not self._search():
+                return None
+            if len(self._buffer) < _BEFORE_LENGTH_COUNTS:
+                return None
+            length = int.from_bytes(self._buffer[4:6], "big")
+            if not _MIN_LENGTH <= length <= _MAX_LENGTH:
+                self._seen = f"a header with length {length}"
+                self._skip(1)
+                self._lost = True
+                continue
+            end = _BEFORE_LENGTH_COUNTS + length
+            if len(self._buffer) < end:
+                return None
+            adu = self._buffer[:end]
+            del self._buffer[:end]
+            return adu
+
+    def _search(self) -> bool:
+        """Throw away all before a header of the awaited reply; False while there is none."""
+        wanted = struct.pack(">HH", self._transaction, 0)
+        at = 0
+        while (at := self._buffer.find(wanted, at)) >= 0:
+            head = self._buffer[at : at + _HEADER.size]
+            length_ok = len(head) < 6 or _MIN_LENGTH <= int.from_bytes(head[4:6], "big") <= _MAX_LENGTH
+            if length_ok and (len(head) < 7 or head[6] == self._unit):
+                self._skip(at)
+                if len(head) == _HEADER.size:
+                    self._lost = False
+                return not self._lost
+            at += 1
+        self._skip(max(0, len(self._buffer) - (len(wanted) - 1)))  # its first bytes may have come already
+        return False
+
+    def _skip(self, count: int) -> None:
+        self.noise_bytes += count
+        del self._buffer[:count]
+
+    def _drop_rest(self) -> None:
+        """What follows the reply is nobody's answer (one request at a time), but its borders still count."""
+        self.feed(b"", 0)

@@ -1,0 +1,87 @@
+"""What a Modbus server answered, decoded: plain frozen values.
+
+Knows nothing of framing, requests or scaling: a register here is the unsigned 16-bit word of the wire.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+class Reply:
+    """What every reply has: `raw`, the payload as on the wire, and `t_ns`, the monotonic time when it was complete."""
+
+    __slots__ = ()
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class WriteReply(Reply):
+    """A write that was acknowledged and verified against the request; `raw` is the echoed data field.
+
+    A broadcast is acknowledged by nobody: then `acknowledged` is False, `raw` empty and `t_ns` the end of transmission.
+    """
+
+    raw: bytes
+    t_ns: int
+    acknowledged: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class RegistersReply(Reply):
+    """Registers 0 to 65535 in the order of their addresses; `raw` is their 2 x n bytes, high byte first (AP 4.2)."""
+
+    registers: tuple[int, ...]
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class BitsReply(Reply):
+    """Exactly as many bits as asked for, in the order of their addresses; `raw` with its padding bits (AP 6.1)."""
+
+    bits: tuple[bool, ...]
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ExceptionStatusReply(Reply):
+    """The eight exception status outputs as one byte (AP 6.7); what they mean is the device's own."""
+
+    status: int
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosticsReply(Reply):
+    """The data field of a diagnostics reply (AP 6.8) as one word: the echo, or the counter asked for."""
+
+    value: int
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ServerIdReply(Reply):
+    """What function 11h reports (AP 6.13): everything after the byte count.
+
+    How it divides into id, run indicator and additional data is the device's own, so it stays whole.
+    """
+
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceIdentificationReply(Reply):
+    """One answer of function 2Bh/0Eh (AP 6.21): (id, value) pairs, and the id to go on with when `more_follows`."""
+
+    objects: tuple[tuple[int, bytes], ...]
+    conformity: int
+    more_follows: bool
+    next_object_id: int
+    raw: bytes
+    t_ns: int

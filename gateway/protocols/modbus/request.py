@@ -1,0 +1,94 @@
+"""What a Modbus request is to framings, transactions and the client; the concrete ones are in `requests` and `identity`.
+
+A request knows its own bytes, how long its reply has to be, and whether a reply is its answer. It knows neither unit
+id, framing nor time.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Generic, TypeVar
+
+from gateway.core.errors import Desync, ModbusExceptionReply, UsageError
+from gateway.protocols.modbus.replies import Reply
+
+R = TypeVar("R", bound=Reply)
+
+MAX_PDU = 253
+"""Bytes of the longest protocol data unit, function code included (AP 4.1)."""
+
+NEED_MORE = 0
+"""`Request.reply_length`: the head is too short to tell."""
+
+IMPOSSIBLE = -1
+"""`Request.reply_length`: no reply to this request starts like this."""
+
+
+class Request(ABC, Generic[R]):
+    """One request PDU and everything needed to judge its reply.
+
+    Ranges are checked when a request is made (`UsageError`), so whatever exists can be sent.
+    """
+
+    __slots__ = ()
+
+    @property
+    @abstractmethod
+    def function(self) -> int:
+        """The function code, 1 to 127."""
+
+    @abstractmethod
+    def encode(self) -> bytes:
+        """The request PDU, function code first."""
+
+    @abstractmethod
+    def reply_length(self, head: bytes) -> int:
+        """Bytes of the normal reply PDU that begins with `head` (whose first byte is `function`).
+
+        `NEED_MORE` or `IMPOSSIBLE` where `head` does not tell a length.
+        """
+
+    @abstractmethod
+    def decode(self, pdu: bytes, t_ns: int) -> R:
+        """The reply in a normal reply PDU, complete at `t_ns`. Raises `Desync`, or `VerifyFailed` for a write."""
+
+    def nominal_length(self) -> int:
+        """Bytes of the reply PDU where the request alone tells, else `NEED_MORE`."""
+        return NEED_MORE
+
+    def unanswered(self, t_ns: int) -> R:
+        """What a broadcast of this request returns; raises `UsageError` where it asks for data (SL 2.1)."""
+        raise UsageError(
+            f"function {self.function:02X}h cannot be broadcast: nobody answers", expected="a write, or a unit from 1"
+        )
+
+
+def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
+    """Judge a whole reply PDU against its request.
+
+    Raises `ModbusExceptionReply` (any code, raw), `Desync` for what is no answer to this request, `VerifyFailed`.
+    """
+    function = request.function
+    if not pdu:
+        raise Desync("an empty reply", expected=f"function {function:02X}h")
+    if pdu[0] == function | 0x80:
+        if len(pdu) != 2:
+            raise Desync("an exception reply of the wrong size", expected="2 bytes", got=pdu.hex(" "))
+        raise ModbusExceptionReply(function, pdu[1])
+    if pdu[0] != function:
+        raise Desync("a reply to another function", expected=f"{function:02X}h", got=f"{pdu[0]:02X}h")
+    length = request.reply_length(pdu)
+    if length != len(pdu):
+        raise Desync("a reply of the wrong size", expected=describe_length(request), got=short_hex(pdu))
+    return request.decode(pdu, t_ns)
+
+
+def describe_length(request: Request[R]) -> str:
+    nominal = request.nominal_length()
+    return f"{nominal} bytes after the unit id" if nominal else "a whole reply"
+
+
+def short_hex(data: bytes | bytearray, most: int = 16) -> str:
+    """`data` for an error message: its size and first bytes."""
+    dots = " ..." if len(data) > most else ""
+    return f"{len(data)} bytes: {bytes(data[:most]).hex(' ')}{dots}"

@@ -1,0 +1,106 @@
+"""One request that awaits its reply: bytes and `now` in, the reply or a typed error out.
+
+A Modbus client has at most one transaction on a wire. It ends exactly once: by its reply, by an error, or by its
+deadline. Nothing here waits, retries or knows a connection.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import Bug, FieldtwinError
+from gateway.protocols.modbus.framing import Framer
+from gateway.protocols.modbus.replies import Reply
+from gateway.protocols.modbus.request import Request, parse_reply
+
+R = TypeVar("R", bound=Reply)
+
+
+class Transaction(Generic[R]):
+    """`request` to `unit` over `framer`; the reply is due `timeout_ns` after the last character has left.
+
+    `char_time_ns` is what one character takes on the wire, 0 where that is no matter (TCP). The characters of the reply
+    take their time too: where the request tells how many there are, that time is granted on top.
+    """
+
+    def __init__(
+        self, framer: Framer, unit: int, request: Request[R], *, timeout_ns: int, char_time_ns: int = 0
+    ) -> None:
+        self._framer = framer
+        self._unit = unit
+        self._request = request
+        self._timeout_ns = timeout_ns
+        self._char_time_ns = char_time_ns
+        self._frame = b""
+        self._heard_ns = 0
+        self._settled = True
+        self.sent_ns = 0
+        """When the last character has left."""
+        self.done = False
+
+    @property
+    def deadline_ns(self) -> int:
+        """When the reply has to be complete."""
+        return self.sent_ns + self._timeout_ns + self._request.nominal_length() * self._char_time_ns
+
+    @property
+    def wake_ns(self) -> int:
+        """When `poll` wants to be called if nothing arrives before."""
+        if self._settled or not self._framer.gap_ns:
+            return self.deadline_ns
+        return min(self.deadline_ns, self._heard_ns + self._framer.gap_ns)
+
+    def start(self, now_ns: int) -> bytes:
+        """The frame to send, now."""
+        if self._frame:
+            raise Bug("a Modbus transaction was started twice")
+        self._frame = self._framer.begin(self._unit, self._request)
+        self.handed_over(now_ns)
+        return self._frame
+
+    def handed_over(self, now_ns: int) -> None:
+        """The frame was handed to the wire at `now_ns`, later than `start` where a buffer was full."""
+        self.sent_ns = now_ns + len(self._frame) * self._char_time_ns
+
+    def feed(self, data: bytes, now_ns: int) -> R | None:
+        """Bytes arrived. The reply if it is complete, else None.
+
+        Raises `CrcError`, `Desync`, `ModbusExceptionReply` or `VerifyFailed`; then the transaction is over.
+        """
+        self._check_running()
+        self._heard_ns = now_ns
+        self._settled = False
+        return self._judge(lambda: self._framer.feed(data, now_ns), now_ns)
+
+    def poll(self, now_ns: int) -> R | None:
+        """Time passed. As `feed`; at the deadline raises what `Framer.overdue` says, `ReplyTimeout` as a rule."""
+        self._check_running()
+        overdue = now_ns >= self.deadline_ns
+        if not self._settled and (overdue or now_ns >= self._heard_ns + self._framer.gap_ns):
+            self._settled = True
+            reply = self._judge(self._framer.settle, self._heard_ns)
+            if reply is not None:
+                return reply
+        if overdue:
+            self.done = True
+            raise self._framer.overdue(self._timeout_ns / NS_PER_S).at(f"unit {self._unit}")
+        return None
+
+    def _judge(self, pdu_from: Callable[[], bytes | None], now_ns: int) -> R | None:
+        try:
+            pdu = pdu_from()
+            if pdu is None:
+                return None
+            reply = parse_reply(self._request, pdu, now_ns)
+        except FieldtwinError as e:
+            self.done = True
+            e.at(f"unit {self._unit}")
+            raise
+        self.done = True
+        return reply
+
+    def _check_running(self) -> None:
+        if self.done or not self._frame:
+            raise Bug("bytes for a Modbus transaction that is not under way")

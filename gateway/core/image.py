@@ -33,6 +33,7 @@ __all__ = [
     "RegionFlag",
     "RegionLayout",
     "RegionReader",
+    "RegionShape",
     "RegionWriter",
     "Snapshot",
     "TagKind",

@@ -287,6 +287,11 @@ class RegionReader(_Region):
         """The sequence of the last message of `tag` that a snapshot carried or counted as missed."""
         return self._seen[tag]
 
+    @property
+    def latest(self) -> Snapshot:
+        """What the last `snapshot` answered, without looking again; counter 0 before the first."""
+        return self._latest
+
     def snapshot(self) -> Snapshot:
         """The latest publication, whole. Never waits: at most `MAX_LOOKS` looks, then the last snapshot again."""
         for _ in range(MAX_LOOKS):

@@ -1,0 +1,26 @@
+"""``python -m plc CONFIG.json``: one PLC process. Exit codes as in DESIGN.md; talk on stderr."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from gateway.core.errors import FieldtwinError
+from plc.config import PlcConfig
+from plc.process import plc_main
+
+
+def main() -> int:
+    """Read the configuration named on the command line and run it."""
+    if len(sys.argv) != 2:
+        print("usage: python -m plc CONFIG.json", file=sys.stderr)
+        return 2
+    try:
+        return plc_main(PlcConfig.load(Path(sys.argv[1])))
+    except FieldtwinError as e:
+        print(f"plc: {e}", file=sys.stderr)
+        return e.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

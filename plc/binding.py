@@ -1,0 +1,145 @@
+"""Putting programs together with a plant: sources, bindings, and the process image that follows from them.
+
+Everything that can be wrong is found here, before the first scan: a variable that does not exist or is bound to
+nothing, kinds that differ, two programs that write one tag. No memory, no clock, no cycle.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from gateway.core.errors import FileInvalid
+from gateway.core.image import ImageLayout, TagKind, TagSpec, process_image
+from gateway.core.values import Scalar
+from plc.program import Program, Role, Variable
+
+_SOURCE = "python: module:Class"
+
+
+@dataclass(frozen=True, slots=True)
+class InputBinding:
+    """Where an input comes from, and what a program sees while that is BAD.
+
+    `if_bad` is ``"pass"`` (the value as it is, BAD), ``"hold"`` (the last one that was not, UNCERTAIN) or a number to
+    put in its place (SUBSTITUTED).
+    """
+
+    tag: str
+    if_bad: str | float = "pass"
+
+
+@dataclass(frozen=True, slots=True)
+class BoundProgram:
+    """A program under its name in the system file, with its variables bound to tags of the plant.
+
+    An output or local that is bound to nothing is published as ``<program>.<variable>``.
+    """
+
+    name: str
+    program: Program
+    inputs: Mapping[str, InputBinding] = field(default_factory=dict)
+    outputs: Mapping[str, str] = field(default_factory=dict)
+
+    def variables(self, role: Role) -> list[Variable]:
+        return [v for v in self.program.variables.values() if v.role is role]
+
+    def published(self) -> list[tuple[Variable, str]]:
+        """Outputs and locals with the tag that each is published as."""
+        both = self.variables(Role.OUTPUT) + self.variables(Role.LOCAL)
+        return [(v, self.outputs.get(v.name, f"{self.name}.{v.name}")) for v in both]
+
+
+def load_program(source: str, python_path: Sequence[str] = ()) -> Program:
+    """Make the program that ``python: module:Class`` names, searching `python_path` first. Raises `FileInvalid`."""
+    language, _, rest = source.partition(":")
+    module_name, _, class_name = rest.strip().partition(":")
+    if language.strip() != "python" or not module_name or not class_name:
+        raise FileInvalid("not the source of a program", expected=_SOURCE, got=source)
+    for folder in reversed(python_path):
+        if folder not in sys.path:
+            sys.path.insert(0, folder)
+    try:
+        found = getattr(importlib.import_module(module_name.strip()), class_name.strip(), None)
+    except Exception as e:  # a user's module can raise anything while it is imported; translated here, once
+        raise FileInvalid(f"program {source!r} cannot be imported: {type(e).__name__}: {e}") from e
+    if not (isinstance(found, type) and issubclass(found, Program)):
+        raise FileInvalid(
+            "not a program", expected=f"a class {class_name} derived from plc.program.Program", got=source
+        )
+    try:
+        return found()
+    except Exception as e:  # as above: its constructor is the user's
+        raise FileInvalid(f"program {source!r} cannot be made: {type(e).__name__}: {e}") from e
+
+
+def image_for(
+    programs: Sequence[BoundProgram], plant: Mapping[str, TagSpec], watched: Iterable[str] = ()
+) -> ImageLayout:
+    """The process image that `programs` need of a plant whose tags are `plant`. Raises `FileInvalid`.
+
+    INPUTS holds every tag that an input is bound to, then the `watched` ones; OUTPUTS every output and local.
+    """
+    inputs: dict[str, TagSpec] = {}
+    outputs: dict[str, TagSpec] = {}
+    writers: dict[str, str] = {}
+    for bound in programs:
+        _check_names(bound)
+        for variable in bound.variables(Role.INPUT):
+            spec = _plant_tag(bound, variable, bound.inputs[variable.name].tag, plant)
+            substitute(spec, bound.inputs[variable.name].if_bad)
+            inputs[spec.name] = spec
+        for variable, tag in bound.published():
+            if tag in writers:
+                raise FileInvalid(f"tag {tag} is written by two programs", got=f"{writers[tag]} and {bound.name}")
+            writers[tag] = bound.name
+            if variable.name in bound.outputs:
+                outputs[tag] = _plant_tag(bound, variable, tag, plant)
+            else:
+                outputs[tag] = TagSpec(tag, variable.kind, variable.unit, variable.max_bytes, variable.depth)
+    for tag in watched:
+        inputs.setdefault(tag, plant[tag])
+    return process_image(list(inputs.values()), list(outputs.values()))
+
+
+def _check_names(bound: BoundProgram) -> None:
+    for what, names, role in (("input", bound.inputs, Role.INPUT), ("output", bound.outputs, Role.OUTPUT)):
+        declared = {v.name for v in bound.variables(role)}
+        for name in names:
+            if name not in declared:
+                raise FileInvalid(
+                    f"program {bound.name} has no {what} {name!r}", expected=", ".join(sorted(declared)) or "none"
+                )
+    for variable in bound.variables(Role.INPUT):
+        if variable.name not in bound.inputs:
+            raise FileInvalid(f"input {variable.name!r} of program {bound.name} is bound to no tag")
+
+
+def _plant_tag(bound: BoundProgram, variable: Variable, tag: str, plant: Mapping[str, TagSpec]) -> TagSpec:
+    where = f"{variable.role.value} {variable.name!r} of program {bound.name}"
+    spec = plant.get(tag)
+    if spec is None:
+        raise FileInvalid(f"{where} is bound to {tag}, which does not exist")
+    source, sink = (spec.kind, variable.kind) if variable.role is Role.INPUT else (variable.kind, spec.kind)
+    if source is not sink and not (source is TagKind.INT and sink is TagKind.REAL):
+        raise FileInvalid(f"{where} and {tag} differ in kind", expected=variable.kind.value, got=spec.kind.value)
+    return spec
+
+
+def substitute(spec: TagSpec, if_bad: str | float) -> Scalar | None:
+    """The value that `if_bad` puts in place of a BAD one of tag `spec`, None for a policy that has none.
+
+    Raises `FileInvalid` where it makes no sense.
+    """
+    if isinstance(if_bad, str):
+        if if_bad not in ("hold", "pass"):
+            raise FileInvalid(f"if_bad of {spec.name}", expected="hold, pass or a number", got=repr(if_bad))
+        return None
+    if spec.kind is TagKind.REAL:
+        return float(if_bad)
+    whole = int(if_bad)
+    if spec.kind is TagKind.MESSAGE or whole != if_bad or (spec.kind is TagKind.BOOL and whole not in (0, 1)):
+        raise FileInvalid(f"if_bad of {spec.name}", expected=f"a value of kind {spec.kind.value}", got=repr(if_bad))
+    return bool(whole) if spec.kind is TagKind.BOOL else whole

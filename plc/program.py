@@ -1,0 +1,185 @@
+"""What a PLC program is: a plain class with declared inputs, outputs, local variables and messages.
+
+    class Hysteresis(Program):
+        level: float | None = var_input(TagKind.REAL)
+        pump: bool = var_output(TagKind.BOOL, initial=False)
+        starts: int = var_local(TagKind.INT, initial=0)
+
+        def execute(self, scan: ScanInfo) -> None:
+            ...
+
+Within `execute` inputs are attributes that do not change, outputs and locals are attributes that the program sets. A
+program must never know the plant behind a variable, the image, a clock (`scan.now_ns` is frozen for a scan) or another
+program. Nothing here waits.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any, ClassVar
+
+from gateway.core.errors import Blame, Bug, FieldtwinError
+from gateway.core.image import Message, TagKind
+from gateway.core.values import Scalar, TagValue
+
+MESSAGE_BYTES = 256
+MESSAGE_DEPTH = 16
+
+
+class ProgramFailed(FieldtwinError):
+    """A program raised, or set a variable to what its tag cannot hold. The task stops and its outputs become safe.
+
+    `program` is its name in the system file, `line` the line of its source that raised (0 where unknown), `variable`
+    the tag concerned, if one is.
+    """
+
+    exit_code = 1
+    blame = Blame.FILE
+
+    def __init__(self, program: str, message: str, *, path: str = "", line: int = 0, variable: str = "") -> None:
+        self.program = program
+        self.line = line
+        self.variable = variable
+        spot = f"program {program}" + (f", {path}:{line}" if line else "") + (f", {variable}" if variable else "")
+        super().__init__(message, where=spot)
+
+
+class Role(Enum):
+    """VAR_INPUT, VAR_OUTPUT and VAR of IEC 61131-3. A local is shown to watchers and bound to nothing."""
+
+    INPUT = "input"
+    OUTPUT = "output"
+    LOCAL = "local"
+
+
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A declared variable. `initial` is what it is before the first scan; `max_bytes` and `depth` are a message output's."""
+
+    name: str
+    role: Role
+    kind: TagKind
+    initial: Scalar | None = None
+    unit: str = ""
+    max_bytes: int = 0
+    depth: int = 0
+
+
+def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:
+    """Declare an input. It is None while the plant never had a value and nothing is substituted."""
+    return Variable("", Role.INPUT, kind, initial)
+
+
+def var_output(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> Any:
+    """Declare an output. While it is None nothing is written to the plant."""
+    return Variable("", Role.OUTPUT, kind, initial, unit)
+
+
+def var_local(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> Any:
+    """Declare a local variable that watchers see as ``<program>.<name>``."""
+    return Variable("", Role.LOCAL, kind, initial, unit)
+
+
+def message_input() -> Any:
+    """Declare an input of messages: in each scan the tuple of `Message`s that are new, each in exactly one scan."""
+    return Variable("", Role.INPUT, TagKind.MESSAGE)
+
+
+def message_output(max_bytes: int = MESSAGE_BYTES, depth: int = MESSAGE_DEPTH) -> Any:
+    """Declare an output of messages: an `Outbox`. Bound to a plant's mailbox it takes that one's size."""
+    return Variable("", Role.OUTPUT, TagKind.MESSAGE, max_bytes=max_bytes, depth=depth)
+
+
+@dataclass(frozen=True, slots=True)
+class ScanInfo:
+    """The scan that runs: its frozen time (monotonic), its number from 1, and whether it is the first since start."""
+
+    now_ns: int
+    number: int
+    first_scan: bool
+
+
+class Outbox:
+    """A message output. Never more than `depth` messages are on their way, so that none is overwritten unread.
+
+    `waits` counts sends that were refused because the taker was behind: one a scan that had to wait.
+    """
+
+    def __init__(self, max_bytes: int, depth: int) -> None:
+        self.max_bytes = max_bytes
+        self.depth = depth
+        self.outstanding = 0
+        """Published and not yet taken; kept by the scan."""
+        self.pending: list[tuple[int, bytes]] = []
+        """Sent in this scan, published at its end."""
+        self.waits = 0
+
+    @property
+    def room(self) -> int:
+        """How many more messages can be sent in this scan."""
+        return max(0, self.depth - self.outstanding - len(self.pending))
+
+    def send(self, data: bytes, t_ns: int) -> bool:
+        """Send `data`, whose source time is `t_ns`. False, counted, when there is no room: keep it, try next scan.
+
+        Raises `Bug` for a message longer than `max_bytes`.
+        """
+        if len(data) > self.max_bytes:
+            raise Bug("message too long", expected=f"at most {self.max_bytes} bytes", got=f"{len(data)} bytes")
+        if not self.room:
+            self.waits += 1
+            return False
+        self.pending.append((t_ns, data))
+        return True
+
+
+class Program(ABC):
+    """Base of all programs. A subclass declares variables in its body and overrides `execute`."""
+
+    variables: ClassVar[dict[str, Variable]] = {}
+    _lookup: Callable[[str], TagValue] | None = None
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        own = {
+            name: replace(declared, name=name) for name, declared in vars(cls).items() if isinstance(declared, Variable)
+        }
+        cls.variables = {**cls.variables, **own}
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Program:
+        self = super().__new__(cls)
+        for v in cls.variables.values():
+            initial: object = v.initial
+            if v.kind is TagKind.MESSAGE:
+                initial = () if v.role is Role.INPUT else Outbox(v.max_bytes, v.depth)
+            self.__dict__[v.name] = initial
+        return self
+
+    @abstractmethod
+    def execute(self, scan: ScanInfo) -> None:
+        """One scan: read inputs, set outputs, return. What it raises stops the task."""
+
+    def tag(self, name: str) -> TagValue:
+        """Input `name` with quality, reason and time, as this scan sees it (after its substitute policy)."""
+        if self._lookup is None:
+            raise Bug("an input was looked up outside a scan", where=f"{type(self).__name__}.{name}")
+        return self._lookup(name)
+
+
+__all__ = [
+    "Message",
+    "Outbox",
+    "Program",
+    "ProgramFailed",
+    "Role",
+    "ScanInfo",
+    "Variable",
+    "message_input",
+    "message_output",
+    "var_input",
+    "var_local",
+    "var_output",
+]

@@ -1,0 +1,163 @@
+"""The wall clock of a PLC process: sleeping precisely, and asking the host for what makes that possible.
+
+One thread does everything. Between two scans it runs the control channel's asyncio loop, but only until `GUARD_NS`
+before the next deadline (asyncio rounds its timers up to 1 ms); the rest is an absolute clock_nanosleep. The alternative
+was a second thread for the channel: it would hold the interpreter's lock at instants that nobody chooses, for up to the
+length of a JSON encoding, whereas here a request is begun only while there is slack. Cycles too short for the guard
+poll the channel without waiting, every `POLL_NS`.
+
+MEASURED
+
+The only module of the PLC that imports ``time``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import errno
+import gc
+import os
+import resource
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from gateway.core.clock import NS_PER_MS, NS_PER_S
+from plc.task import CyclicTask
+
+GUARD_NS = 2 * NS_PER_MS
+POLL_NS = 10 * NS_PER_MS
+STEP_NS = 200 * NS_PER_MS
+"""Longest time without looking at whether to stop."""
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+_PR_SET_TIMERSLACK = 29
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+_libc: Any = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
+
+
+def monotonic_ns() -> int:
+    """The host's monotonic time, the same for every process."""
+    return time.monotonic_ns()
+
+
+def sleep_until_ns(deadline_ns: int) -> None:
+    """Return at `deadline_ns` of `monotonic_ns` or after it; earlier only when a signal came in."""
+    if _libc is None:
+        time.sleep(max(0, deadline_ns - time.monotonic_ns()) / NS_PER_S)
+        return
+    until = _Timespec(deadline_ns // NS_PER_S, deadline_ns % NS_PER_S)
+    _libc.clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(until), None)
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeReport:
+    """What the host granted, and what it did not, with the reason."""
+
+    granted: tuple[str, ...]
+    refused: tuple[tuple[str, str], ...]
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {"granted": list(self.granted), "refused": dict(self.refused)}
+
+
+def prepare(priority: int = 10) -> RealtimeReport:
+    """Ask for timer slack 1 ns, locked memory, a frozen heap and, last, SCHED_FIFO at `priority` (0: not asked for).
+
+    Last, because threads inherit the class. Never raises: a laptop or a container grants less, and the report says so.
+    """
+    granted, refused = [], []
+    for what, ask in (
+        ("timer slack 1 ns", _timer_slack),
+        ("memory locked", _lock_memory),
+        ("heap frozen", _freeze_heap),
+        (f"SCHED_FIFO {priority}", lambda: _promote(priority)),
+    ):
+        try:
+            ask()
+            granted.append(what)
+        except OSError as e:
+            refused.append((what, e.strerror or str(e)))
+    return RealtimeReport(tuple(granted), tuple(refused))
+
+
+def _timer_slack() -> None:
+    _need_linux()
+    _check(_libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0))
+
+
+def _lock_memory() -> None:
+    _need_linux()
+    # With a limit on locked memory, locking what is still to come would make a later allocation fail: lock what is there.
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    future = _MCL_FUTURE if soft == resource.RLIM_INFINITY else 0
+    _check(_libc.mlockall(_MCL_CURRENT | future))
+
+
+def _freeze_heap() -> None:
+    gc.collect()
+    gc.freeze()
+
+
+def _promote(priority: int) -> None:
+    _need_linux()
+    if priority <= 0:
+        raise OSError(errno.EPERM, "not asked for")
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+
+
+def _need_linux() -> None:
+    if _libc is None:
+        raise OSError(errno.ENOSYS, "only on Linux")
+
+
+def _check(result: int) -> None:
+    if result:
+        code = ctypes.get_errno()
+        raise OSError(code, os.strerror(code))
+
+
+def run_task(task: CyclicTask, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:
+    """Drive `task` on the wall clock, and `loop` in its slack, until `stop_requested()`; outputs are safe afterwards.
+
+    A task that stops by itself leaves the loop running, so that it can be asked why. To end a wait early stop the loop.
+    """
+    task.start()
+    polled_ns = 0
+    try:
+        while not stop_requested():
+            now_ns = time.monotonic_ns()
+            due_ns = task.deadline_ns if task.running else now_ns + STEP_NS
+            slack_ns = due_ns - GUARD_NS - now_ns
+            if slack_ns > 0:
+                _run_loop(loop, min(slack_ns, STEP_NS))
+            elif now_ns - polled_ns >= POLL_NS:
+                _run_loop(loop, 0)
+            else:
+                sleep_until_ns(due_ns)
+                if time.monotonic_ns() >= due_ns and task.running and not stop_requested():
+                    task.run_once()
+                continue
+            polled_ns = time.monotonic_ns()
+    finally:
+        task.stop()
+
+
+def _run_loop(loop: asyncio.AbstractEventLoop, for_ns: int) -> None:
+    """Run callbacks for `for_ns`; with 0, what is ready now."""
+    timer = loop.call_later(for_ns / NS_PER_S, loop.stop) if for_ns else loop.call_soon(loop.stop)
+    try:
+        loop.run_forever()
+    finally:
+        timer.cancel()

@@ -1,0 +1,204 @@
+"""The paper's ControlLogic (SPEC part 1), and `Relay`, the PLC program that runs it in a scan.
+
+`ControlLogic` is the row to the letter: consumers `sensor` and `transmitter`, producers `response` and `command`, a
+period, a data log and the observatory's state machine. Its payloads are never looked into, but for the period of a
+command. `Relay` connects it to tags: what the mailboxes bring goes to the consumers, what the producers emit goes to
+outputs, and waits in a bounded queue while the transmitter is behind.
+
+Neither may know a protocol, a register or the time of day; `now_ns` is the scan's.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from gateway.core.errors import Bug, Desync
+from gateway.core.events import Consumer, Producer
+from gateway.core.image import Message, TagKind
+from gateway.core.statemachine import STATE_CODES, EventStateMachine
+from gateway.core.values import COMMAND, DATA, RESPONSE
+from plc.program import Outbox, Program, ScanInfo, message_input, message_output, var_local, var_output
+
+QUEUE_CAPACITY = 256
+LOG_CAPACITY = 1024
+LOG_BYTES = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class LogEntry:
+    """One entry of the data log: ``command``, ``response`` or ``bad command``, its payload, and when (monotonic ns)."""
+
+    t_ns: int
+    kind: str
+    data: bytes
+
+    def encode(self) -> bytes:
+        """As it leaves in the `log` messages: UTF-8 JSON ``{"t_ns": int, "kind": str, "data": hex}``."""
+        return json.dumps({"t_ns": self.t_ns, "kind": self.kind, "data": self.data.hex()}).encode()
+
+
+class DataLog:
+    """Bounded, ordered, time-stamped; duplicates are kept, a full log drops its oldest entry (SPEC ruling 2).
+
+    `total` counts all entries there ever were.
+    """
+
+    def __init__(self, capacity: int = LOG_CAPACITY) -> None:
+        self.entries: deque[LogEntry] = deque(maxlen=capacity)
+        self.total = 0
+
+    def append(self, entry: LogEntry) -> None:
+        self.entries.append(entry)
+        self.total += 1
+
+    @property
+    def dropped(self) -> int:
+        return self.total - len(self.entries)
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def __iter__(self) -> Iterator[LogEntry]:
+        return iter(self.entries)
+
+
+class ControlLogic:
+    """SPEC row ControlLogic. Init: period 0, log empty, state STANDBY.
+
+    `commands`, `responses` count what was relayed, `bad_commands` what came as a command and was none.
+    """
+
+    def __init__(self) -> None:
+        self.sensor: Consumer[RESPONSE] = Consumer("sensor", QUEUE_CAPACITY)
+        self.transmitter: Consumer[COMMAND] = Consumer("transmitter", QUEUE_CAPACITY)
+        self.response: Producer[RESPONSE] = Producer("response")
+        self.command: Producer[COMMAND] = Producer("command")
+        self.machine = EventStateMachine()
+        self.data_log = DataLog()
+        self.commands = self.responses = self.bad_commands = 0
+
+    @property
+    def period_s(self) -> int:
+        """`period` in Z: seconds, as last commanded."""
+        return self.machine.period_s
+
+    def set_period(self, command: COMMAND) -> None:
+        """SetPeriod: the period and the state that follows from it. Raises `Desync` for a command that is none."""
+        self.machine.process_event(command)
+
+    def log_data(self, kind: str, data: DATA, now_ns: int) -> None:
+        """LogData. Its precondition is period > 0: asking otherwise is a bug of the caller."""
+        if self.period_s <= 0:
+            raise Bug("data logged while nothing is sampled", expected="period > 0", got=str(self.period_s))
+        self.data_log.append(LogEntry(now_ns, kind, data.data))
+
+    def send_cmd(self, now_ns: int) -> None:
+        """sendCmd: drain the transmitter's queue; each command is consumed, sets the period, and is emitted.
+
+        It is always relayed; logging is what period > 0 guards, with the period after SetPeriod (SPEC ruling 1). What
+        is no command changes nothing and is not relayed: it is counted, and logged under the same guard.
+        """
+        for command in self.transmitter.drain():
+            try:
+                self.set_period(command)
+            except Desync:
+                self.bad_commands += 1
+                self._log_if_active("bad command", command, now_ns)
+                continue
+            self.commands += 1
+            self.command.emit(command)
+            self._log_if_active("command", command, now_ns)
+
+    def send_rsp(self, now_ns: int) -> None:
+        """sendRsp: drain the sensor's queue; each response is consumed and emitted unaltered, and logged if active."""
+        for response in self.sensor.drain():
+            self.responses += 1
+            self.response.emit(response)
+            self._log_if_active("response", response, now_ns)
+
+    def _log_if_active(self, kind: str, data: DATA, now_ns: int) -> None:
+        if self.period_s > 0:
+            self.log_data(kind, data, now_ns)
+
+
+class Relay(Program):
+    """The observatory's control logic as a program.
+
+    `period_s` is the commanded period, also when it is 0 or negative; 0 before the first command (STANDBY). `response`
+    carries the sensor's payloads unaltered, `log` the data log's entries (`LogEntry.encode`). A full mailbox means
+    wait: responses queue, bounded, the oldest dropped and counted.
+    """
+
+    command: tuple[Message, ...] = message_input()
+    sample: tuple[Message, ...] = message_input()
+    period_s: int = var_output(TagKind.INT, initial=0, unit="s")
+    response: Outbox = message_output()
+    log: Outbox = message_output(LOG_BYTES, depth=64)
+    state: int = var_local(TagKind.INT, initial=STATE_CODES["STANDBY"])
+    period: int = var_local(TagKind.INT, initial=0, unit="s")
+    commands: int = var_local(TagKind.INT, initial=0)
+    responses: int = var_local(TagKind.INT, initial=0)
+    logged: int = var_local(TagKind.INT, initial=0)
+    dropped: int = var_local(TagKind.INT, initial=0)
+    bad_commands: int = var_local(TagKind.INT, initial=0)
+    waiting: int = var_local(TagKind.INT, initial=0)
+
+    def __init__(self) -> None:
+        self.logic = ControlLogic()
+        self._outgoing: Consumer[RESPONSE] = Consumer("response", QUEUE_CAPACITY)
+        self.logic.response.subscribe(self._outgoing)
+        self._log_sent = 0
+        self._log_lost = 0
+        self._too_long = 0
+
+    def execute(self, scan: ScanInfo) -> None:
+        logic = self.logic
+        for message in self.command:
+            logic.transmitter.observe(COMMAND(message.data))
+        for message in self.sample:
+            logic.sensor.observe(RESPONSE(message.data))
+        logic.send_cmd(scan.now_ns)
+        logic.send_rsp(scan.now_ns)
+        self._pass_on_responses(scan.now_ns)
+        self._pass_on_log()
+        self._show()
+
+    def _pass_on_responses(self, now_ns: int) -> None:
+        queue = self._outgoing.queue
+        while queue:
+            if len(queue[0].data) > self.response.max_bytes:
+                self._too_long += 1  # the transmitter could never take it
+            elif not self.response.send(queue[0].data, now_ns):
+                return
+            self._outgoing.consume()
+
+    def _pass_on_log(self) -> None:
+        log = self.logic.data_log
+        if log.total == self._log_sent:
+            return
+        first = log.total - len(log)
+        if self._log_sent < first:  # overwritten before anybody took them
+            self._log_lost += first - self._log_sent
+            self._log_sent = first
+        while self._log_sent < log.total and self.log.room:
+            entry = log.entries[self._log_sent - first]
+            text = entry.encode()
+            if len(text) > self.log.max_bytes:
+                self._too_long += 1
+            else:
+                self.log.send(text, entry.t_ns)
+            self._log_sent += 1
+
+    def _show(self) -> None:
+        logic = self.logic
+        self.period_s = self.period = logic.period_s
+        self.state = STATE_CODES[logic.machine.state.name]
+        self.commands, self.responses, self.bad_commands = logic.commands, logic.responses, logic.bad_commands
+        self.logged = logic.data_log.total
+        self.waiting = len(self._outgoing.queue)
+        self.dropped = (
+            logic.sensor.dropped + logic.transmitter.dropped + self._outgoing.dropped + self._log_lost + self._too_long
+        )

@@ -1,0 +1,167 @@
+"""The cyclic task: a scan on absolute deadlines, its lateness, its watchdog.
+
+Deadlines are start + k x cycle and never move. A task that is late runs once and goes on with the next deadline that is
+still to come: missed periods are skipped and counted, never made up for in a burst.
+
+    READY --start--> RUNNING --stop------------------------------> STOPPED (requested)
+                        | ---`stop_after` overruns in a row------> STOPPED (watchdog)
+                        | ---a program raises--------------------> STOPPED (failed; `error` says where)
+
+On every way to STOPPED the outputs are published as stopped, which makes the gateway write their safe values. The task
+waits for nothing by itself: whoever drives it sleeps until `deadline_ns` and calls `run_once`. So the same object runs
+on the wall clock (plc.realtime) and in a loop under virtual time (`run_on_clock`). It must never know which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol
+
+from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.errors import Bug, CheckFailed, FieldtwinError
+from plc.histogram import Histogram
+
+
+class Executable(Protocol):
+    """What a task runs: plc.scan.Scan."""
+
+    def execute(self, now_ns: int) -> None: ...
+
+    def stop(self, now_ns: int) -> None: ...
+
+
+class TaskState(Enum):
+    READY = "ready"
+    RUNNING = "running"
+    STOPPED = "stopped"
+
+
+class StopReason(Enum):
+    NONE = "none"
+    REQUESTED = "requested"
+    WATCHDOG = "watchdog"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class TaskConfig:
+    """`cycle_ms` between deadlines; a scan that starts more than `late_ms` after its deadline, or ends after the next one,
+    is an overrun, and `stop_after` overruns in a row stop the task (0: never)."""
+
+    cycle_ms: float
+    late_ms: float = 5.0
+    stop_after: int = 3
+
+    def __post_init__(self) -> None:
+        if not (self.cycle_ms > 0 and self.late_ms > 0 and self.stop_after >= 0):
+            raise Bug(
+                "an impossible task", expected="cycle_ms and late_ms above 0, stop_after 0 or more", got=str(self)
+            )
+
+
+class CyclicTask:
+    """One scan on one cycle. `now_ns` is the clock's monotonic time, read around each scan.
+
+    `lateness` and `duration` are histograms of start after deadline and of execution time. Counters: `scans`,
+    `missed_periods`, `overruns`.
+    """
+
+    def __init__(self, scan: Executable, config: TaskConfig, now_ns: Callable[[], int]) -> None:
+        self.config = config
+        self.state = TaskState.READY
+        self.stop_reason = StopReason.NONE
+        self.error: FieldtwinError | None = None
+        self.lateness = Histogram()
+        self.duration = Histogram()
+        self.scans = self.missed_periods = self.overruns = 0
+        self.deadline_ns = 0
+        """When the next scan is due; meaningful while RUNNING."""
+        self._scan = scan
+        self._now_ns = now_ns
+        self._cycle_ns = round(config.cycle_ms * NS_PER_MS)
+        self._late_ns = round(config.late_ms * NS_PER_MS)
+        self._overruns_in_a_row = 0
+
+    @property
+    def running(self) -> bool:
+        return self.state is TaskState.RUNNING
+
+    def start(self) -> None:
+        """READY to RUNNING: the first scan is due one cycle from now."""
+        if self.state is not TaskState.READY:
+            raise Bug("a task is started once", got=self.state.value)
+        self.state = TaskState.RUNNING
+        self.deadline_ns = self._now_ns() + self._cycle_ns
+
+    def run_once(self) -> None:
+        """The scan that is due. Afterwards `deadline_ns` is the next one to wait for, or the task is STOPPED."""
+        if not self.running:
+            raise Bug("a scan of a task that does not run", got=self.state.value)
+        began_ns = self._now_ns()
+        late_ns = began_ns - self.deadline_ns
+        self.lateness.record(late_ns)
+        try:
+            self._scan.execute(began_ns)
+        except FieldtwinError as e:
+            self.error = e
+            self._stop(StopReason.FAILED)
+            return
+        self.scans += 1
+        ended_ns = self._now_ns()
+        self.duration.record(ended_ns - began_ns)
+        missed = max(0, (ended_ns - self.deadline_ns) // self._cycle_ns)
+        self.missed_periods += missed
+        self.deadline_ns += (missed + 1) * self._cycle_ns
+        self._watch(overrun=late_ns > self._late_ns or missed > 0)
+
+    def stop(self) -> None:
+        """Stop on request: outputs safe. A task that has stopped already stays as it is."""
+        if self.state is not TaskState.STOPPED:
+            self._stop(StopReason.REQUESTED)
+
+    def _watch(self, overrun: bool) -> None:
+        if not overrun:
+            self._overruns_in_a_row = 0
+            return
+        self.overruns += 1
+        self._overruns_in_a_row += 1
+        if self.config.stop_after and self._overruns_in_a_row >= self.config.stop_after:
+            self.error = CheckFailed(
+                "the watchdog stopped the task",
+                expected=f"a scan every {self.config.cycle_ms} ms, at most {self.config.late_ms} ms late",
+                got=f"{self._overruns_in_a_row} overruns in a row, the longest scan {self.duration.max_ns / 1e6:.3f} ms",
+            )
+            self._stop(StopReason.WATCHDOG)
+
+    def _stop(self, reason: StopReason) -> None:
+        self.state = TaskState.STOPPED
+        self.stop_reason = reason
+        self._scan.stop(self._now_ns())
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able: state, reason, error, counters, lateness and duration in microseconds."""
+        return {
+            "state": self.state.value,
+            "stop_reason": self.stop_reason.value,
+            "error": str(self.error) if self.error else "",
+            "cycle_ms": self.config.cycle_ms,
+            "scans": self.scans,
+            "missed_periods": self.missed_periods,
+            "overruns": self.overruns,
+            "lateness_us": self.lateness.summary_us(),
+            "duration_us": self.duration.summary_us(),
+        }
+
+
+async def run_on_clock(task: CyclicTask, clock: Clock) -> None:
+    """Drive `task` in the running loop until it is stopped: what a virtual clock does. Cancelling it makes outputs safe."""
+    task.start()
+    try:
+        while task.running:
+            await clock.sleep_until_ns(task.deadline_ns)
+            if task.running:
+                task.run_once()
+    finally:
+        task.stop()

@@ -8,9 +8,9 @@ with back-off; until then the devices' tags are bad and say why.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import Connector
@@ -28,7 +28,7 @@ from gateway.core.values import Reason
 from gateway.devices.config import BusConfig
 from gateway.devices.register_device import RegisterDriver
 from gateway.devices.transmitter import TransmitterDriver
-from gateway.protocols.modbus.client import ClientCounters, ModbusClient
+from gateway.protocols.modbus.client import ModbusClient
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.tags import TagTable
 
@@ -92,7 +92,7 @@ class ModbusBus:
         self._on_offline = on_offline
         self._jobs: deque[Job] = deque()
         self._wake = asyncio.Event()
-        self._past: list[ClientCounters] = []
+        self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
 
     # -- what others see ----------------------------------------------------------------------------------------------
@@ -111,11 +111,9 @@ class ModbusBus:
             self._jobs.append(job)
             self._wake.set()
 
-    def totals(self) -> dict[str, int]:
+    def totals(self) -> Counter[str]:
         """Counters over all connections so far: requests, replies, timeouts..."""
-        parts = self._past + ([self._client.counters] if self._client else [])
-        names = [n for n in vars(ClientCounters()) if isinstance(getattr(ClientCounters(), n), int)]
-        return {name: sum(getattr(part, name) for part in parts) for name in names}
+        return self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
 
     # -- running --------------------------------------------------------------------------------------------------------
 
@@ -150,7 +148,7 @@ class ModbusBus:
                 self._lost(e)
                 await self._pause(backoff.next_s())
             finally:
-                self._past = [_sum(self._past, client.counters)]
+                self._past.update(asdict(client.counters))
                 self._client = None
                 self.connected = False
                 await client.aclose()
@@ -261,13 +259,3 @@ class ModbusBus:
             except WireError:
                 if not left:
                     raise
-
-
-def _sum(parts: list[ClientCounters], last: ClientCounters) -> ClientCounters:
-    """One set of counters that stands for all closed connections."""
-    total = ClientCounters()
-    for part in [*parts, last]:
-        for name, value in vars(part).items():
-            if isinstance(value, int):
-                setattr(total, name, getattr(total, name) + value)
-    return total

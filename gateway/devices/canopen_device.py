@@ -1,0 +1,180 @@
+"""The driver of a CANopen node: identity, configuration over SDO, values from TPDO1, state from the heartbeat.
+
+The node's values are good while its TPDOs come and it is OPERATIONAL; a lost heartbeat makes them bad at once. Without
+leave to write, nothing is configured and nothing is started: the mapping is read from the node and listened to.
+"""
+
+from __future__ import annotations
+
+from gateway.core.clock import Clock
+from gateway.core.connection import PROTOCOL, CanConnection
+from gateway.core.errors import Bug, NotAllowed, WrongDevice
+from gateway.core.profile import Tag
+from gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
+from gateway.devices.codec import decode_little, encode, reorder
+from gateway.devices.config import DeviceConfig
+from gateway.devices.driver import DeviceDriver, TagSink
+from gateway.protocols.canopen.cob_id import TPDO_BASES
+from gateway.protocols.canopen.configure import configure_tpdo, read_tpdo, set_heartbeat_producer
+from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from gateway.protocols.canopen.pdo import PdoLengthMismatch, PdoMapping
+
+BITS = {
+    "bool": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
+    "float32": 32, "float64": 64,
+}  # fmt: skip
+
+NMT_COMMANDS = {
+    "nmt_start": NmtCommand.START,
+    "nmt_stop": NmtCommand.STOP,
+    "nmt_preoperational": NmtCommand.ENTER_PRE_OPERATIONAL,
+    "nmt_reset_node": NmtCommand.RESET_NODE,
+    "nmt_reset_communication": NmtCommand.RESET_COMMUNICATION,
+}
+
+
+class CanopenDriver(DeviceDriver):
+    """A driver of one node, made from its profile."""
+
+    wire_types = frozenset({PROTOCOL.CAN})
+
+    def __init__(self, config: DeviceConfig, sink: TagSink, clock: Clock) -> None:
+        super().__init__(config, sink)
+        self._clock = clock
+        self.node = config.address
+        self.malformed_pdos = 0
+        self._master: CanopenMaster | None = None
+        self._by_object = {t.object: t for t in self.profile.tags.values()}
+        self._mapping: PdoMapping | None = None
+        self._cob_id = 0
+
+    @property
+    def message_tag(self) -> str | None:
+        """A node emits no message that a program could be bound to."""
+        return None
+
+    @property
+    def master(self) -> CanopenMaster:
+        """The master of the bus that this node stands on."""
+        if self._master is None:
+            raise Bug("a driver without a master was used", where=self.config.where)
+        return self._master
+
+    @property
+    def pdo_tags(self) -> list[str]:
+        """The full names of the tags that TPDO1 brings."""
+        return [f"{self.config.name}.{t}" for t in (self.config.tpdo1.tags if self.config.tpdo1 else ())]
+
+    def attach_master(self, connection: CanConnection, master: CanopenMaster) -> None:
+        """Use `master`, which talks over `connection`, from now on."""
+        self.attach(connection)
+        self._master = master
+        self._mapping, self._cob_id = None, 0
+        consumer_ms = self.config.heartbeat.consumer_ms if self.config.heartbeat else 0
+        master.add_node(self.node, heartbeat_consumer_ms=consumer_ms)
+
+    # -- bringing the node up (CiA 302-2, boot slave) ---------------------------------------------------------------
+
+    async def identify(self) -> None:
+        """Read what `expect` names over SDO; raises `WrongDevice` on a difference."""
+        wrong: dict[str, object] = {}
+        for name, expected in self.config.expect.items():
+            tag = self.profile.tags[name]
+            held = (await self._upload(tag)).value
+            if str(held) != expected:
+                wrong[name] = held
+        self.identity_error = ", ".join(f"{n} is {v!r}" for n, v in wrong.items())
+        if wrong:
+            expected = ", ".join(f"{n} {self.config.expect[n]!r}" for n in wrong)
+            raise WrongDevice(
+                "another node answers", expected=expected, got=self.identity_error, where=self.config.where
+            )
+
+    async def configure(self) -> None:
+        """Set heartbeat and TPDO1 as the system file says. These are writes: the caller has leave to write."""
+        if self.config.heartbeat is not None:
+            await set_heartbeat_producer(self.master, self.node, self.config.heartbeat.producer_ms)
+        if self.config.tpdo1 is not None:
+            objects = [self._entry(self.profile.tags[t]) for t in self.config.tpdo1.tags]
+            cob_id = TPDO_BASES[0] + self.node
+            mapping = await configure_tpdo(
+                self.master, self.node, 1, objects, cob_id, event_ms=self.config.tpdo1.event_ms
+            )
+            self._listen(cob_id, mapping)
+
+    async def adopt(self) -> None:
+        """Take TPDO1 as the node has it, and listen. Reads only."""
+        if self.config.tpdo1 is not None:
+            held = await read_tpdo(self.master, self.node, 1)
+            if held.enabled:
+                self._listen(held.cob_id, held.mapping)
+
+    def _listen(self, cob_id: int, mapping: PdoMapping) -> None:
+        if self._cob_id:
+            self.master.unsubscribe_pdo(self._cob_id, self._on_pdo)
+        self._cob_id, self._mapping = cob_id, mapping
+        self.master.subscribe_pdo(cob_id, self._on_pdo)
+
+    def _entry(self, tag: Tag) -> tuple[int, int, int]:
+        assert tag.object is not None
+        return (*tag.object, BITS[tag.type])
+
+    # -- what the node sends --------------------------------------------------------------------------------------------
+
+    def _on_pdo(self, data: bytes, t_ns: int) -> None:
+        if self._mapping is None or self.identity_error:
+            return
+        if self.master.node_state(self.node) not in (NmtState.OPERATIONAL, None):
+            return  # a TPDO that overtook its node's last heartbeat: the state decides
+        try:
+            values = self._mapping.unpack(data)
+        except PdoLengthMismatch:
+            self.malformed_pdos += 1
+            return
+        for entry, raw in zip(self._mapping.entries, values, strict=True):
+            tag = self._by_object.get((entry.index, entry.subindex))
+            if tag is not None and BITS.get(tag.type) == entry.bits:
+                self.sink.put(f"{self.config.name}.{tag.name}", decode_little(tag, raw, t_ns))
+        self.emitter.emit(MEASUREMENT(data))
+
+    def on_event(self, event: NodeEvent) -> None:
+        """The node's state changed, or its heartbeat was lost: its values follow at once."""
+        if event.kind == "heartbeat-lost":
+            self.sink.put_bad(self.tag_names, Reason.HEARTBEAT_LOST)
+        elif event.kind == "boot-up" or (event.kind == "state" and event.state is not NmtState.OPERATIONAL):
+            self.sink.put_bad(self.pdo_tags, Reason.NOT_OPERATIONAL)
+
+    # -- SDO ------------------------------------------------------------------------------------------------------------
+
+    async def _upload(self, tag: Tag) -> TagValue:
+        assert tag.object is not None
+        length = BITS[tag.type] // 8 if tag.type in BITS else None
+        raw = await self.master.sdo_upload(self.node, *tag.object, length=length)
+        value = decode_little(tag, raw, self._clock.monotonic_ns())
+        self.sink.put(f"{self.config.name}.{tag.name}", value)
+        return value
+
+    async def _read(self, what: str) -> list[DATA]:
+        for tag in self.profile.group(what):
+            await self._upload(tag)
+        return []
+
+    async def _write(self, item: DATA) -> None:
+        if not isinstance(item, COMMAND):
+            raise Bug("a node takes commands only", got=type(item).__name__, where=self.config.where)
+        self.check(item)
+        if item.name in NMT_COMMANDS:
+            await self.master.nmt(NMT_COMMANDS[item.name], self.node)
+            return
+        tag = self.profile.tags[self.profile.form.commands.get(item.name, item.name.removeprefix("set_"))]
+        assert tag.object is not None
+        await self.master.sdo_download(self.node, *tag.object, item.data)
+
+    def command(self, tag_name: str, value: float) -> COMMAND:
+        """The command that writes `value` to a tag's object. Raises `NotAllowed` outside its limits."""
+        tag = self.profile.tags.get(tag_name)
+        if tag is None or not tag.writable:
+            raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
+        big = reorder(encode(tag, value), tag.order)
+        return COMMAND(big[::-1], self.profile.command_for(tag_name))

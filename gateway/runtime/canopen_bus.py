@@ -1,0 +1,176 @@
+"""One CAN bus: its connection, the CANopen master on it, and the bringing up of its nodes.
+
+Every node is brought up on its own and again whenever it restarts or was lost: identity, configuration, start, in the order of
+CiA 302-2. Configuring and starting are writes: on a plant that was not allowed, the nodes are listened to and nothing more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import Connector
+from gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
+from gateway.core.nursery import Nursery
+from gateway.core.values import COMMAND, Reason
+from gateway.devices.canopen_device import CanopenDriver
+from gateway.devices.config import BusConfig
+from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.canopen.nmt import NodeEvent
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.backoff import Backoff
+from gateway.runtime.modbus_bus import reason_of
+from gateway.runtime.tags import TagTable
+
+
+@dataclass
+class NodeStatus:
+    """What the bus knows about one node. `wanted` is set while it has to be brought up (again)."""
+
+    driver: CanopenDriver
+    online: bool = False
+    error: str = "not asked yet"
+    boots: int = 0
+    emcys: int = 0
+    bring_ups: int = 0
+    wanted: asyncio.Event = field(default_factory=asyncio.Event)
+    backoff: Backoff = field(default_factory=lambda: Backoff(0.25, 10.0))
+
+
+class CanopenBus:
+    """Runs a bus until cancelled."""
+
+    def __init__(
+        self,
+        config: BusConfig,
+        drivers: list[CanopenDriver],
+        connector: Connector,
+        clock: Clock,
+        tags: TagTable,
+        audit: AuditLog,
+        allow_writes: bool,
+    ) -> None:
+        self.config = config
+        self.nodes = {d.node: NodeStatus(d) for d in drivers}
+        self.connected = False
+        self.opens = 0
+        self.error = ""
+        self._connector = connector
+        self._clock = clock
+        self._tags = tags
+        self._audit = audit
+        self._allow_writes = allow_writes
+        self._master: CanopenMaster | None = None
+        self._past: Counter[str] = Counter()
+
+    def totals(self) -> Counter[str]:
+        """Counters over all connections so far."""
+        return self._past + Counter(asdict(self._master.counters)) if self._master else Counter(self._past)
+
+    async def run(self) -> None:
+        """Open, serve, and open again, until cancelled."""
+        backoff = Backoff(0.25, 5.0)
+        while True:
+            try:
+                connection = await self._connector.open_can(self.config.endpoint, self.config.bitrate)
+            except (Unreachable, UsageError) as e:  # a wrong bit rate can be mended while we run: keep trying
+                self._lost(e)
+                await self._pause(backoff.next_s())
+                continue
+            master = CanopenMaster(
+                connection, self._clock, sdo_timeout_s=self.config.timeout_s, on_event=self._on_event
+            )
+            self._master = master
+            self.connected, self.error = True, ""
+            self.opens += 1
+            try:
+                async with Nursery() as nursery:
+                    nursery.start(master.run(), f"{self.config.name} master")
+                    for status in self.nodes.values():
+                        status.driver.attach_master(connection, master)
+                        status.wanted.set()
+                        nursery.start(self._keep_up(status), f"{status.driver.config.name} bring-up")
+                    backoff.reset()
+                    await nursery.wait()
+            except ConnectionLost as e:
+                self._lost(e)
+                await self._pause(backoff.next_s())
+            finally:
+                self._past.update(asdict(master.counters))
+                self._master = None
+                self.connected = False
+                await connection.aclose()
+
+    async def _pause(self, seconds: float) -> None:
+        await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(seconds * NS_PER_S))
+
+    def _lost(self, error: FieldtwinError) -> None:
+        self.connected, self.error = False, str(error)
+        for status in self.nodes.values():
+            status.online, status.error = False, str(error)
+            self._tags.put_bad(status.driver.tag_names, Reason.UNREACHABLE)
+
+    async def _keep_up(self, status: NodeStatus) -> None:
+        """Bring the node up now, and again each time that it is wanted."""
+        while True:
+            await status.wanted.wait()
+            status.wanted.clear()
+            try:
+                await self._bring_up(status.driver)
+            except ConnectionLost:
+                raise
+            except FieldtwinError as e:
+                status.online, status.error = False, str(e)
+                self._tags.put_bad(status.driver.tag_names, reason_of(e))
+                status.wanted.set()
+                await self._pause(status.backoff.next_s())
+            else:
+                status.online, status.error = True, ""
+                status.bring_ups += 1
+                status.backoff.reset()
+
+    async def _bring_up(self, driver: CanopenDriver) -> None:
+        await driver.identify()
+        if not self._allow_writes:
+            await driver.adopt()
+            return
+        name = driver.config.name
+        self._audit.note("sdo", name, by="start-up", result="asked", what="heartbeat and TPDO1 as in the system file")
+        await driver.configure()
+        if driver.config.start:
+            self._audit.note("nmt", name, by="start-up", result="asked", what="start")
+            driver.consumer.observe(COMMAND(b"", "nmt_start"))
+            await driver.send()
+
+    def _on_event(self, event: NodeEvent) -> None:
+        status = self.nodes.get(event.node)
+        if status is None:
+            return
+        status.driver.on_event(event)
+        if event.kind == "boot-up":
+            status.boots += 1
+            status.online, status.error = False, "the node restarted"
+            status.wanted.set()
+        elif event.kind == "heartbeat-lost":
+            status.online, status.error = False, "heartbeat lost"
+            status.wanted.set()
+        elif event.kind == "conflict":
+            status.error = "two nodes answer under this node id"
+        elif event.kind == "emcy":
+            status.emcys += 1
+
+    async def stop_nodes(self, timeout_s: float) -> None:
+        """On the way out: nodes that we started go back to PRE-OPERATIONAL, where they send no process data."""
+        if self._master is None or not self._allow_writes:
+            return
+        for status in self.nodes.values():
+            if status.online and status.driver.config.start:
+                self._audit.note("nmt", status.driver.config.name, by="stop", result="asked", what="pre-operational")
+                try:
+                    async with asyncio.timeout(timeout_s):
+                        status.driver.consumer.observe(COMMAND(b"", "nmt_preoperational"))
+                        await status.driver.send()
+                except (TimeoutError, FieldtwinError) as e:
+                    status.error = f"not stopped: {e}"

@@ -1,0 +1,203 @@
+"""The gateway: buses, drivers, tags, outputs and the process image, put together and run.
+
+It is given a Connector, a clock and an image, and cannot tell a plant from its prototype. Its status is plain data for the
+control channel; nothing in it is written for a screen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from gateway.core.connection import Connector
+from gateway.core.events import Consumer
+from gateway.core.image import Image
+from gateway.core.nursery import Nursery
+from gateway.core.values import DATA
+from gateway.devices.canopen_device import CanopenDriver
+from gateway.devices.config import BusConfig, DeviceConfig
+from gateway.devices.register_device import RegisterDriver, SensorDriver
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.canopen_bus import CanopenBus
+from gateway.runtime.image_io import ImageExchange
+from gateway.runtime.mailbox_pump import MailboxPump
+from gateway.runtime.modbus_bus import ModbusBus
+from gateway.runtime.outputs import Output, OutputWriter
+from gateway.runtime.tags import TagTable
+from gateway.store.exchange_log import ExchangeLog
+
+PLC_GRACE_NS = 10 * NS_PER_S
+"""How long a PLC may take to appear after the gateway's start before the outputs are made safe."""
+
+
+@dataclass(frozen=True)
+class GatewayConfig:
+    """What a gateway runs. `plc_lost_ms` is how old the PLC's last scan may be before its outputs count no more."""
+
+    buses: dict[str, BusConfig]
+    devices: dict[str, DeviceConfig]
+    cycle_ms: int
+    plc_lost_ms: int
+    outputs: frozenset[str] = field(default_factory=frozenset)
+    log_tags: frozenset[str] = field(default_factory=frozenset)
+    allow_writes: bool = False
+    remote: bool = False
+
+
+def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clock) -> RegisterDriver | CanopenDriver:
+    """The driver that a device's profile and bus ask for."""
+    if config.profile.protocol == "canopen":
+        return CanopenDriver(config, tags, clock)
+    if config.profile.inbox is not None:
+        return TransmitterDriver(config, tags)
+    return SensorDriver(config, tags) if bus.endpoint.is_serial else RegisterDriver(config, tags)
+
+
+class Gateway:
+    """Runs until cancelled; `shut_down` then brings the outputs to their safe values."""
+
+    def __init__(
+        self, config: GatewayConfig, connector: Connector, clock: Clock, image: Image, audit: AuditLog, log: ExchangeLog
+    ) -> None:
+        self.config = config
+        self.clock = clock
+        self.tags = TagTable(clock)
+        self.log = log
+        self._audit = audit
+        self._started_ns = clock.monotonic_ns()
+        self.drivers: dict[str, RegisterDriver | CanopenDriver] = {}
+        self.buses: dict[str, ModbusBus | CanopenBus] = {}
+        for device in config.devices.values():
+            driver = make_driver(device, config.buses[device.bus], self.tags, clock)
+            self.drivers[device.name] = driver
+            self._declare(driver)
+        for bus in config.buses.values():
+            self._make_bus(bus, connector)
+        self.outputs = OutputWriter(self._make_outputs(), self.tags, audit, config.allow_writes)
+        self.pumps = [
+            MailboxPump(d, self._modbus(d), audit, allow_writes=config.allow_writes, remote=config.remote)
+            for d in self.drivers.values()
+            if isinstance(d, TransmitterDriver)
+        ]
+        sources = self._message_sources()
+        self._sources = sources
+        self.exchange = ImageExchange(image, self.tags, sources)
+        self.plc_alive = False
+        self.plc_losses = 0
+        self.outputs_by_plc: Mapping[str, Any] = {}
+
+    def _declare(self, driver: RegisterDriver | CanopenDriver) -> None:
+        """Tags read again and again grow stale; those read once, at identification, do not."""
+        config = driver.config
+        cyclic = {t.name for g in config.poll for t in driver.profile.group(g)}
+        cyclic |= set(config.tpdo1.tags) if config.tpdo1 else set()
+        for tag in driver.profile.tags.values():
+            if tag.readable:
+                every_ms = config.poll.get(tag.poll, 0)
+                stale_ms = max(config.stale_after_ms, 3 * every_ms) if tag.name in cyclic else None
+                self.tags.declare([f"{config.name}.{tag.name}"], stale_ms)
+
+    def _make_bus(self, bus: BusConfig, connector: Connector) -> None:
+        on_it = [d for d in self.drivers.values() if d.config.bus == bus.name]
+        if bus.endpoint.is_can:
+            nodes = [d for d in on_it if isinstance(d, CanopenDriver)]
+            self.buses[bus.name] = CanopenBus(
+                bus, nodes, connector, self.clock, self.tags, self._audit, self.config.allow_writes
+            )
+        elif on_it:
+            units = [d for d in on_it if isinstance(d, RegisterDriver)]
+            self.buses[bus.name] = ModbusBus(bus, units, connector, self.clock, self.tags, self._on_offline)
+
+    def _modbus(self, driver: RegisterDriver) -> ModbusBus:
+        bus = self.buses[driver.config.bus]
+        assert isinstance(bus, ModbusBus)
+        return bus
+
+    def _make_outputs(self) -> list[Output]:
+        made = []
+        for tag in sorted(self.config.outputs):
+            device, _, local = tag.partition(".")
+            driver = self.drivers[device]
+            if isinstance(driver, RegisterDriver) and not isinstance(driver, TransmitterDriver):
+                made.append(Output(tag, local, driver, self._modbus(driver), driver.config.safe.get(local)))
+        return made
+
+    def _message_sources(self) -> dict[str, Consumer[DATA]]:
+        sources: dict[str, Consumer[DATA]] = {pump.driver.message_tag: pump.inbox for pump in self.pumps}
+        for driver in self.drivers.values():
+            if driver.message_tag is not None and driver.message_tag not in sources:
+                consumer: Consumer[DATA] = Consumer(driver.emitter.event, capacity=256)
+                driver.emitter.subscribe(consumer)
+                sources[driver.message_tag] = consumer
+        return sources
+
+    def _on_offline(self, driver: RegisterDriver) -> None:
+        self.outputs.forget(driver)
+
+    # -- running --------------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Run every bus and the exchange with the PLC, until cancelled or until one fails (a bug of ours)."""
+        async with Nursery() as nursery:
+            for name, bus in self.buses.items():
+                nursery.start(bus.run(), f"bus {name}")
+            nursery.start(self._cycle(), "exchange with the PLC")
+            await nursery.wait()
+
+    async def _cycle(self) -> None:
+        period_ns = self.config.cycle_ms * NS_PER_MS
+        next_ns = self.clock.monotonic_ns()
+        while True:
+            now_ns = self.clock.monotonic_ns()
+            self.tick(now_ns)
+            next_ns = max(next_ns + period_ns, now_ns)  # what was missed is skipped, never made up for in a burst
+            await self.clock.sleep_until_ns(next_ns)
+
+    def tick(self, now_ns: int) -> None:
+        """One exchange with the PLC and what follows from it. Never waits."""
+        for pump in self.pumps:
+            pump.refuse_when_local()
+            self.exchange.untaken[pump.driver.outbox_tag] = pump.untaken
+        self.exchange.exchange(now_ns)
+        for tag, messages in self.exchange.new_messages.items():
+            for pump in self.pumps:
+                if pump.driver.outbox_tag == tag:
+                    pump.offer([m.data for m in messages])
+            if tag in self.config.log_tags:
+                self.log.append([(tag, m.seq, m.t_ns, m.data) for m in messages])
+        self._judge_plc(now_ns)
+        self.outputs.tick(now_ns)
+        for pump in self.pumps:
+            pump.tick(now_ns, self.exchange.all_consumed(pump.driver.message_tag))
+
+    def _judge_plc(self, now_ns: int) -> None:
+        """A PLC whose heartbeat stopped, or which says that it stopped, commands nothing any more."""
+        x = self.exchange
+        age_ms = x.plc_age_ms(now_ns)
+        alive = age_ms <= self.config.plc_lost_ms and not x.plc_stopped
+        if alive:
+            if not self.plc_alive:
+                self.outputs.release()
+            for tag in self.config.outputs:
+                value = x.outputs[tag].value if tag in x.outputs else None
+                if isinstance(value, int | float):
+                    self.outputs.want(tag, value)
+        elif self.plc_alive or (not self.outputs.safe_active and now_ns - self._started_ns > PLC_GRACE_NS):
+            self.plc_losses += 1
+            self.outputs.make_safe("the PLC stopped" if x.plc_stopped else "the PLC's heartbeat was lost")
+        self.plc_alive = alive
+
+    async def shut_down(self, timeout_s: float = 1.0) -> bool:
+        """While `run` still runs: safe outputs, nodes stopped. True when every output was confirmed in time."""
+        deadline_ns = self.clock.monotonic_ns() + int(timeout_s * NS_PER_S)
+        self.plc_alive = False
+        self.outputs.make_safe("the gateway stops")
+        while not self.outputs.settled and self.clock.monotonic_ns() < deadline_ns:
+            await self.clock.sleep_until_ns(self.clock.monotonic_ns() + 5 * NS_PER_MS)
+        for bus in self.buses.values():
+            if isinstance(bus, CanopenBus):
+                await bus.stop_nodes(timeout_s / 2)
+        return self.outputs.settled

@@ -1,0 +1,95 @@
+"""The gateway's side of the process image: tags and messages in, outputs and messages out, and is the PLC alive.
+
+`exchange` runs once a PLC cycle. It never waits: it reads the newest whole publication of the PLC and leaves one of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gateway.core.clock import NS_PER_MS
+from gateway.core.events import Consumer
+from gateway.core.image import INPUTS, OUTPUTS, Image, Message, TagKind, consumed_name, taken_name
+from gateway.core.values import DATA, Quality, Reason, TagValue
+from gateway.runtime.tags import TagTable
+
+
+class ImageExchange:
+    """Publishes INPUTS from the tag table and the message queues; hands on OUTPUTS.
+
+    `sources` are the queues of input messages by tag. Whoever uses this reads `outputs` (values by tag) and `new_messages`
+    (by tag, in order) after each `exchange`, and tells through `taken` how far each output message was dealt with.
+    """
+
+    def __init__(self, image: Image, tags: TagTable, sources: Mapping[str, Consumer[DATA]]) -> None:
+        self._writer = image.writer(INPUTS)
+        self._reader = image.reader(OUTPUTS)
+        self._tags = tags
+        self._sources = dict(sources)
+        inputs = {region.name: region for region in image.layout.regions}[INPUTS]
+        self._inputs = inputs.tags
+        self._depth = {t.name: t.depth for t in self._inputs if t.kind is TagKind.MESSAGE}
+        outputs = {region.name: region for region in image.layout.regions}[OUTPUTS]
+        self._output_names = [t.name for t in outputs.tags if t.kind is not TagKind.MESSAGE]
+        self._message_outputs = [t.name for t in outputs.tags if t.kind is TagKind.MESSAGE]
+        self._consumed: dict[str, int] = {}
+        self.untaken: dict[str, int] = {}
+        """By output message tag: how many messages that were read have not been dealt with yet."""
+        self.outputs: dict[str, TagValue] = {}
+        self.new_messages: Mapping[str, tuple[Message, ...]] = {}
+        self.plc_counter = 0
+        self.plc_stopped = False
+        self._plc_heard_ns = 0
+        self._resume(image)
+
+    def _resume(self, image: Image) -> None:
+        """A restarted gateway goes on behind the last message that its predecessor said it had taken."""
+        before = image.reader(INPUTS).snapshot()
+        for tag in self._message_outputs:
+            taken = before.value(taken_name(tag)).value
+            if isinstance(taken, int) and taken:
+                self._reader.resume(tag, taken)
+
+    def exchange(self, now_ns: int) -> None:
+        """Read the PLC's outputs, then publish the inputs."""
+        snapshot = self._reader.snapshot()
+        if snapshot.counter != self.plc_counter:
+            self.plc_counter = snapshot.counter
+            self._plc_heard_ns = snapshot.t_ns
+        self.plc_stopped = snapshot.stopped
+        self.new_messages = snapshot.messages
+        if snapshot.counter:
+            self.outputs = {name: snapshot.value(name) for name in self._output_names}
+            for tag in self._depth:
+                value = self.outputs[consumed_name(tag)].value
+                self._consumed[tag] = int(value) if value is not None else 0
+        self._publish(now_ns)
+
+    def plc_age_ms(self, now_ns: int) -> float:
+        """Milliseconds since the PLC last published; infinite when it never did."""
+        return (now_ns - self._plc_heard_ns) / NS_PER_MS if self.plc_counter else float("inf")
+
+    def all_consumed(self, tag: str) -> bool:
+        """True when the PLC has consumed every message of `tag` that it was given."""
+        return self._consumed.get(tag, 0) >= self._writer.last_sequence(tag)
+
+    def _publish(self, now_ns: int) -> None:
+        messages: dict[str, list[tuple[int, bytes]]] = {}
+        for tag, source in self._sources.items():
+            if tag not in self._depth:
+                source.queue.clear()
+                continue
+            room = self._depth[tag] - (self._writer.last_sequence(tag) - self._consumed.get(tag, 0))
+            batch = [(now_ns, source.consume().data) for _ in range(min(max(room, 0), len(source.queue)))]
+            if batch:
+                messages[tag] = batch
+        values = [self._value(spec.name, spec.kind, now_ns) for spec in self._inputs]
+        self._writer.publish(values, now_ns, messages)
+
+    def _value(self, name: str, kind: TagKind, now_ns: int) -> TagValue:
+        if kind is TagKind.MESSAGE:
+            return TagValue(0, Quality.GOOD, Reason.NONE, now_ns)
+        tag, dot, suffix = name.rpartition(".")
+        if dot and suffix == "taken" and tag in self._message_outputs:
+            return TagValue(self._reader.seen(tag) - self.untaken.get(tag, 0), Quality.GOOD, Reason.NONE, now_ns)
+        return self._tags.current(name, now_ns)

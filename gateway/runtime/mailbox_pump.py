@@ -1,0 +1,87 @@
+"""Between a transmitter's mailboxes and the control logic: acknowledge what was consumed, send when there is room.
+
+A mailbox is acknowledged only when the PLC has consumed its message, so a command survives a gateway that dies in between.
+A plant whose switch says `local` takes no commands: they are acknowledged, refused and on record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+
+from gateway.core.clock import NS_PER_MS
+from gateway.core.errors import FieldtwinError
+from gateway.core.events import Consumer
+from gateway.core.values import DATA, RESPONSE
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.modbus_bus import Job, ModbusBus
+
+ASK_EVERY_NS = 50 * NS_PER_MS
+"""How often a full outbox is looked at again."""
+
+
+class MailboxPump:
+    """Drives one transmitter. `inbox` holds what came and the PLC was not given yet; `tick` never waits."""
+
+    def __init__(
+        self, driver: TransmitterDriver, bus: ModbusBus, audit: AuditLog, *, allow_writes: bool, remote: bool
+    ) -> None:
+        self.driver = driver
+        self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=64)
+        driver.emitter.subscribe(self.inbox)
+        self.commands_refused = 0
+        self._bus = bus
+        self._audit = audit
+        self._allow_writes = allow_writes
+        self._remote = remote
+        self._busy = False
+        self._sending = 0
+        self._next_ns = 0
+
+    def offer(self, payloads: list[bytes]) -> None:
+        """The control logic sent these, in order."""
+        for payload in payloads:
+            self.driver.consumer.observe(RESPONSE(payload))
+
+    @property
+    def untaken(self) -> int:
+        """Messages of the control logic that did not reach the transmitter's mailbox yet."""
+        return len(self.driver.consumer.queue) + self._sending
+
+    def refuse_when_local(self) -> None:
+        """Drop what came in while the plant's switch says `local`."""
+        if not self._remote:
+            for item in self.inbox.drain():
+                self.commands_refused += 1
+                self._audit.note(
+                    "refuse",
+                    self.driver.config.name,
+                    by="far side",
+                    result="the plant says local",
+                    payload=item.data.hex(),
+                )
+
+    def tick(self, now_ns: int, all_consumed: bool) -> None:
+        """Start the next exchange. `all_consumed` says that the PLC has consumed everything that it was given."""
+        if self._busy or now_ns < self._next_ns or not self._allow_writes or not self._bus.online(self.driver):
+            return
+        if self.driver.to_acknowledge and all_consumed and not self.inbox.queue:
+            self._submit(self.driver.acknowledge)
+        elif self.driver.consumer.queue:
+            if self.driver.outbox_free:
+                self._sending = 1
+                self._submit(self.driver.send)
+            else:
+                self._next_ns = now_ns + ASK_EVERY_NS
+                self._submit(self._ask)
+
+    async def _ask(self) -> None:
+        await self.driver.check_outbox()
+
+    def _submit(self, run: Callable[[], Awaitable[None]]) -> None:
+        self._busy = True
+        self._bus.submit(Job(self.driver, run, self._done))
+
+    def _done(self, error: FieldtwinError | None) -> None:
+        self._busy = False
+        self._sending = 0

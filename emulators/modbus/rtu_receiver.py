@@ -163,9 +163,11 @@ class RtuReceiver:
         """Length of the whole, correct frame at `start`, or 0."""
         head = self._buffer[start : start + MAX_FRAME]
         shapes = self._shapes(head)
-        for shape in shapes:
-            if shape is not None and MIN_FRAME <= shape.length <= len(head) and crc16(head[: shape.length]) == 0:
-                return shape.length
+        # Shortest first: a 00 behind a whole frame leaves its check sum right, and is the next frame's broadcast address.
+        lengths = sorted(s.length for s in shapes if s is not None and MIN_FRAME <= s.length <= len(head))
+        for length in lengths:
+            if crc16(head[:length]) == 0:
+                return length
         # Searching by CRC alone is for frames to us, and for the place where a frame is known to begin: elsewhere it would
         # find frames in noise, one in 65536 tries.
         if None in shapes and (head[0] in self._own or (start == 0 and self._run == 0)):

@@ -11,36 +11,15 @@ import math
 from array import array
 from bisect import bisect_right
 from collections.abc import Iterable
-from enum import Enum
 from pathlib import Path
 
+from emulators.context import UsedUp, WhenUsedUp
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.recording import RecordingReader, SignalRow
 
 MAX_NUMBERS = 16_000_000
 """Times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. More is refused, not swapped."""
-
-
-class WhenUsedUp(Enum):
-    """What an emulator does when its recording has nothing left (SPEC ruling 3); named in the prototype file."""
-
-    HOLD = "hold"
-    LOOP = "loop"
-    ERROR = "error"
-
-    @classmethod
-    def parse(cls, text: str) -> WhenUsedUp:
-        """The policy of that name; raises `UsageError`."""
-        try:
-            return cls(text)
-        except ValueError:
-            expected = ", ".join(policy.value for policy in cls)
-            raise UsageError("unknown policy for the end of a recording", expected=expected, got=repr(text)) from None
-
-
-class UsedUp(FileInvalid):
-    """The recording has nothing left, and the prototype file says that this is an error."""
 
 
 class SignalTrack:

@@ -1,0 +1,174 @@
+"""The paper's virtual context: a collection of recordings from which an emulator answers (SPEC row Emulator).
+
+Ordered, time-stamped, duplicates kept, bounded (rulings 2 and 3): of what was recorded for a command, the oldest is
+returned first and removed. Pure; it knows neither protocols nor files. `emulators.replay` stands on it and makes a
+command of each register that a request asks for.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from gateway.core.errors import FileInvalid, UnknownCommand, UsageError
+from gateway.core.values import COMMAND, RECORDING
+
+MAX_ENTRIES = 500_000
+"""Recordings that a context keeps: about 100 MB at most."""
+
+
+class WhenUsedUp(Enum):
+    """What an emulator does when its recording has nothing left (SPEC ruling 3); named in the prototype file."""
+
+    HOLD = "hold"
+    LOOP = "loop"
+    ERROR = "error"
+
+    @classmethod
+    def parse(cls, text: str) -> WhenUsedUp:
+        """The policy of that name; raises `UsageError`."""
+        try:
+            return cls(text)
+        except ValueError:
+            expected = ", ".join(policy.value for policy in cls)
+            raise UsageError("unknown policy for the end of a recording", expected=expected, got=repr(text)) from None
+
+
+class UsedUp(FileInvalid):
+    """The recording has nothing left, and the prototype file says that this is an error."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """A recorded response, when it was recorded (seconds since the recording's start) and how long it had taken."""
+
+    t_s: float
+    response: RECORDING
+    latency_s: float = 0.0
+
+
+class _Series:
+    """What was recorded for one command: what is left, what was taken, and the last one taken."""
+
+    __slots__ = ("last", "left", "skip", "taken", "when_used_up")
+
+    def __init__(self, when_used_up: WhenUsedUp) -> None:
+        self.left: deque[Recorded] = deque()
+        self.taken: list[Recorded] = []  # kept under LOOP only
+        self.last: Recorded | None = None
+        self.skip = 0  # taken since, and still in the context's order of arrival
+        self.when_used_up = when_used_up
+
+
+class VirtualContext:
+    """Recordings by command. `taken` counts what was removed by being returned, `dropped` what had no room.
+
+    With `commands`, that list is fixed and its items are what `take` accepts, with or without recordings. Without, it is
+    derived from what is added (ruling 12). A full context drops its oldest entry.
+    """
+
+    def __init__(
+        self,
+        commands: Iterable[COMMAND] | None = None,
+        recordings: Iterable[tuple[COMMAND, Recorded]] = (),
+        *,
+        when_used_up: WhenUsedUp = WhenUsedUp.HOLD,
+        max_entries: int = MAX_ENTRIES,
+    ) -> None:
+        self.when_used_up = when_used_up
+        self.max_entries = max_entries
+        self.taken = 0
+        self.dropped = 0
+        self._left = 0
+        self._fixed = commands is not None
+        self._series: dict[bytes, _Series] = {command.data: _Series(when_used_up) for command in commands or ()}
+        self._order: deque[_Series] = deque()  # one entry for each added and not yet known to be gone
+        for command, recorded in recordings:
+            self.add(command, recorded)
+
+    def __len__(self) -> int:
+        """How many recordings are left."""
+        return self._left
+
+    @property
+    def command_list(self) -> tuple[COMMAND, ...]:
+        """The commands that `take` accepts, in the order in which they came."""
+        return tuple(COMMAND(data) for data in self._series)
+
+    def left(self, command: COMMAND) -> int:
+        """How many recordings are left for `command`."""
+        series = self._series.get(command.data)
+        return len(series.left) if series else 0
+
+    def add(self, command: COMMAND, recorded: Recorded) -> None:
+        """Append to what was recorded for `command`; raises `UnknownCommand` where the list is fixed."""
+        series = self._series.get(command.data)
+        if series is None:
+            if self._fixed:
+                raise self._unknown(command)
+            if len(self._series) >= self.max_entries:
+                raise FileInvalid("the recording holds too many different requests", expected=str(self.max_entries))
+            series = self._series[command.data] = _Series(self.when_used_up)
+        if self._left >= self.max_entries:
+            self._drop_oldest()
+        series.left.append(recorded)
+        self._order.append(series)
+        self._left += 1
+
+    def set_policies(self, policies: Mapping[bytes, WhenUsedUp]) -> None:
+        """Other policies for single commands, which must be in the list."""
+        for data, policy in policies.items():
+            if data not in self._series:
+                raise self._unknown(COMMAND(data))
+            self._series[data].when_used_up = policy
+
+    def take(self, command: COMMAND) -> RECORDING:
+        """SPEC: the command must be in the list; a recording of the context is returned and removed.
+
+        Used up: `HOLD` returns the last one again, `LOOP` starts over, `ERROR` raises `UsedUp`, and so do the
+        others where nothing was ever recorded. Raises `UnknownCommand`.
+        """
+        return self.take_recorded(command).response
+
+    def take_recorded(self, command: COMMAND) -> Recorded:
+        """As `take`, with time and latency."""
+        series = self._series.get(command.data)
+        if series is None:
+            raise self._unknown(command)
+        if not series.left and series.taken and series.when_used_up is WhenUsedUp.LOOP:
+            self._left += len(series.taken)
+            self._order.extend([series] * len(series.taken))
+            series.left.extend(series.taken)
+            series.taken.clear()
+        if series.left:
+            return self._remove(series)
+        if series.last is not None and series.when_used_up is WhenUsedUp.HOLD:
+            return series.last
+        raise UsedUp(f"nothing is left of what was recorded for command {command.data.hex(' ')}")
+
+    def _remove(self, series: _Series) -> Recorded:
+        recorded = series.last = series.left.popleft()
+        if series.when_used_up is WhenUsedUp.LOOP:
+            series.taken.append(recorded)
+        series.skip += 1
+        self._left -= 1
+        self.taken += 1
+        while self._order and self._order[0].skip:  # forget the order of those that are gone
+            self._order.popleft().skip -= 1
+        return recorded
+
+    def _drop_oldest(self) -> None:
+        while self._order:
+            series = self._order.popleft()
+            if series.skip:
+                series.skip -= 1
+                continue
+            series.left.popleft()
+            self._left -= 1
+            self.dropped += 1
+            return
+
+    def _unknown(self, command: COMMAND) -> UnknownCommand:
+        return UnknownCommand("not in the command list", got=command.data.hex(" ") or "no bytes")

@@ -1,0 +1,88 @@
+"""Recorded counters: values of several registers that must never be torn apart, and never run backwards.
+
+Two registers of a counter that were answered from different moments make a number that never was. So a counter's registers move
+together: a read gets the value in turn, and the next value only when it asks again for a register that it has
+already had of this one. Reading it whole, or in parts, gives the same numbers. What was written before is no matter to a
+counter, and when its recording is used up it stays where it is, whatever the policy (SPEC ruling 3).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
+from emulators.modbus.bank import Table
+from emulators.replay.situation import Cell
+from gateway.core.errors import Bug
+from gateway.core.values import COMMAND, RECORDING
+
+
+@dataclass(frozen=True, slots=True)
+class CounterSpan:
+    """A counter of the device profile: `count` registers of one unit from `address` on."""
+
+    unit: int
+    table: Table
+    address: int
+    count: int
+
+
+class _Counter:
+    """One counter: assembled while learning, then read register by register."""
+
+    def __init__(self, span: CounterSpan) -> None:
+        if not 1 <= span.count <= 4:
+            raise Bug("registers of a counter", expected="1 to 4", got=str(span.count))
+        self.span = span
+        self.command = COMMAND(struct.pack(">BBH", span.unit, 0xFE, span.address) + span.table.encode())
+        self.partial: dict[int, int] = {}
+        self.shown: tuple[int, ...] | None = None
+        self.seen: set[int] = set()
+
+
+class Counters:
+    """The counters of a recording. `torn` counts registers that were recorded without the rest of their counter."""
+
+    def __init__(self, spans: Iterable[CounterSpan], context: VirtualContext) -> None:
+        self._context = context
+        self._by_cell: dict[tuple[int, Cell], tuple[_Counter, int]] = {}
+        self.torn = 0
+        for span in spans:
+            counter = _Counter(span)
+            for i in range(span.count):
+                self._by_cell[span.unit, (span.table, span.address + i)] = (counter, i)
+
+    def learn(self, unit: int, cell: Cell, value: int, t_s: float) -> bool:
+        """A register was recorded. Returns whether it is one of a counter."""
+        found = self._by_cell.get((unit, cell))
+        if found is None:
+            return False
+        counter, i = found
+        self.torn += i in counter.partial
+        counter.partial[i] = value
+        if len(counter.partial) == counter.span.count:
+            words = struct.pack(f">{counter.span.count}H", *(counter.partial[k] for k in range(counter.span.count)))
+            self._context.add(counter.command, Recorded(t_s, RECORDING(words)))
+            self._context.set_policies({counter.command.data: WhenUsedUp.HOLD})
+            counter.partial.clear()
+        return True
+
+    def knows(self, unit: int, cell: Cell) -> bool:
+        """Whether the register is one of a counter of which something whole was recorded."""
+        found = self._by_cell.get((unit, cell))
+        return found is not None and (found[0].shown is not None or self._context.left(found[0].command) > 0)
+
+    def read(self, unit: int, cell: Cell) -> int:
+        """The register's present word; the caller asked `knows`."""
+        counter, i = self._by_cell[unit, cell]
+        if counter.shown is None or i in counter.seen:
+            try:
+                words = self._context.take(counter.command).data
+            except UsedUp as error:
+                raise Bug("a counter without a recording was read") from error
+            counter.shown = struct.unpack(f">{counter.span.count}H", words)
+            counter.seen.clear()
+        counter.seen.add(i)
+        return counter.shown[i]

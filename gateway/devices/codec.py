@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 
 from gateway.core.errors import NotAllowed
 from gateway.core.profile import Tag
@@ -53,7 +54,7 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
 def decode_little(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     """The value of `tag` from a CANopen object's bytes, which are little endian (CiA 301, 7.1.4)."""
     if tag.type in _FORMATS:
-        return decode(tag, reorder(data[::-1], tag.order), t_ns)
+        return replace(decode(tag, reorder(data[::-1], tag.order), t_ns), raw=data)
     return decode(tag, data, t_ns)
 
 

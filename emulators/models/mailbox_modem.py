@@ -1,0 +1,132 @@
+"""A pair of modems with mailboxes in holding registers, and the link between them (SPEC ruling 17).
+
+Each modem is a register bank of its own: the plant's on one socket, the far one on another. What one side writes into its outbox
+travels over the link and appears in the other side's inbox when that is free. A sequence that was taken before is taken
+as the same message again and not sent twice. Functions of time: links are advanced when somebody looks.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from random import Random
+
+from emulators.codec import encode
+from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
+from emulators.models.packet_link import PacketLink
+from gateway.core.errors import FileInvalid
+from gateway.core.profile import Box, DeviceProfile, RegisterRange
+
+LAST_SEQUENCE = 0xFFFF
+RECEIVED = 64
+"""Messages that wait for a free inbox; the link waits beyond that."""
+
+
+class MailboxModem(RegisterBank):
+    """One modem. `outgoing` carries what it sends, `incoming` what it receives."""
+
+    def __init__(self, profile: DeviceProfile, outgoing: PacketLink, incoming: PacketLink) -> None:
+        if profile.inbox is None or profile.outbox is None:
+            raise FileInvalid("the profile has no mailbox", path=profile.path, expected="`mailbox:`")
+        self._inbox, self._outbox = profile.inbox, profile.outbox
+        self._outgoing, self._incoming = outgoing, incoming
+        self._tags = profile.tags
+        self._cells = MapBank(_spans(profile), self._on_write)
+        self._received: deque[bytes] = deque(maxlen=RECEIVED)
+        self._sequence = 0
+        self._accepted = 0
+        self._pending: bytes | None = None
+
+    def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
+        self.advance(now_ns)
+        return self._cells.read(table, address, count, now_ns)
+
+    def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
+        self._cells.check_read(table, address, count, now_ns)
+
+    def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
+        self.advance(now_ns)
+        self._cells.write(table, address, values, now_ns)
+        if table == self._outbox.at.table and address == self._outbox.at.address:
+            self._take_outbox()
+        self.advance(now_ns)
+
+    def advance(self, now_ns: int) -> None:
+        """Hand a pending message to the link, take what arrived, fill a free inbox, refresh the counters."""
+        if self._pending is not None and self._outgoing.submit(self._pending, now_ns):
+            self._pending = None
+            self._poke(self._outbox.ack, self._accepted)
+        while len(self._received) < RECEIVED and (payload := self._incoming.arrived(now_ns)) is not None:
+            self._received.append(payload)
+        if self._received and self._cells.peek("holding", self._inbox.ack.address) == self._sequence:
+            self._fill_inbox(self._received.popleft())
+        for name, number in (
+            ("link_state", 1),
+            ("link_sent", self._outgoing.sent),
+            ("link_received", self._incoming.delivered),
+            ("link_resent", self._outgoing.resent),
+        ):
+            tag = self._tags.get(name)
+            if tag is not None:
+                self._cells.poke(tag.registers.table, tag.registers.address, *encode(number, tag.type, tag.order))
+
+    def _on_write(self, table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
+        """Sequence, length and payload come in one write, from the outbox's first register."""
+        box = self._outbox.at
+        if table != box.table or not (address < box.end and address + len(values) > box.address):
+            return
+        if address != box.address or len(values) < 3 or not 0 < values[1] <= 2 * (len(values) - 2):
+            raise IllegalValue("not a mailbox message", expected="sequence, length and payload in one write")
+        if values[0] == 0 or values[1] > self._outbox.bytes:
+            raise IllegalValue(
+                "not a mailbox message", expected=f"sequence 1 to 65535, up to {self._outbox.bytes} bytes"
+            )
+        if self._pending is not None and values[0] != self._accepted:
+            raise IllegalValue("the outbox is full", expected="wait until its message is acknowledged")
+
+    def _take_outbox(self) -> None:
+        at = self._outbox.at
+        sequence, length = self._cells.peek("holding", at.address), self._cells.peek("holding", at.address + 1)
+        if sequence == self._accepted:
+            return  # the same message again: its writer did not see our reply
+        words = [self._cells.peek("holding", a) for a in range(at.address + 2, at.end)]
+        self._accepted = sequence
+        self._pending = b"".join(w.to_bytes(2) for w in words)[:length]
+
+    def _fill_inbox(self, payload: bytes) -> None:
+        self._sequence = 1 if self._sequence >= LAST_SEQUENCE else self._sequence + 1
+        padded = payload.ljust(2 * ((self._inbox.bytes + 1) // 2), b"\0")
+        words = [self._sequence, len(payload)]
+        words += [int.from_bytes(padded[i : i + 2]) for i in range(0, len(padded), 2)]
+        self._cells.poke("holding", self._inbox.at.address, *words)
+
+    def _poke(self, at: RegisterRange, value: int) -> None:
+        self._cells.poke(at.table, at.address, value)
+
+
+class ModemPair:
+    """Both modems and both directions of the link. `latency_s` is one way."""
+
+    def __init__(self, profile: DeviceProfile, *, bytes_per_s: float, latency_s: float, loss: float, seed: int) -> None:
+        up = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} up"))
+        down = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} down"))
+        self.near = MailboxModem(profile, up, down)
+        self.far = MailboxModem(profile, down, up)
+        self.up, self.down = up, down
+
+
+def _spans(profile: DeviceProfile) -> list[Span]:
+    """The mailboxes' cells and the tags': the inbox is the device's, its acknowledge register and the outbox the master's."""
+
+    def box(b: Box, message: str, ack: str) -> list[Span]:
+        return [
+            Span("holding", b.at.address, b.at.count, "ro" if message == "ro" else "rw"),
+            Span("holding", b.ack.address, 1, "ro" if ack == "ro" else "rw"),
+        ]
+
+    assert profile.inbox is not None
+    assert profile.outbox is not None
+    spans = box(profile.inbox, "ro", "rw") + box(profile.outbox, "rw", "ro")
+    return spans + [
+        Span(t.registers.table, t.registers.address, t.registers.count, "ro") for t in profile.tags.values()
+    ]

@@ -1,0 +1,63 @@
+"""A slow, lossy link that delivers every packet once and in order: the sound between two modems.
+
+Packets go one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with probability
+`loss`, which the sender learns from a missing acknowledgement and sends again. So nothing is lost, only late. Seeded, and a
+function of time: when a packet arrives is known when it is sent.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from random import Random
+
+from gateway.core.clock import NS_PER_S
+
+OVERHEAD_BYTES = 8
+"""Preamble, address and check sum of a packet."""
+MAX_RESENDS = 50
+
+
+class PacketLink:
+    """One direction. At most `capacity` packets are under way; `submit` refuses more."""
+
+    def __init__(self, bytes_per_s: float, latency_s: float, loss: float, random: Random, capacity: int = 8) -> None:
+        self._bytes_per_s = bytes_per_s
+        self._latency_ns = round(latency_s * NS_PER_S)
+        self._loss = loss
+        self._random = random
+        self._capacity = capacity
+        self._under_way: deque[tuple[int, bytes]] = deque()
+        self._free_ns = 0
+        self.sent = self.resent = self.delivered = 0
+
+    @property
+    def full(self) -> bool:
+        return len(self._under_way) >= self._capacity
+
+    def submit(self, payload: bytes, now_ns: int) -> bool:
+        """Send `payload`; False when the link has no room."""
+        if self.full:
+            return False
+        airtime_ns = round((len(payload) + OVERHEAD_BYTES) / self._bytes_per_s * NS_PER_S)
+        end_ns = max(now_ns, self._free_ns) + airtime_ns
+        for _ in range(MAX_RESENDS):
+            if self._random.random() >= self._loss:
+                break
+            self.resent += 1
+            end_ns += 2 * self._latency_ns + airtime_ns
+        self._free_ns = end_ns
+        self.sent += 1
+        self._under_way.append((end_ns + self._latency_ns, payload))
+        return True
+
+    def arrived(self, now_ns: int) -> bytes | None:
+        """The next packet that has arrived by `now_ns`, or None. Taking it removes it."""
+        if self._under_way and self._under_way[0][0] <= now_ns:
+            self.delivered += 1
+            return self._under_way.popleft()[1]
+        return None
+
+    @property
+    def waiting(self) -> bool:
+        """True while something is under way or arrived and not taken."""
+        return bool(self._under_way)

@@ -1,0 +1,45 @@
+"""Recorded signals as CANopen objects: what a node's TPDOs and SDO uploads read at the emulator's clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from emulators.canopen.codec import encode
+from emulators.canopen.dictionary import Dictionary
+from emulators.journal import HeldJournal
+from emulators.signals import SignalPlayer
+from gateway.core.errors import FileInvalid
+from gateway.core.profile import Tag
+
+Key = tuple[int, int]
+
+
+class PlayedObjects:
+    """A node's value source: called with the time, returns raw values by (index, subindex).
+
+    Signals are in engineering units under the tags' names; scale and offset of the profile and the data type of the EDS make
+    object values of them. What was given out is journalled.
+    """
+
+    def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: SignalPlayer) -> None:
+        self.journal = HeldJournal()
+        self._player = player
+        self._objects: list[tuple[Tag, Key, int]] = []
+        for tag in tags:
+            if tag.object is None or tag.name not in player.track.names:
+                continue
+            entry = dictionary.entry(*tag.object)
+            if entry is None:
+                index, subindex = tag.object
+                raise FileInvalid(f"the EDS has no object {index:04X}h:{subindex:02X} for tag {tag.name!r}")
+            self._objects.append((tag, tag.object, entry.data_type))
+
+    def __call__(self, now_ns: int) -> dict[Key, bytes]:
+        values = self._player.values(now_ns)
+        out: dict[Key, bytes] = {}
+        for tag, key, data_type in self._objects:
+            number = (values[tag.name] - tag.offset) / tag.scale
+            raw = encode(data_type, number if tag.type.startswith("float") else round(number))
+            self.journal.note(tag.name, raw, now_ns)
+            out[key] = raw
+        return out

@@ -1,0 +1,155 @@
+"""A sensor that samples: registers that follow from a profile, values that follow from recorded signals.
+
+Write a period into the tag that the profile names, and from then on a sample is taken every so many seconds, the first at
+once; 0 is standby, a negative period is off. A sample is read from the recording at the emulator's clock, all signals at one
+instant, which stands in the `instrument_time` register in milliseconds where the profile has one. A function of time:
+nothing here waits, samples that fell due are taken when somebody looks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from emulators.codec import decode, encode
+from emulators.journal import HeldJournal
+from emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
+from emulators.signals import SignalPlayer
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import FileInvalid
+from gateway.core.profile import DeviceProfile, Tag
+
+STANDBY, SAMPLING, OFF = 0, 1, 2
+MAX_CATCH_UP = 3600
+"""Samples taken at once after nobody looked for long; older ones are skipped, their count is not."""
+
+OWN = ("status", "instrument_time")
+"""Tags that the model fills itself, besides the sample counter and the period."""
+
+
+class SampledSensor(RegisterBank):
+    """The register bank of a sampling sensor. `identity` gives text tags their values (a serial number)."""
+
+    def __init__(self, profile: DeviceProfile, player: SignalPlayer, identity: Mapping[str, str]) -> None:
+        if profile.sampled is None:
+            raise FileInvalid("the profile says nothing about sampling", path=profile.path, expected="`sampled:`")
+        self.journal = HeldJournal()
+        self.samples = 0
+        self._player = player
+        self._tags = profile.tags
+        self._period_tag = profile.tags[profile.sampled.period]
+        self._count_tag = profile.tags[profile.sampled.count]
+        own = {*OWN, profile.sampled.period, profile.sampled.count, *identity}
+        self._signals = [t for t in profile.tags.values() if t.name not in own and not t.is_text]
+        for tag in self._signals:
+            player.at(player.start_ns, tag.name)  # a recording without a signal that the device has is refused now
+        self._cells = MapBank(_spans(profile), self._on_write)
+        self._period_s = 0
+        self._next_ns = 0
+        for tag in self._signals:
+            self._put(tag, math.nan, player.start_ns)
+        for tag in (self._count_tag, self._period_tag, *(profile.tags[n] for n in OWN if n in profile.tags)):
+            self._put(tag, 0, player.start_ns)
+        for name, text in identity.items():
+            self._put(self._tag(name, profile), text, player.start_ns)
+
+    @staticmethod
+    def _tag(name: str, profile: DeviceProfile) -> Tag:
+        if name not in profile.tags:
+            raise FileInvalid(
+                f"{profile.name} has no tag {name!r}", path=profile.path, expected=", ".join(profile.tags)
+            )
+        return profile.tags[name]
+
+    @property
+    def period_s(self) -> int:
+        """The sampling period as last written."""
+        return self._period_s
+
+    def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
+        self._take_due(now_ns)
+        return self._cells.read(table, address, count, now_ns)
+
+    def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
+        self._cells.check_read(table, address, count, now_ns)
+
+    def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
+        self._take_due(now_ns)
+        self._cells.write(table, address, values, now_ns)
+        self._note_tags(table, address, len(values), now_ns)
+        at = self._period_tag.registers
+        if table == at.table and address <= at.address < address + len(values):
+            self._set_period(self._held_period(), now_ns)
+
+    def _held_period(self) -> int:
+        at = self._period_tag.registers
+        words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
+        return int(decode(words, self._period_tag.type, self._period_tag.order))
+
+    def _on_write(self, table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
+        """A write that covers only part of the period would leave half a value: refused as a whole."""
+        at = self._period_tag.registers
+        if table == at.table and address < at.end and address + len(values) > at.address:
+            whole = address <= at.address and address + len(values) >= at.end
+            if not whole:
+                raise IllegalValue("half of the sample period", expected="all of its registers in one write")
+
+    def _set_period(self, period_s: int, now_ns: int) -> None:
+        self._period_s = period_s
+        self._next_ns = now_ns
+        status = SAMPLING if period_s > 0 else STANDBY if period_s == 0 else OFF
+        if "status" in self._tags:
+            self._put(self._tags["status"], status, now_ns)
+        self._take_due(now_ns)
+
+    def _take_due(self, now_ns: int) -> None:
+        """Take every sample that fell due up to `now_ns`, at its own time."""
+        if self._period_s <= 0 or now_ns < self._next_ns:
+            return
+        step_ns = self._period_s * NS_PER_S
+        due = (now_ns - self._next_ns) // step_ns + 1
+        skipped = max(0, due - MAX_CATCH_UP)
+        self.samples += skipped
+        self._next_ns += skipped * step_ns
+        while self._next_ns <= now_ns:
+            self._sample(self._next_ns)
+            self._next_ns += step_ns
+
+    def _sample(self, t_ns: int) -> None:
+        """One sample: the signals at the instrument's time, which is the recording's, to the millisecond."""
+        time_ms = round(self._player.position_s(t_ns) * 1000)
+        values = self._player.track.values(time_ms / 1000)
+        self.samples += 1
+        for tag in self._signals:
+            self._put(tag, (values[tag.name] - tag.offset) / tag.scale, t_ns)
+        if "instrument_time" in self._tags:
+            self._put(self._tags["instrument_time"], time_ms & 0xFFFFFFFF, t_ns)
+        self._put(self._count_tag, self.samples & 0xFFFFFFFF, t_ns)
+
+    def _put(self, tag: Tag, value: float | int | str, now_ns: int) -> None:
+        """The device sets one of its own tags."""
+        at = tag.registers
+        if tag.type.startswith(("int", "uint")) and not isinstance(value, str):
+            value = round(value) if math.isfinite(value) else 0
+        words = encode(value, tag.type, tag.order, registers=at.count)
+        self._cells.poke(at.table, at.address, *words)
+        self.journal.note(tag.name, b"".join(w.to_bytes(2) for w in words), now_ns)
+
+    def _note_tags(self, table: Table, address: int, count: int, now_ns: int) -> None:
+        """Journal what a master's write made of the tags that it touched."""
+        for tag in self._tags.values():
+            at = tag.registers
+            if at.table == table and at.address < address + count and address < at.end:
+                words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
+                self.journal.note(tag.name, b"".join(w.to_bytes(2) for w in words), now_ns)
+
+
+def _spans(profile: DeviceProfile) -> list[Span]:
+    """The cells that exist: those of the tags, each cell once."""
+    spans: dict[tuple[str, int], Span] = {}
+    for tag in profile.tags.values():
+        at = tag.registers
+        access: Access = "ro" if tag.access == "ro" else "rw" if tag.access == "rw" else "wo"
+        for address in range(at.address, at.end):
+            spans.setdefault((at.table, address), Span(at.table, address, 1, access))
+    return list(spans.values())

@@ -109,15 +109,16 @@ async def configure_tpdo(
     mapping: Iterable[tuple[int, int, int]],
     cob_id: int,
     transmission_type: int = 254,
-    event_ms: int = 0,
+    event_ms: int | None = None,
     inhibit_100us: int | None = None,
 ) -> PdoMapping:
     """Configure TPDO `number` (from 1) by the procedure of 7.5.2.38, verify it, and return its mapping.
 
     `mapping` is (index, subindex, bits) in order, at most 64 bits. `cob_id` is the CAN-ID; whether remote frames are
-    allowed stays as the node has it. `event_ms` 0 switches the event timer off, `inhibit_100us` None leaves the inhibit
-    time alone. Raises `UsageError` before anything is sent, `SdoAborted` where the node refuses a step (the TPDO is then
-    left disabled), `VerifyFailed` where it holds something else in the end.
+    allowed stays as the node has it. `event_ms` 0 switches the event timer off; None leaves event timer and inhibit time
+    alone, which a node need not have. Call it in PRE-OPERATIONAL. Raises `UsageError` before anything is sent,
+    `SdoAborted` where the node refuses a step (the TPDO is then left disabled), `VerifyFailed` where it holds something
+    else in the end.
     """
     communication, mapped = _records(number)
     wanted = PdoMapping.of(mapping)
@@ -125,11 +126,10 @@ async def configure_tpdo(
     if not wanted.entries:
         raise UsageError(f"TPDO {number} of node {node} maps nothing", expected="at least one object")
     u8, u16, u32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
-    parameters = [(2, u8, transmission_type), (5, u16, event_ms)]
-    if inhibit_100us is not None:
-        parameters.insert(1, (3, u16, inhibit_100us))
+    optional = ((2, u8, transmission_type), (3, u16, inhibit_100us), (5, u16, event_ms))
+    parameters = [(sub, data_type, value) for sub, data_type, value in optional if value is not None]
     for _, data_type, value in parameters:
-        encode(data_type, value)
+        encode(data_type, value)  # a value that does not fit is refused before anything is sent
 
     # Bits 0 to 29 must not change while the PDO exists: first the old CAN-ID with bit 31, the new one at the end.
     held = await read_number(master, node, communication, 1, u32)

@@ -43,6 +43,8 @@ class HeartbeatConsumer:
     def monitor(self, node: int, consumer_ms: int) -> None:
         """Watch `node` from its next heartbeat on, or no longer (0). A node that is being watched stays so."""
         known = self._node(cob_id.check_node(node))
+        if not known.consumer_ns or not consumer_ms:
+            known.monitored = known.lost = False
         known.consumer_ns = consumer_ms * NS_PER_MS
 
     def state(self, node: int) -> NmtState | None:

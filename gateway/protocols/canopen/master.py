@@ -53,6 +53,7 @@ class CanopenMaster:
         self._channels: dict[int, SdoChannel] = {}
         self._pdos: dict[int, list[PdoCallback]] = {}
         self._stopped: ConnectionLost | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._timer_due_ns = 0
 
@@ -62,6 +63,7 @@ class CanopenMaster:
         """Make `node` known; with a consumer time it is watched from its first heartbeat on."""
         self._channel(cob_id.check_node(node))
         self._heartbeat.monitor(node, heartbeat_consumer_ms)
+        self._arm()
 
     def node_state(self, node: int) -> NmtState | None:
         """The NMT state that the node last told, None if it never did."""
@@ -112,6 +114,7 @@ class CanopenMaster:
 
         Heartbeats are checked here too, at their deadlines. Transfers that wait when it ends fail with `ConnectionLost`.
         """
+        self._loop = asyncio.get_running_loop()
         self._stop(None)
         self._arm()
         reason = ConnectionLost("the CANopen master was stopped", where=self._where())
@@ -121,10 +124,8 @@ class CanopenMaster:
         except ConnectionLost as e:
             reason = e
             raise
-        except FieldtwinError as e:
-            reason = ConnectionLost(str(e), where=self._where())
-            raise reason from e
         finally:
+            self._loop = None
             self._disarm()
             self._stop(reason)
 
@@ -182,12 +183,12 @@ class CanopenMaster:
     def _arm(self) -> None:
         """See to it that somebody looks at the next deadline, or earlier."""
         due_ns = self._heartbeat.next_deadline_ns()
-        if due_ns is None or (self._timer is not None and self._timer_due_ns <= due_ns):
+        if self._loop is None or due_ns is None or (self._timer is not None and self._timer_due_ns <= due_ns):
             return
         self._disarm()
         left_ns = max(due_ns - self._clock.monotonic_ns(), 0) + NS_PER_MS  # a loop may wake a little early
         self._timer_due_ns = due_ns
-        self._timer = asyncio.get_running_loop().call_later(left_ns / NS_PER_S, self._on_deadline)
+        self._timer = self._loop.call_later(left_ns / NS_PER_S, self._on_deadline)
 
     def _disarm(self) -> None:
         if self._timer is not None:
@@ -220,7 +221,7 @@ class CanopenMaster:
     def _channel(self, node: int) -> SdoChannel:
         channel = self._channels.get(node)
         if channel is None:
-            channel = SdoChannel(node, self._send, self._clock, self.counters, self._ns(None))
+            channel = SdoChannel(node, self._send, self._clock, self.counters)
             channel.lose(self._stopped)
             self._channels[node] = channel
         return channel

@@ -47,7 +47,7 @@ class NodeEvent:
     `state` is what is known after it (None: never heard). `data` is the frame's data where a frame caused it. `t_ns`
     is monotonic. `unexpected` marks a boot-up that this master did not ask for, of a node that it had heard before:
     the node restarted and has lost its configuration (CO-035). A ``conflict`` means that two nodes seem to share this
-    node id (CO-042).
+    node id, or two masters its SDO channel (CO-042).
     """
 
     node: int

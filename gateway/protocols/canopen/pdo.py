@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from gateway.core.errors import UsageError, WireError
+from gateway.core.errors import Desync, UsageError, WireError
 
 PDO_BITS = 64
 MAX_ENTRIES = 64
@@ -54,8 +54,11 @@ class PdoMapping:
 
     @classmethod
     def from_words(cls, words: Iterable[int]) -> PdoMapping:
-        """From the entries 1 to n of a mapping record (1600h, 1A00h...)."""
-        return cls(tuple(PdoEntry.from_word(word) for word in words))
+        """From the entries 1 to n of a mapping record (1600h, 1A00h...). Raises `Desync`: it is the node that said so."""
+        try:
+            return cls(tuple(PdoEntry.from_word(word) for word in words))
+        except UsageError as e:
+            raise Desync(e.message, expected=e.expected, got=e.got) from e
 
     @classmethod
     def of(cls, objects: Iterable[tuple[int, int, int]]) -> PdoMapping:

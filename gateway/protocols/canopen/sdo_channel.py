@@ -58,13 +58,12 @@ class SdoChannel:
     """The client's end of one channel. `deliver` is called by the bus's reader, `run` by whoever wants an object."""
 
     def __init__(
-        self, node: int, send: Callable[[CanFrame], Awaitable[None]], clock: Clock, counters: Counters, timeout_ns: int
+        self, node: int, send: Callable[[CanFrame], Awaitable[None]], clock: Clock, counters: Counters
     ) -> None:
         self._node = node
         self._send = send
         self._clock = clock
         self._counters = counters
-        self._timeout_ns = timeout_ns
         self._turn = asyncio.Lock()
         self._late = LateReplies()
         self._active: SdoTransfer | None = None
@@ -74,7 +73,10 @@ class SdoChannel:
         self._last_answer: Multiplexor | None = None
 
     def deliver(self, frame: CanFrame) -> bool:
-        """A frame came from the node. True when it repeats the last answer: two nodes with one id do that (CO-042)."""
+        """A frame came from the node. True when it answers what was answered before (CO-042).
+
+        Two nodes with one id do that, or two masters on one SDO channel.
+        """
         active = self._active
         repeated = self._is_foreign(frame, active)
         if active is None or len(self._inbox) >= MAX_INBOX:
@@ -108,7 +110,7 @@ class SdoChannel:
         self._counters.sdo_probes += 1
         index, subindex = self._late.probe()
         try:
-            await self._run(SdoUpload(self._node, index, subindex, self._timeout_ns))
+            await self._run(SdoUpload(self._node, index, subindex, transfer.timeout_ns))
         except SdoAborted:
             pass  # an answer, which is all that was wanted
         except ReplyTimeout as e:
@@ -124,7 +126,6 @@ class SdoChannel:
         if self._lost is not None:
             raise self._again(self._lost)
         request, complete = (transfer.index, transfer.subindex), False
-        self._inbox.clear()
         self._active, self._last_answer = transfer, None
         try:
             data = await self._drive(transfer)
@@ -136,6 +137,8 @@ class SdoChannel:
             raise
         finally:
             self._active = None
+            self._counters.ignored += len(self._inbox)
+            self._inbox.clear()
             if transfer.answered:
                 self._late.answered(request)
             if not complete:
@@ -147,7 +150,7 @@ class SdoChannel:
             frame = await self._next_frame(transfer)
             if frame is None:
                 self._counters.sdo_timeouts += 1
-                await self._fail(transfer.expire(transfer.deadline_ns))
+                await self._fail(transfer.expire(transfer.deadline_ns), transfer)
                 continue
             match transfer.feed(frame, self._clock.monotonic_ns()):
                 case Send(request):
@@ -157,7 +160,7 @@ class SdoChannel:
                     self._counters.sdo_replies += 1
                     return data
                 case Failed() as failed:
-                    await self._fail(failed)
+                    await self._fail(failed, transfer)
                 case Stray():
                     self._counters.ignored += 1
 
@@ -172,7 +175,7 @@ class SdoChannel:
             transfer.over = True
             raise ReplyTimeout(f"{transfer.name}: the request could not be sent", hint="the bus takes no frames") from e
 
-    async def _fail(self, failed: Failed | None) -> None:
+    async def _fail(self, failed: Failed | None, transfer: SdoTransfer) -> None:
         """Tell the node why, if it was us who gave up, and raise."""
         if failed is None:
             return
@@ -180,7 +183,7 @@ class SdoChannel:
             self._counters.sdo_aborts += 1
         if failed.abort is not None:
             try:
-                async with asyncio.timeout(self._timeout_ns / NS_PER_S):
+                async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
                     await self._send(failed.abort)
             except TimeoutError:
                 pass  # the abort is a courtesy: the next initiate request ends the old transfer as well
@@ -211,7 +214,7 @@ class SdoChannel:
             return False
         request = multiplexor_of(frame.data)
         if active is not None and (active.index, active.subindex) == request:
-            return False
+            return any(waiting.data[:4] == frame.data[:4] for waiting in self._inbox)
         if self._late.is_ambiguous(request):
             if is_final(frame.data):
                 self._late.answered(request)

@@ -1,0 +1,236 @@
+"""EDS and DCF files as text (CiA 306): sections and keys with their lines, and what has to be mended in real ones.
+
+Vendors' files leave numbers empty, write octal, spell keys in any case, put sub-objects before their object and use
+whatever encoding their editor had. This module reads all that, says what it mended, and refuses what cannot be
+guessed with file, section and key. It writes the text that remains; it knows no data type and no node.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+
+from gateway.core.errors import FileInvalid
+
+MAX_BYTES = 16 * 1024 * 1024
+"""No EDS comes near; whatever does is another kind of file."""
+
+_OBJECT = re.compile(r"^([0-9A-F]{4})(?:(SUB)([0-9A-F]{1,2})|(NAME))?$", re.IGNORECASE)
+_TYPE_OF_A_TOOL = re.compile(r"^[0-9A-F]{2,3}sub1$")
+"""Where CANFestival's editor says of which basic type a type of its own is; `canopen` looks there."""
+_COMMENT = re.compile(r"\s;.*$")
+_OCTAL = re.compile(r"^0[0-7]+$")
+_NUMBER = re.compile(r"^(0x[0-9a-f]+|[0-9]+)$", re.IGNORECASE)
+
+_TEXT_KEYS = ("ParameterName", "AccessType", "DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
+_MORE_TEXT_KEYS = ("Factor", "Description", "Unit", "StorageLocation")
+_NUMBER_KEYS = {"ObjectType": "0x7", "DataType": "", "PDOMapping": "0", "CompactSubObj": "0", "NrOfEntries": "0"}
+"""Keys that hold a number, and what an empty one stands for (CiA 306, 4.6.3.2); nothing for those that must be there."""
+
+_DEVICE_TEXT = ("VendorName", "ProductName", "OrderCode")
+_DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "NrOfTXPDO")
+_COMMISSIONING_NUMBERS = ("NodeID", "Baudrate")
+_CANONICAL = {
+    key.lower(): key
+    for key in (*_TEXT_KEYS, *_MORE_TEXT_KEYS, *_NUMBER_KEYS, *_DEVICE_TEXT, *_DEVICE_NUMBERS, *_COMMISSIONING_NUMBERS)
+}
+
+
+@dataclass(slots=True)
+class Section:
+    """One section: canonical key -> value, and the line of each key; `line` is that of the heading."""
+
+    name: str
+    line: int
+    values: dict[str, str] = field(default_factory=dict)
+    lines: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class EdsText:
+    """A mended file: its sections by canonical name (``DeviceInfo``, ``1018``, ``1018sub1``, ``3004Name``)."""
+
+    sections: dict[str, Section]
+    mended: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """The mended file, objects before their sub-objects, without what says nothing about objects."""
+        blocks = []
+        for name, section in self.sections.items():
+            blocks.append("\n".join([f"[{name}]", *(f"{key}={value}" for key, value in section.values.items())]))
+        return "\n\n".join(blocks) + "\n"
+
+
+def decode_eds(raw: bytes, path: str = "") -> tuple[str, tuple[str, ...]]:
+    """The text of a file, and what had to be assumed: UTF-8 (with or without mark), else Windows-1252."""
+    if len(raw) > MAX_BYTES:
+        raise FileInvalid("not an EDS", path=path, expected=f"at most {MAX_BYTES} bytes", got=str(len(raw)))
+    try:
+        return raw.decode("utf-8-sig"), ()
+    except UnicodeDecodeError:
+        text = raw.decode("cp1252", errors="replace")
+        return text, ("not UTF-8: read as Windows-1252",)
+
+
+def read_eds_text(text: str, path: str = "") -> EdsText:
+    """Read and mend. Raises `FileInvalid` with file, line, section and key for what cannot be mended."""
+    mended: list[str] = []
+    sections = _split(text, path, mended)
+    if not any(_OBJECT.match(name) for name in sections):
+        raise FileInvalid("no object in this file", path=path, expected="an EDS or DCF with sections such as [1000]")
+    kept: dict[str, Section] = {}
+    for name, allowed in (("DeviceInfo", (_DEVICE_TEXT, _DEVICE_NUMBERS)), ("DeviceComissioning", _commissioning())):
+        section = sections.get(name, Section(name, 0))
+        kept[name] = _mend_information(section, allowed, path, mended)
+    for name in (n for n in sections if _TYPE_OF_A_TOOL.match(n) and sections[n].values.get("DefaultValue")):
+        kept[name] = sections[name]
+    for name in sorted((n for n in sections if _OBJECT.match(n)), key=_order):
+        parent = sections.get(name[:4])
+        if parent is None:
+            mended.append(f"[{name}]: left out, there is no [{name[:4]}]")
+        elif name != parent.name and _is_variable(parent, path) and "CompactSubObj" not in kept[parent.name].values:
+            mended.append(f"[{name}]: left out, [{parent.name}] is a single variable")
+        elif name.endswith("Name"):
+            _mend_names(sections[name], parent, kept, path, mended)
+        else:
+            kept[name] = _mend_object(sections[name], path, mended)
+    return EdsText(kept, tuple(mended))
+
+
+def invalid(message: str, section: Section, key: str, path: str, *, expected: str, got: str = "") -> FileInvalid:
+    """The error for a key of a section."""
+    line = section.lines.get(key, section.line)
+    return FileInvalid(f"[{section.name}] {key}: {message}", path=path, line=line, expected=expected, got=got)
+
+
+def _commissioning() -> tuple[tuple[str, ...], tuple[str, ...]]:
+    return (), _COMMISSIONING_NUMBERS
+
+
+def _order(name: str) -> tuple[int, int, int]:
+    """Objects, then their sub-objects, then their names."""
+    index, sub = int(name[:4], 16), name[7:]
+    return index, name.endswith("Name"), -1 if len(name) == 4 or name.endswith("Name") else int(sub, 16)
+
+
+def _canonical_section(name: str) -> str:
+    match = _OBJECT.match(name)
+    if match is None:
+        known = {"deviceinfo": "DeviceInfo", "devicecomissioning": "DeviceComissioning"}
+        known["devicecommissioning"] = "DeviceComissioning"  # the standard misspells it, some vendors do not
+        return known.get(name.lower(), name)
+    index = match[1].upper()
+    if match[4]:
+        return f"{index}Name"
+    return f"{index}sub{int(match[3], 16):X}" if match[2] else index
+
+
+def _split(text: str, path: str, mended: list[str]) -> dict[str, Section]:
+    """Sections and keys; a key or an object twice is refused unless both say the same."""
+    sections: dict[str, Section] = {}
+    current: Section | None = None
+    for number, raw in enumerate(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), 1):
+        line = _COMMENT.sub("", raw).strip()
+        if not line or line[0] in ";#":
+            continue
+        if line[0] == "[":
+            if not line.endswith("]"):
+                raise FileInvalid("a section without its bracket", path=path, line=number, expected="[...]", got=line)
+            current = Section(_canonical_section(line[1:-1].strip()), number)
+            if current.name in sections and _OBJECT.match(current.name):
+                before = sections[current.name].line
+                raise FileInvalid(f"[{current.name}] is there twice", path=path, line=number, got=f"also line {before}")
+            sections[current.name] = current
+            continue
+        key, equals, value = line.partition("=")
+        if current is None or not equals:
+            if current is not None and not _OBJECT.match(current.name):
+                continue  # free text in a comment section
+            raise FileInvalid(
+                "neither section nor key", path=path, line=number, expected="[...] or KEY=VALUE", got=line[:60]
+            )
+        _put(current, key.strip(), value.strip(), number, path, mended)
+    return sections
+
+
+def _put(section: Section, written: str, value: str, line: int, path: str, mended: list[str]) -> None:
+    key = _CANONICAL.get(written.lower(), written)
+    if key in section.values and _OBJECT.match(section.name):
+        if section.values[key] != value:
+            raise FileInvalid(
+                f"[{section.name}] {key} is there twice", path=path, line=line, got=f"also line {section.lines[key]}"
+            )
+        mended.append(f"[{section.name}] {key}: there twice")
+    section.values[key], section.lines[key] = value, line
+
+
+def _number(section: Section, key: str, if_empty: str, path: str, mended: list[str]) -> str:
+    """A number as `canopen` reads it: decimal or 0x; octal (a leading 0 in CiA 306) rewritten, empty filled in."""
+    value = section.values[key].replace(" ", "")
+    if not value:
+        if not if_empty:
+            raise invalid("is empty", section, key, path, expected="a number")
+        mended.append(f"[{section.name}] {key}: empty, read as {if_empty}")
+        return if_empty
+    if _OCTAL.match(value):
+        return str(int(value, 8))
+    if not _NUMBER.match(value) or (len(value) > 1 and value[0] == "0" and value[1] in "0123456789"):
+        raise invalid("cannot be read", section, key, path, expected="a number", got=repr(value))
+    return value
+
+
+def _mend_information(
+    section: Section, allowed: tuple[tuple[str, ...], tuple[str, ...]], path: str, mended: list[str]
+) -> Section:
+    """The keys of [DeviceInfo] or [DeviceComissioning] that are of use."""
+    texts, numbers = allowed
+    kept = Section(section.name, section.line)
+    for key in section.values:
+        if key in texts:
+            kept.values[key] = section.values[key]
+        elif key in numbers and (section.values[key] or key not in _COMMISSIONING_NUMBERS):
+            kept.values[key] = str(int(_number(section, key, "0", path, mended), 0))
+        elif key.lower() == "compactpdo" and section.values[key] not in ("", "0", "0x0", "0x00"):
+            mended.append("[DeviceInfo] CompactPDO: PDO parameters that the file leaves out are not made up")
+    return kept
+
+
+def _mend_object(section: Section, path: str, mended: list[str]) -> Section:
+    """The keys of an object or sub-object, complete enough for a reader that forgives nothing."""
+    kept = Section(section.name, section.line, lines=section.lines)
+    for key, value in section.values.items():
+        if key in _NUMBER_KEYS:
+            if key == "DataType" and not value and not _is_variable(section, path):
+                continue  # a record's own data type means nothing
+            kept.values[key] = _number(section, key, _NUMBER_KEYS[key], path, mended)
+        elif key in _TEXT_KEYS or key in _MORE_TEXT_KEYS:
+            kept.values[key] = value
+    if not int(kept.values.get("CompactSubObj", "0"), 0):
+        kept.values.pop("CompactSubObj", None)  # `canopen` takes its mere presence for a compact array
+    required = ("ParameterName", "DataType", "AccessType") if _is_variable(kept, path) else ("ParameterName",)
+    for key in required:
+        if not kept.values.get(key):
+            raise invalid("is missing", section, key, path, expected="a value")
+    return kept
+
+
+def _is_variable(section: Section, path: str) -> bool:
+    """Whether the section describes a value, rather than an array or record of others."""
+    if "ObjectType" not in section.values:
+        return True
+    kind = int(_number(section, "ObjectType", "0x7", path, []), 0)
+    compact = int(_number(section, "CompactSubObj", "0", path, []) if "CompactSubObj" in section.values else "0", 0)
+    return kind in (0x2, 0x7) or "sub" in section.name or bool(compact)
+
+
+def _mend_names(names: Section, parent: Section, kept: dict[str, Section], path: str, mended: list[str]) -> None:
+    """[xxxxName] lists the names of a compact array's entries, those that differ only: fill in the others."""
+    array = kept[parent.name]
+    if "CompactSubObj" not in array.values:
+        mended.append(f"[{names.name}]: left out, [{parent.name}] is no compact array")
+        return
+    count = int(array.values["CompactSubObj"], 0)
+    filled = Section(names.name, names.line, {"NrOfEntries": str(count)})
+    for sub in range(1, min(count, 254) + 1):
+        filled.values[str(sub)] = names.values.get(str(sub)) or f"{array.values['ParameterName']}{sub}"
+    kept[names.name] = filled

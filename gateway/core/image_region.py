@@ -127,6 +127,7 @@ class RegionWriter(_Region):
         if self.counter:
             copy = self._slot(self.counter)
             if copy is None:
+                self.release()
                 raise FileInvalid("a damaged process image", expected="a whole last publication", got=shape.layout.name)
             fields = shape.body.unpack_from(copy, CHECK.size)
             self._last = {r.spec.name: int(fields[4 + shape.count + r.index]) for r in shape.rings}

@@ -1,0 +1,271 @@
+"""A PLC as its own process on a mapped image: commands in, outputs out, a gateway that dies, logic that raises."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import mmap
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import eventually, run
+
+from gateway.core.control import ControlClient, RemoteError
+from gateway.core.errors import FileInvalid, Unreachable
+from gateway.core.image import INPUTS, OUTPUTS, RegionReader, TagKind, TagSpec, message_tag, taken_name
+from gateway.core.statemachine import encode_period
+from gateway.core.values import Quality, TagValue
+from plc.binding import InputBinding, image_for
+from plc.config import PlcConfig, ProgramConfig
+from plc.process import plc_main
+
+PLANT = {
+    "modem.inbox": message_tag("modem.inbox", 64, 8),
+    "modem.outbox": message_tag("modem.outbox", 64, 8),
+    "ctd.sample": message_tag("ctd.sample", 64, 8),
+    "ctd.sample_period_s": TagSpec("ctd.sample_period_s", TagKind.INT, "s"),
+}
+RELAY = ProgramConfig(
+    "relay",
+    "python: plc.relay:Relay",
+    {"command": InputBinding("modem.inbox"), "sample": InputBinding("ctd.sample")},
+    {"period_s": "ctd.sample_period_s", "response": "modem.outbox"},
+)
+FAULTY = """
+from gateway.core.image import TagKind
+from plc.program import Program, var_input, var_output
+
+
+class Faulty(Program):
+    n = var_input(TagKind.INT)
+    out = var_output(TagKind.INT, initial=1)
+
+    def execute(self, scan):
+        if scan.number == 5:
+            raise ValueError("five")
+"""
+
+
+class Gateway:
+    """The test as the gateway: feeds INPUTS, reads OUTPUTS."""
+
+    def __init__(self, path: Path, config: PlcConfig) -> None:
+        layout = config.image_layout()
+        with path.open("xb") as file:
+            file.truncate(layout.size)
+        with path.open("r+b") as file:
+            self._mapped = mmap.mmap(file.fileno(), 0)
+        self._memory = memoryview(self._mapped)
+        layout.format(self._memory)
+        self._image = layout.attach(self._memory)
+        self._writer = self._image.writer(INPUTS)
+        self.reader: RegionReader = self._image.reader(OUTPUTS)
+        self.names = [tag.name for tag in layout.regions[0].tags]
+        self.taken = 0
+        self.arrived: list[bytes] = []
+
+    def publish(self, **messages: bytes) -> None:
+        now_ns = time.monotonic_ns()
+        values = {taken_name("modem.outbox"): self.taken}
+        row = [TagValue(values.get(name, 0), Quality.GOOD, t_ns=now_ns) for name in self.names]
+        self._writer.publish(row, now_ns, {k.replace("_", ".", 1): [(now_ns, v)] for k, v in messages.items()})
+
+    def take(self) -> None:
+        for message in self.reader.snapshot().messages.get("modem.outbox", ()):
+            self.arrived.append(message.data)
+            self.taken = message.seq
+
+    async def alive(self) -> None:
+        while True:
+            self.publish()
+            self.take()
+            await asyncio.sleep(0.02)
+
+    def close(self) -> None:
+        self._image.release()
+        self._memory.release()
+        self._mapped.close()
+
+
+def config_in(folder: Path, *programs: ProgramConfig, **more: Any) -> PlcConfig:
+    bound = [p.bind((str(folder),)) for p in programs]
+    return PlcConfig(
+        image_path=str(folder / "image"),
+        layout=image_for(bound, PLANT).describe(),
+        control_path=str(folder / "plc.sock"),
+        programs=programs,
+        stop_after=0,  # the machine that runs tests is busy
+        heartbeat_limit_ms=300,
+        priority=0,
+        python_path=(str(folder),),
+        **more,
+    )
+
+
+@asynccontextmanager
+async def plc_running(config: PlcConfig) -> AsyncIterator[tuple[asyncio.subprocess.Process, Gateway, ControlClient]]:
+    folder = Path(config.image_path).parent
+    gateway = Gateway(Path(config.image_path), config)
+    gateway.publish()
+    (folder / "plc.json").write_bytes(config.to_json())
+    child = await asyncio.create_subprocess_exec(sys.executable, "-m", "plc", str(folder / "plc.json"))
+    client = None
+    try:
+        client = await _connect(Path(config.control_path), child)
+        assert (await client.call("ready"))["ready"] is True
+        yield child, gateway, client
+    finally:
+        if client is not None:
+            await client.aclose()
+        if child.returncode is None:
+            child.kill()
+        await child.wait()
+        gateway.close()
+
+
+async def _connect(path: Path, child: asyncio.subprocess.Process) -> ControlClient:
+    while True:
+        try:
+            return await ControlClient.connect_unix(path)
+        except Unreachable:
+            assert child.returncode is None
+            await asyncio.sleep(0.01)
+
+
+async def got(client: ControlClient, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+    """`get` until `condition` holds for what it answers."""
+    last: dict[str, Any] = {}
+
+    async def holds() -> bool:
+        last.clear()
+        last.update(await client.call("get"))
+        return condition(last)
+
+    await eventually(holds)
+    return last
+
+
+def test_commands_become_outputs_and_samples_responses_until_told_to_stop(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with plc_running(config_in(tmp_path, RELAY)) as (child, gateway, client):
+            beating = asyncio.create_task(gateway.alive())
+            await got(client, lambda s: s["gateway_alive"] and s["variables"]["relay.state"] == 0)
+            gateway.publish(modem_inbox=encode_period(2).data)
+            await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 2)
+            for n in range(20):  # more than the ring is deep
+                gateway.publish(ctd_sample=bytes([n, 0xFF]))
+                await eventually(lambda n=n: len(gateway.arrived) > n)
+            assert gateway.arrived == [bytes([n, 0xFF]) for n in range(20)]
+            gateway.publish(modem_inbox=b"nonsense")
+            status = await got(client, lambda s: s["variables"]["relay.bad_commands"] == 1)
+            assert status["variables"]["relay.state"] == 1
+            assert status["variables"]["relay.period_s"] == 2
+            assert (status["state"], status["error"]) == ("running", "")
+            assert status["inputs"]["modem.inbox"]["quality"] == "good"
+            assert status["lateness_us"]["count"] >= status["scans"] > 0
+            assert status["realtime"]["refused"]["SCHED_FIFO 0"] == "not asked for"
+            with pytest.raises(RemoteError):
+                await client.call("fault")
+            assert (await client.call("stop"))["state"] == "stopped"
+            assert gateway.reader.snapshot().stopped
+            assert await asyncio.wait_for(child.wait(), 1.0) == 0
+            assert not (tmp_path / "plc.sock").exists()
+            beating.cancel()
+            await asyncio.wait([beating])
+
+    run(main())
+
+
+def test_a_gateway_that_dies_turns_inputs_bad_and_sigterm_ends_it_within_a_second(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with plc_running(config_in(tmp_path, RELAY, cycle_ms=5_000)) as (child, gateway, _):
+            child.send_signal(signal.SIGTERM)  # in the middle of a long cycle
+            assert await asyncio.wait_for(child.wait(), 1.0) == 0
+            assert gateway.reader.snapshot().stopped
+        os.unlink(tmp_path / "image")
+        async with plc_running(config_in(tmp_path, RELAY, cycle_ms=2)) as (child, gateway, client):
+            beating = asyncio.create_task(gateway.alive())
+            await got(client, lambda s: s["gateway_alive"])
+            beating.cancel()
+            status = await got(client, lambda s: not s["gateway_alive"])
+            assert {(v["quality"], v["reason"]) for v in status["inputs"].values()} == {("bad", "gateway dead")}
+            scans = status["scans"]
+            await got(client, lambda s: s["scans"] > scans)  # and it goes on scanning
+            gateway.publish()
+            await got(client, lambda s: s["inputs"]["ctd.sample"]["quality"] == "good")
+            child.send_signal(signal.SIGINT)
+            assert await asyncio.wait_for(child.wait(), 1.0) == 0
+
+    run(main())
+
+
+def test_a_killed_plc_leaves_a_whole_image_and_its_successor_goes_on(tmp_path: Path) -> None:
+    async def main() -> None:
+        config = config_in(tmp_path, RELAY, cycle_ms=1)
+        async with plc_running(config) as (child, gateway, _):
+            gateway.publish(modem_inbox=encode_period(3).data)
+            await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 3)
+            child.kill()
+            await child.wait()
+            last = gateway.reader.snapshot()
+            assert not last.stopped  # nobody could say so: the heartbeat stands still
+            again = await asyncio.create_subprocess_exec(sys.executable, "-m", "plc", str(tmp_path / "plc.json"))
+            try:
+                await eventually(lambda: gateway.reader.snapshot().counter > last.counter)
+                out = gateway.reader.snapshot()
+                assert out.value("relay.commands").value == 0  # the old command is not obeyed again
+                assert out.value("modem.inbox.consumed").value == 1
+            finally:
+                again.terminate()
+                assert await asyncio.wait_for(again.wait(), 1.0) == 0
+
+    run(main())
+
+
+def test_logic_that_raises_stops_with_outputs_safe_and_can_be_asked_why(tmp_path: Path) -> None:
+    (tmp_path / "faulty_program.py").write_text(FAULTY)
+    line = FAULTY.splitlines().index('            raise ValueError("five")') + 1
+
+    async def main() -> None:
+        program = ProgramConfig("f", "python: faulty_program:Faulty", {"n": InputBinding("ctd.sample_period_s")})
+        async with plc_running(config_in(tmp_path, program)) as (child, gateway, client):
+            status = await got(client, lambda s: s["state"] == "stopped")
+            assert status["stop_reason"] == "failed"
+            assert f"program f, {tmp_path}/faulty_program.py:{line}: ValueError: five" in status["error"]
+            out = gateway.reader.snapshot()
+            assert out.stopped
+            assert out.value("f.out").quality is Quality.BAD
+            child.terminate()
+            assert await asyncio.wait_for(child.wait(), 1.0) == 1
+
+    run(main())
+
+
+def test_the_configuration_survives_json_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
+    config = config_in(tmp_path, RELAY, cycle_ms=2.5)
+    assert PlcConfig.from_json(config.to_json()) == config
+    text = json.loads(config.to_json())
+    text["cycle_ms"] = "fast"
+    with pytest.raises(FileInvalid, match="cycle_ms"):
+        PlcConfig.from_json(json.dumps(text).encode())
+    with pytest.raises(FileInvalid, match="cannot read"):
+        PlcConfig.load(tmp_path / "nothing.json")
+
+
+def test_an_image_that_is_missing_empty_or_another_is_refused(tmp_path: Path) -> None:
+    config = config_in(tmp_path, RELAY)
+    with pytest.raises(Unreachable, match="no process image"):
+        plc_main(config)
+    (tmp_path / "image").write_bytes(b"")
+    with pytest.raises(FileInvalid, match="not a process image"):
+        plc_main(config)
+    (tmp_path / "image").write_bytes(bytes(config.image_layout().size))
+    with pytest.raises(FileInvalid, match="not a process image"):
+        plc_main(config)

@@ -129,6 +129,7 @@ def parse_eds(text: str, path: str = "") -> Dictionary:
     if not objects:
         raise FileInvalid("a data sheet without objects", path=path, expected="sections such as [1000]")
     info = sections.get("deviceinfo", Section("DeviceInfo", 0, path))
+    _refuse_implied_pdos(info, objects)
     commissioning = sections.get("devicecomissioning") or sections.get("devicecommissioning")
     return Dictionary(
         path=path,
@@ -139,6 +140,21 @@ def parse_eds(text: str, path: str = "") -> Dictionary:
         objects=objects,
         dummies=_read_dummies(sections.get("dummyusage")),
     )
+
+
+def _refuse_implied_pdos(info: Section, objects: dict[int, DictionaryObject]) -> None:
+    """A file may describe PDOs by the CompactPDO mask alone; a node without its PDOs would be a silent half."""
+    if not info.number("CompactPDO", 0):
+        return
+    for key, first in (("NrOfRXPDO", 0x1400), ("NrOfTXPDO", 0x1800)):
+        listed = sum(first <= index < first + 0x200 for index in objects)
+        if listed < info.number(key, 0):
+            raise info.error(
+                "PDOs that are described by CompactPDO only",
+                "CompactPDO",
+                expected=f"{info.number(key, 0)} sections from [{first:X}] on",
+                got=str(listed),
+            )
 
 
 def _read_dummies(section: Section | None) -> frozenset[int]:

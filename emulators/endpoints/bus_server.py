@@ -26,6 +26,8 @@ HELLO_TIMEOUT_S = 5.0
 CLOSE_TIMEOUT_S = 1.0
 SEND_BUFFER_BYTES = 64 * 1024
 """The kernel's buffer per client. Left alone it grows to megabytes: minutes of frames that a slow client reads late."""
+RECEIVE_BUFFER_BYTES = 16 * 1024
+"""Likewise the other way: a sender that waits for no confirmations is held back after some hundred frames."""
 
 
 class SoftBusServer:
@@ -70,6 +72,8 @@ class SoftBusServer:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("the port of the software CAN bus is in use", where=str(endpoint)) from e
             raise Unreachable(f"cannot listen: {e.strerror or e}", where=str(endpoint)) from e
+        for listening in server.sockets:  # whatever it accepts inherits this
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         bus._server = server
         bus._endpoint = endpoint.with_address(host, int(server.sockets[0].getsockname()[1]))
         return bus

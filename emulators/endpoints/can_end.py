@@ -176,7 +176,11 @@ def _open_kernel_end(endpoint: Endpoint) -> KernelCanEnd:
         kind = (link / "type").read_text().strip()
         up = int((link / "flags").read_text(), 16) & 1
     except OSError as e:
-        raise Unreachable(f"there is no interface {endpoint.path}", where=str(endpoint)) from e
+        raise Unreachable(
+            f"there is no interface {endpoint.path}",
+            where=str(endpoint),
+            hint="create it, or use the software bus: can:fieldtwin/HOST:PORT",
+        ) from e
     if kind != ARPHRD_CAN:
         raise Unreachable(f"{endpoint.path} is no CAN interface", where=str(endpoint))
     if not up:

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import socket
 
 import can
 
-from gateway.connections.can_link import CanLink, query_link
+from gateway.connections.can_link import query_link
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CANConnection, CanConnection, closed_here
@@ -152,9 +153,10 @@ class SocketCanConnection(CanConnection):
 def _check(endpoint: Endpoint, bitrate: int) -> None:
     """Refuse an interface that is not there, no CAN, down, or at another bit rate, before python-can opens a socket."""
     try:
-        link: CanLink = query_link(endpoint.path)
-    except AttributeError as e:  # a platform without netlink
-        raise _unreachable(endpoint, OSError(errno.EAFNOSUPPORT, "this operating system has no SocketCAN")) from e
+        socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+        link = query_link(endpoint.path)
+    except AttributeError as e:  # an operating system without these families
+        raise _unreachable(endpoint, OSError(errno.EAFNOSUPPORT, "no SocketCAN")) from e
     except OSError as e:
         raise _unreachable(endpoint, e) from e
     if not link.is_can:
@@ -173,7 +175,7 @@ def _check(endpoint: Endpoint, bitrate: int) -> None:
 
 def _unreachable(endpoint: Endpoint, error: Exception) -> Unreachable:
     number = getattr(error, "errno", None) or getattr(error, "error_code", None)
-    if number == errno.EAFNOSUPPORT:
+    if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT):
         text, hint = (
             "this kernel has no SocketCAN",
             "modprobe can_raw, or use the software bus: can:fieldtwin/HOST:PORT",

@@ -28,6 +28,8 @@ from gateway.wallclock import WallClock
 
 OPEN_TIMEOUT_S = 5.0
 CLOSE_TIMEOUT_S = 1.0
+SEND_BUFFER_BYTES = 8 * 1024
+"""The kernel's, for python-can: what is sent next waits behind all that it holds."""
 
 
 class SoftBusConnection(CanConnection):
@@ -241,6 +243,7 @@ class SoftBus(can.BusABC):
             raise can.CanInitializationError(str(_nobody(e, f"can:fieldtwin/{channel}"))) from e
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
             asked_ns = clock.monotonic_ns()
             self._socket.sendall(ask(bitrate, confirmations=receive_own_messages))
             welcome = read_answer(self._read_answer(), bitrate, f"can:fieldtwin/{channel}")
@@ -320,6 +323,8 @@ class SoftBus(can.BusABC):
                 if not select.select([], [self._socket], [], left_s)[1]:
                     raise can.CanTimeoutError("the software CAN bus takes no more frames now")
                 self._unsent = self._unsent[self._socket.send(self._unsent) :]
+            except can.CanTimeoutError:
+                raise  # an OSError too, by way of TimeoutError
             except BlockingIOError:
                 pass  # filled up between select and send
             except (OSError, ValueError) as e:

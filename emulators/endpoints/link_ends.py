@@ -61,7 +61,7 @@ class TcpEnd(ByteConnection):
             self.wire.transport.write(data)
             await self.wire.room.wait()
         if not self.wire.open:
-            raise self._lost or closed_here(self.endpoint)
+            raise self._loss()
 
     def finish(self) -> None:
         """Say that nothing more will be sent, and keep receiving."""
@@ -245,7 +245,7 @@ class TtyEnd(ByteConnection):
         rest = memoryview(data)
         while rest:
             if self._lost is not None:
-                raise self._lost
+                raise self._loss()
             try:
                 rest = rest[os.write(self._fd, rest) :]
             except BlockingIOError:

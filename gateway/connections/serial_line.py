@@ -84,13 +84,14 @@ class SerialConnection(ByteConnection):
             rest = memoryview(data)
             while rest:
                 if self._lost is not None:
-                    raise self._lost
+                    raise self._loss()
                 try:
                     rest = rest[os.write(self._fd, rest) :]
                 except (BlockingIOError, InterruptedError):
                     await self._wait_for_room()
                 except OSError as e:
-                    raise self._fail(_lost(self.endpoint, e.strerror or str(e))) from e
+                    self._fail(_lost(self.endpoint, e.strerror or str(e)))
+                    raise self._loss() from e
 
     async def aclose(self) -> None:
         """Let what was written leave (at most `DRAIN_LIMIT_S`), then close. Closing twice does nothing."""
@@ -135,8 +136,8 @@ class SerialConnection(ByteConnection):
         if self._room is not None and not self._room.done():
             self._room.set_result(None)
 
-    def _fail(self, error: FieldtwinError) -> FieldtwinError:
-        """End the connection once; returns the reason that counts."""
+    def _fail(self, error: FieldtwinError) -> None:
+        """End the connection; only the first reason counts."""
         if self._lost is None:
             self.feed_lost(error)
             self._reading = False
@@ -144,7 +145,6 @@ class SerialConnection(ByteConnection):
             self._loop.remove_writer(self._fd)
             self._port.close()
             self._on_writable()  # a writer that waits learns of it
-        return self._lost or error
 
     async def _drain(self) -> None:
         """Wait until the driver's buffer is empty; throw away what does not leave, or close(2) waits 30 s for it."""

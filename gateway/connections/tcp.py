@@ -76,7 +76,7 @@ class TcpConnection(ByteConnection):
             self._wire.transport.write(data)
             await self._wire.room.wait()
         if self._lost is not None:
-            raise self._lost
+            raise self._loss()
         if self._wire.closing:
             raise _ended(self.endpoint)
 

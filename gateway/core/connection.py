@@ -113,6 +113,14 @@ class _End(Generic[T]):
     def on_room(self) -> None:
         """Called after a consumer took an item; an end that paused its medium resumes here."""
 
+    def _loss(self) -> FieldtwinError:
+        """The reason, anew for each `raise`: one that is raised again and again collects tracebacks and `at`s."""
+        kept = self._lost or closed_here(self.endpoint)
+        fresh = type(kept).__new__(type(kept))
+        fresh.args = kept.args
+        fresh.__dict__.update(kept.__dict__)
+        return fresh
+
     def _wake(self) -> None:
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(None)
@@ -120,7 +128,7 @@ class _End(Generic[T]):
     async def _next(self) -> T:
         while not self.inbound.data_stream:
             if self._lost is not None:
-                raise self._lost
+                raise self._loss()
             if self._waiter is not None:
                 raise Bug("two readers on one connection", where=str(self.endpoint))
             self._waiter = asyncio.get_running_loop().create_future()

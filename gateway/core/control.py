@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from gateway.core.errors import Bug, ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable, UsageError
+from gateway.core.errors import Bug, ConnectionLost, EndpointBusy, FieldtwinError, ReplyTimeout, Unreachable, UsageError
 
 VERSION = 1
 MAX_LINE = 4 * 1024 * 1024
@@ -37,16 +37,23 @@ class ControlServer:
         self._verbs = dict(verbs)
         self._token = token
         self._servers: list[asyncio.Server] = []
-        self._clients: set[asyncio.StreamWriter] = set()
+        self._clients: dict[asyncio.StreamWriter, asyncio.Task[None] | None] = {}
+        self._sockets: list[Path] = []
 
     async def listen_unix(self, path: Path) -> None:
-        """Listen on `path`, replacing a stale socket; readable and writable for the owner only."""
-        path.unlink(missing_ok=True)
+        """Listen on `path`, replacing a stale socket; readable and writable for the owner only.
+
+        Raises `EndpointBusy` when a living process serves there, `Unreachable` when it is no place for a socket.
+        """
         try:
+            if path.is_socket():
+                await _refuse_if_alive(path)
+                path.unlink()
             server = await asyncio.start_unix_server(self._serve_unix, path=str(path), limit=MAX_LINE)
         except OSError as e:
             raise Unreachable(f"cannot listen for control: {e.strerror or e}", where=str(path)) from e
         path.chmod(0o600)
+        self._sockets.append(path)
         self._servers.append(server)
 
     async def listen_tcp(self, host: str, port: int) -> int:
@@ -61,14 +68,18 @@ class ControlServer:
         return int(server.sockets[0].getsockname()[1])
 
     async def aclose(self) -> None:
-        """Stop listening and drop every client."""
+        """Stop listening, drop every client and the verb that it waits for, remove the sockets."""
         for server in self._servers:
             server.close()
-        for writer in list(self._clients):
-            writer.close()
+        serving = [task for task in self._clients.values() if task is not None and task is not asyncio.current_task()]
+        for task in serving:
+            task.cancel()
+        await asyncio.gather(*serving, return_exceptions=True)
         for server in self._servers:
             await server.wait_closed()
         self._servers.clear()
+        while self._sockets:
+            self._sockets.pop().unlink(missing_ok=True)
 
     async def _serve_unix(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await self._serve(reader, writer, trusted=True)
@@ -80,7 +91,7 @@ class ControlServer:
         if len(self._clients) >= MAX_CLIENTS:
             writer.close()
             return
-        self._clients.add(writer)
+        self._clients[writer] = asyncio.current_task()
         try:
             while line := await reader.readline():
                 answer, trusted = await self._answer(line, trusted)
@@ -89,31 +100,54 @@ class ControlServer:
         except (ConnectionError, asyncio.CancelledError, ValueError):
             pass  # client gone, server closing, or a line over the limit: only this client is dropped
         finally:
-            self._clients.discard(writer)
+            self._clients.pop(writer, None)
             writer.close()
 
     async def _answer(self, line: bytes, trusted: bool) -> tuple[bytes, bool]:
         request_id: Any = None
         try:
-            request = json.loads(line)
-            if not isinstance(request, dict) or request.get("v") != VERSION:
-                raise UsageError("not a control request", expected=f'a JSON object with "v": {VERSION}')
+            request = _parse(line)
             request_id = request.get("id")
-            trusted = trusted or hmac.compare_digest(str(request.get("token", "")), self._token)
+            token = str(request.get("token", ""))
+            trusted = trusted or hmac.compare_digest(token.encode(errors="replace"), self._token.encode())
             if not trusted:
                 raise UsageError("this control channel wants its token")
             verb = self._verbs.get(str(request.get("verb")))
             if verb is None:
                 raise UsageError(f"unknown verb {request.get('verb')!r}", expected=", ".join(sorted(self._verbs)))
-            answer: dict[str, Any] = {"ok": True, "result": await verb(request.get("args") or {})}
+            return _encode(request_id, {"ok": True, "result": await verb(request.get("args") or {})}), trusted
         except FieldtwinError as e:
-            answer = {"ok": False, "error": _describe(e)}
-        except json.JSONDecodeError as e:
-            answer = {"ok": False, "error": _describe(UsageError(f"not JSON: {e}"))}
+            error = e
         except Exception as e:  # a verb's bug must not take the channel down; it is reported to the caller
-            answer = {"ok": False, "error": _describe(Bug(f"{type(e).__name__}: {e}"))}
-        text = json.dumps({"v": VERSION, "id": request_id, **answer}, separators=(",", ":"), default=str)
-        return text.encode() + b"\n", trusted
+            error = Bug(f"{type(e).__name__}: {e}")
+        return _encode(request_id, {"ok": False, "error": _describe(error)}), trusted
+
+
+def _parse(line: bytes) -> dict[str, Any]:
+    """A request, or `UsageError`: what a stranger sends is never a bug of ours."""
+    try:
+        request = json.loads(line)
+    except (ValueError, RecursionError) as e:
+        raise UsageError(f"not JSON: {e}") from e
+    if not isinstance(request, dict) or request.get("v") != VERSION:
+        raise UsageError("not a control request", expected=f'a JSON object with "v": {VERSION}')
+    if not isinstance(request.get("args") or {}, dict):
+        raise UsageError("not a control request", expected='"args" to be a JSON object')
+    return request
+
+
+def _encode(request_id: Any, answer: dict[str, Any]) -> bytes:
+    text = json.dumps({"v": VERSION, "id": request_id, **answer}, separators=(",", ":"), default=str)
+    return text.encode() + b"\n"
+
+
+async def _refuse_if_alive(path: Path) -> None:
+    try:
+        _, writer = await asyncio.open_unix_connection(str(path))
+    except OSError:
+        return  # nobody behind it: left over from a process that was killed
+    writer.close()
+    raise EndpointBusy("another process serves control here", where=str(path), hint="is this instance running already?")
 
 
 def _describe(e: FieldtwinError) -> dict[str, Any]:
@@ -184,7 +218,9 @@ class ControlClient:
             line = await self._reader.readline()
             if not line:
                 raise ConnectionLost("the other process closed its control channel", where=self._where)
-            answer: dict[str, Any] = json.loads(line)
+            answer = json.loads(line)
+            if not isinstance(answer, dict):
+                raise ConnectionLost("the other process does not speak the control protocol", where=self._where)
             if answer.get("id") == request_id:  # an answer to a call that timed out earlier is skipped
                 return answer
 

@@ -27,7 +27,11 @@ SOCKET_SCHEMES = ("tcp", "rtu+tcp", "udp", "tls")
 SCHEMES = (*SERIAL_SCHEMES, *SOCKET_SCHEMES, "can", "pty")
 DEFAULT_PORTS = {"tcp": 502, "udp": 502, "tls": 802}
 
+SERIAL_PARAMS = ("baudrate", "frame")
+
 _FRAME = re.compile(r"^([78])([NEO])([12])$")
+_NUMBER = re.compile(r"^[0-9]{1,9}$")  # str.isdigit also takes digits that int() refuses
+_HOST = re.compile(r"^(\[[^\s\[\]/?#@]+\]|[^\s\[\]/?#@:]+)$")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,8 +100,7 @@ class Endpoint:
             if not rest:
                 raise UsageError(f"endpoint {url!r} names no port", expected=f"{scheme}:PATH")
             endpoint = cls(scheme, path=rest, params=params)
-        if endpoint.is_serial:
-            endpoint.serial  # noqa: B018  read once so that a bad setting is refused here, not at open
+        _check_params(endpoint)
         return endpoint
 
     @property
@@ -116,7 +119,7 @@ class Endpoint:
     def serial(self) -> SerialSettings:
         """Baud rate and frame of a serial endpoint (19200 8E1 where not said: the default of Modbus, SL 2.5.1)."""
         text, frame = self.param("baudrate", "19200"), self.param("frame", "8E1").upper()
-        if not text.isdigit() or not 50 <= int(text) <= 4_000_000:
+        if not _NUMBER.match(text) or not 50 <= int(text) <= 4_000_000:
             raise UsageError(f"endpoint {self}: baud rate", expected="a number from 50 to 4000000", got=repr(text))
         if not _FRAME.match(frame):
             raise UsageError(
@@ -129,9 +132,9 @@ class Endpoint:
         """Host and port of a socket endpoint, or of a software CAN bus."""
         if self.is_can:
             host, _, port = self.path.rpartition(":")
-            if not host or not port.isdigit():
+            if not _HOST.match(host) or not _NUMBER.match(port) or int(port) > 65535:
                 raise UsageError(f"cannot read endpoint {self}", expected="can:fieldtwin/HOST:PORT")
-            return host, int(port)
+            return host.strip("[]"), int(port)
         return self.host, self.port
 
     def with_path(self, path: str) -> Endpoint:
@@ -141,17 +144,34 @@ class Endpoint:
     def with_address(self, host: str, port: int) -> Endpoint:
         """The same endpoint on another host and port."""
         if self.is_can:
-            return replace(self, path=f"{host}:{port}")
+            return replace(self, path=f"{_bracketed(host)}:{port}")
         return replace(self, host=host, port=port)
 
     def __str__(self) -> str:
         query = f"?{urlencode(self.params)}" if self.params else ""
         if self.scheme in SOCKET_SCHEMES:
-            host = f"[{self.host}]" if ":" in self.host else self.host
-            return f"{self.scheme}://{host}:{self.port}{query}"
+            return f"{self.scheme}://{_bracketed(self.host)}:{self.port}{query}"
         if self.is_can:
             return f"can:{self.interface}/{self.path}{query}"
         return f"{self.scheme}:{self.path}{query}"
+
+
+def _bracketed(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
+
+
+def _check_params(endpoint: Endpoint) -> None:
+    """Refuse here, and not when the port is opened: what is said twice, a bad setting, a misspelt one of a port."""
+    names = [name for name, _ in endpoint.params]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"endpoint {endpoint}: {name!r} is said more than once")
+        if endpoint.is_serial and name not in SERIAL_PARAMS:
+            raise UsageError(
+                f"endpoint {endpoint}: unknown setting", expected=" or ".join(SERIAL_PARAMS), got=repr(name)
+            )
+    if endpoint.is_serial or endpoint.scheme == "pty":
+        endpoint.serial  # noqa: B018  reading it checks it
 
 
 def _host_port(url: str, scheme: str, rest: str) -> tuple[str, int]:
@@ -161,6 +181,9 @@ def _host_port(url: str, scheme: str, rest: str) -> tuple[str, int]:
     host, colon, port = rest[2:].rstrip("/").rpartition(":")
     if not colon or "]" in port:  # no port given (the colons of an IPv6 address are inside its brackets)
         host, port = rest[2:].rstrip("/"), str(DEFAULT_PORTS.get(scheme, ""))
-    if not host or not port.isdigit() or int(port) > 65535:
-        raise UsageError(f"cannot read endpoint {url!r}", expected=f"{scheme}://HOST:PORT, port 0 to 65535")
+    if not _HOST.match(host) or not _NUMBER.match(port) or int(port) > 65535:
+        raise UsageError(
+            f"cannot read endpoint {url!r}",
+            expected=f"{scheme}://HOST:PORT, port 0 to 65535, [..] around an IPv6 address",
+        )
     return host.strip("[]"), int(port)

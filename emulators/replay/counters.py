@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
 from emulators.modbus.bank import Table
 from emulators.replay.situation import Cell
-from gateway.core.errors import Bug
+from gateway.core.errors import Bug, UnknownCommand
 from gateway.core.values import COMMAND, RECORDING
 
 
@@ -74,15 +74,25 @@ class Counters:
         found = self._by_cell.get((unit, cell))
         return found is not None and (found[0].shown is not None or self._context.left(found[0].command) > 0)
 
+    def begin(self, unit: int, table: Table, addresses: range) -> None:
+        """A request for these registers starts: a counter of which it wants one again moves on, before any is read."""
+        for address in addresses:
+            counter, i = self._by_cell.get((unit, (table, address)), (None, 0))
+            if counter is not None and (counter.shown is None or i in counter.seen):
+                self._move_on(counter)
+
     def read(self, unit: int, cell: Cell) -> int:
-        """The register's present word; the caller asked `knows`."""
+        """The register's word; the caller asked `knows`, and called `begin` for the whole request."""
         counter, i = self._by_cell[unit, cell]
-        if counter.shown is None or i in counter.seen:
-            try:
-                words = self._context.take(counter.command).data
-            except UsedUp as error:
-                raise Bug("a counter without a recording was read") from error
-            counter.shown = struct.unpack(f">{counter.span.count}H", words)
-            counter.seen.clear()
+        if counter.shown is None:
+            raise Bug("a counter was read before its request began")
         counter.seen.add(i)
         return counter.shown[i]
+
+    def _move_on(self, counter: _Counter) -> None:
+        try:
+            words = self._context.take(counter.command).data
+        except (UnknownCommand, UsedUp):
+            return  # nothing whole was recorded: `knows` says so
+        counter.shown = struct.unpack(f">{counter.span.count}H", words)
+        counter.seen.clear()

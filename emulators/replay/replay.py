@@ -249,6 +249,8 @@ class ExchangeReplay:
                 if requests.is_written(request, pdu, reply):
                     self._write(unit, request, request.values)
                 return Answer(reply, outcome.latency_s)
+            if not self._knows_all(unit_id, unit, request):
+                return Answer(reply, outcome.latency_s)  # half a counter was recorded: all there is of it
             return Answer(self._read(unit_id, unit, request), outcome.latency_s)
         if request is None or pdu[0] not in unit.functions:
             known = pdu[0] in unit.functions
@@ -262,7 +264,7 @@ class ExchangeReplay:
         refused = unit.least_refused.get(request.function)
         if refused is not None and refused <= request.count > unit.most_read.get(request.function, 0):
             return Answer(requests.exception(pdu, requests.ILLEGAL_VALUE), unit.usual_latency_s(request.function))
-        if not all(self._knows(unit_id, unit, (request.table, address)) for address in request.addresses):
+        if not self._knows_all(unit_id, unit, request):
             return self._never(pdu, requests.ILLEGAL_ADDRESS)
         return Answer(self._read(unit_id, unit, request), unit.usual_latency_s(request.function))
 
@@ -300,6 +302,7 @@ class ExchangeReplay:
         return outcome
 
     def _read(self, unit_id: int, unit: _Unit, request: CellRequest) -> bytes:
+        self._spans.begin(unit_id, request.table, request.addresses)
         values = [self._value(unit_id, unit, (request.table, address)) for address in request.addresses]
         return requests.read_reply(request, values)
 
@@ -309,6 +312,9 @@ class ExchangeReplay:
             or self._spans.knows(unit_id, cell)
             or unit.situations.written(cell) is not None
         )
+
+    def _knows_all(self, unit_id: int, unit: _Unit, request: CellRequest) -> bool:
+        return all(self._knows(unit_id, unit, (request.table, address)) for address in request.addresses)
 
     def _value(self, unit_id: int, unit: _Unit, cell: Cell) -> int:
         """One cell: from its counter, or as recorded after the same writes, or as it was written."""

@@ -172,9 +172,10 @@ class ModbusClient:
     async def execute(self, unit: int, request: Request[R], timeout_s: float | None = None) -> R:
         """Send `request` once and return its reply. Waits for its turn and for the line to be silent before.
 
-        `timeout_s` counts from the end of transmission, the reply's own time on the wire comes on top. Raises `ReplyTimeout`, `CrcError`, `Desync`,
-        `ModbusExceptionReply` or `VerifyFailed`; `UsageError` before anything is sent; `ConnectionLost` when the
-        client has become useless. Cancelling it is safe: its reply is never taken for another's.
+        `timeout_s` counts from the end of transmission; the reply's own time on the wire comes on top. Raises
+        `ReplyTimeout`, `CrcError`, `Desync`, `ModbusExceptionReply` or `VerifyFailed`; `UsageError` before anything is
+        sent; `ConnectionLost` when the client has become useless. Cancelling it is safe: its reply is never taken for
+        another's.
         """
         timeout_ns = round(_checked_timeout(self._timeout_s if timeout_s is None else timeout_s) * NS_PER_S)
         if not 0 <= unit <= 255:
@@ -265,15 +266,17 @@ class ModbusClient:
 
         Raises `Desync` when the line does not become silent, `ConnectionLost` when it is gone.
         """
-        since_ns = now_ns = self._clock.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
+        babble_ns = self._line.babble_ns(now_ns)
         self._drain(self._connection.read_pending(), now_ns, live=False)
         while (clear_ns := self._line.clear_ns(now_ns)) > now_ns:
-            if now_ns >= self._line.babble_ns(since_ns):
-                where = str(self._connection.endpoint)
-                raise Desync("the line is never silent", where=where, hint="another master, or a unit that babbles")
             data = await self._read_until(clear_ns)
             now_ns = self._clock.monotonic_ns()
             self._drain(data, now_ns, live=True)
+            if data and now_ns >= babble_ns:
+                self._line.babbled()
+                where = str(self._connection.endpoint)
+                raise Desync("the line is never silent", where=where, hint="another master, or a unit that babbles")
         lost = self._connection.lost
         if lost is not None:
             raise ConnectionLost(lost.message, where=lost.where)

@@ -1,7 +1,8 @@
 """What a framing is: request PDU in, frame out; bytes in, the one awaited reply PDU out.
 
-`RtuFramer` (in rtu) and `MbapFramer` (in mbap) implement it; ASCII, UDP and TLS have the same shape. A framing decides which bytes are the
-reply, and whether they arrived whole; what the reply says is the request's to judge. No clock: `now_ns` is passed.
+`RtuFramer` (in rtu) and `MbapFramer` (in mbap) implement it; ASCII, UDP and TLS have the same shape. A framing decides
+which bytes are the reply, and whether they arrived whole; what the reply says is the request's to judge. No clock here:
+`now_ns` is passed.
 """
 
 from __future__ import annotations

@@ -35,6 +35,7 @@ class LineSilence:
         self._sent_ns = 0
         self._in_quarantine = False
         self.longest_latency_ns = 0
+        self._before_quarantine = (0, 0)
 
     @property
     def in_quarantine(self) -> bool:
@@ -47,8 +48,13 @@ class LineSilence:
         return max(silent_ns, self._not_before_ns)
 
     def babble_ns(self, since_ns: int) -> int:
-        """When to give up waiting for silence that was awaited since `since_ns`."""
+        """From when on, if silence was awaited since `since_ns`, bytes mean that the line will not become silent."""
         return max(since_ns, self._not_before_ns) + _BABBLE_FACTOR * self._required_ns + _BABBLE_GRACE_NS
+
+    def babbled(self) -> None:
+        """What was heard was no late reply: unlearn the latency, or every quarantine would be longer than the last."""
+        if self._in_quarantine:
+            self.longest_latency_ns, self._required_ns = self._before_quarantine
 
     def heard(self, now_ns: int, *, live: bool) -> None:
         """Bytes arrived between exchanges. `live`: they arrived just now, so they tell how late a reply can be."""
@@ -78,6 +84,7 @@ class LineSilence:
         if self._quarantines:
             self._in_quarantine = True
             self._end(max(now_ns, sent_ns), max(timeout_ns, self.longest_latency_ns, self._settle_ns))
+            self._before_quarantine = self.longest_latency_ns, self._required_ns
 
     def broadcast(self, sent_ns: int) -> None:
         """Nobody answers; the units get time to execute."""

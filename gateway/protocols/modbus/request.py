@@ -13,6 +13,7 @@ from gateway.core.errors import Desync, ModbusExceptionReply, UsageError
 from gateway.protocols.modbus.replies import Reply
 
 R = TypeVar("R", bound=Reply)
+R_co = TypeVar("R_co", bound=Reply, covariant=True)
 
 MAX_PDU = 253
 """Bytes of the longest protocol data unit, function code included (AP 4.1)."""
@@ -24,7 +25,7 @@ IMPOSSIBLE = -1
 """`Request.reply_length`: no reply to this request starts like this."""
 
 
-class Request(ABC, Generic[R]):
+class Request(ABC, Generic[R_co]):
     """One request PDU and everything needed to judge its reply.
 
     Ranges are checked when a request is made (`UsageError`), so whatever exists can be sent.
@@ -49,14 +50,14 @@ class Request(ABC, Generic[R]):
         """
 
     @abstractmethod
-    def decode(self, pdu: bytes, t_ns: int) -> R:
+    def decode(self, pdu: bytes, t_ns: int) -> R_co:
         """The reply in a normal reply PDU, complete at `t_ns`. Raises `Desync`, or `VerifyFailed` for a write."""
 
     def nominal_length(self) -> int:
         """Bytes of the reply PDU where the request alone tells, else `NEED_MORE`."""
         return NEED_MORE
 
-    def unanswered(self, t_ns: int) -> R:
+    def unanswered(self, t_ns: int) -> R_co:
         """What a broadcast of this request returns; raises `UsageError` where it asks for data (SL 2.1)."""
         raise UsageError(
             f"function {self.function:02X}h cannot be broadcast: nobody answers", expected="a write, or a unit from 1"
@@ -83,7 +84,7 @@ def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
     return request.decode(pdu, t_ns)
 
 
-def describe_length(request: Request[R]) -> str:
+def describe_length(request: Request[Reply]) -> str:
     nominal = request.nominal_length()
     return f"{nominal} bytes after the unit id" if nominal else "a whole reply"
 

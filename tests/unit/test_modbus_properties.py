@@ -1,0 +1,155 @@
+"""Whatever arrives in whatever pieces: never a wrong value, never a foreign exception, and the next request is answered."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.core.errors import FieldtwinError, ReplyTimeout, WireError
+from gateway.protocols.modbus.crc import with_crc
+from gateway.protocols.modbus.framing import Framer
+from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
+from gateway.protocols.modbus.mbap import MbapFramer
+from gateway.protocols.modbus.replies import RegistersReply, Reply
+from gateway.protocols.modbus.request import Request
+from gateway.protocols.modbus.requests import ReadBits, ReadRegisters, WriteRegister, WriteRegisters
+from gateway.protocols.modbus.rtu import RtuFramer
+from gateway.protocols.modbus.transaction import Transaction
+
+UNIT = 1
+TIMEOUT_NS = 1_000_000_000
+
+REQUESTS = st.one_of(
+    st.builds(ReadRegisters, st.sampled_from(["holding", "input"]), st.integers(0, 999), st.integers(1, 125)),
+    st.builds(ReadBits, st.sampled_from(["coil", "discrete"]), st.integers(0, 999), st.integers(1, 2000)),
+    st.builds(WriteRegister, st.integers(0, 65535), st.integers(0, 65535)),
+    st.builds(WriteRegisters, st.just(7), st.lists(st.integers(0, 65535), min_size=1, max_size=123).map(tuple)),
+    st.just(ReportServerId()),
+    st.just(ReadDeviceIdentification()),
+)
+
+# Bytes that look like something: units, functions and counts in use, whole frames of ours and of others.
+CRUMBS = st.one_of(
+    st.binary(max_size=12),
+    st.sampled_from([b"\x01\x03", b"\x01\x83", b"\x01\x04\x04", b"\x01", b"\x00", b"\xff", b"\x02\x03\xfa"]),
+    st.sampled_from([bytes.fromhex(h) for h in ("02 03 02 00 07", "02 83 02", "02 06 00 01 00 02")]).map(with_crc),
+    st.sampled_from([bytes.fromhex(h) for h in ("00 01 00 00", "00 01 00 00 00 05 02", "00 00 00 00 ff ff")]),
+)
+GARBAGE = st.lists(CRUMBS, max_size=12).map(b"".join)
+SPLITS = st.lists(st.tuples(st.integers(1, 40), st.integers(0, 40_000_000)), max_size=40)
+
+
+def framer_of(kind: str, echo: bool = False, strict: bool = False) -> Framer:
+    if kind == "mbap":
+        return MbapFramer()
+    return RtuFramer(echo=echo, strict=strict, char_time_ns=573_000 if strict else 0)
+
+
+def play(framer: Framer, request: Request[Reply], data: bytes, splits: list[tuple[int, int]]) -> Reply | FieldtwinError:
+    """Deliver `data` in pieces of the sizes and at the intervals of `splits`, the rest at once; then let time pass."""
+    transaction = Transaction(framer, UNIT, request, timeout_ns=TIMEOUT_NS)
+    now_ns = 0
+    transaction.start(now_ns)
+    try:
+        for size, pause_ns in [*splits, (len(data), 0)]:
+            now_ns += pause_ns
+            while transaction.wake_ns <= now_ns:
+                reply = transaction.poll(transaction.wake_ns)
+                if reply is not None:
+                    return reply
+            piece, data = data[:size], data[size:]
+            if piece:
+                reply = transaction.feed(piece, now_ns)
+                if reply is not None:
+                    return reply
+        while True:
+            reply = transaction.poll(transaction.wake_ns)
+            if reply is not None:
+                return reply
+    except FieldtwinError as e:
+        return e
+
+
+def framed(kind: str, transaction: int, pdu: bytes, unit: int = UNIT) -> bytes:
+    if kind == "mbap":
+        return transaction.to_bytes(2, "big") + b"\x00\x00" + (len(pdu) + 1).to_bytes(2, "big") + bytes([unit]) + pdu
+    return with_crc(bytes([unit]) + pdu)
+
+
+def registers_pdu(function: int, values: list[int]) -> bytes:
+    return bytes([function, 2 * len(values)]) + b"".join(v.to_bytes(2, "big") for v in values)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.sampled_from(["rtu", "mbap"]), st.booleans(), st.booleans(), REQUESTS, GARBAGE, SPLITS)
+def test_garbage_gives_typed_errors_only_and_the_next_exchange_works(
+    kind: str, echo: bool, strict: bool, request: Request[Reply], garbage: bytes, splits: list[tuple[int, int]]
+) -> None:
+    framer = framer_of(kind, echo, strict)
+    outcome = play(framer, request, garbage, splits)
+    assert isinstance(outcome, FieldtwinError), f"a value out of garbage: {outcome}"
+    read = ReadRegisters("holding", 0, 2)
+    reply = framed(kind, 2, registers_pdu(3, [7, 0xFFFF]))
+    echoed = with_crc(bytes([UNIT]) + read.encode()) if echo and kind == "rtu" else b""
+    answer = play(framer, read, echoed + reply, [])
+    assert isinstance(answer, RegistersReply)
+    assert answer.registers == (7, 0xFFFF)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.sampled_from(["rtu", "mbap"]),
+    st.lists(st.integers(0, 65535), min_size=1, max_size=125),
+    SPLITS,
+    st.lists(st.sampled_from([b"\x00", b"\xff"]), max_size=5).map(b"".join),
+)
+def test_a_reply_is_read_whatever_its_pieces(
+    kind: str, values: list[int], splits: list[tuple[int, int]], noise: bytes
+) -> None:
+    data = framed(kind, 1, registers_pdu(4, values))
+    if kind == "rtu":
+        data = noise + data
+    outcome = play(framer_of(kind), ReadRegisters("input", 0, len(values)), data, splits)
+    if isinstance(outcome, ReplyTimeout):
+        assert sum(pause for _, pause in splits) >= TIMEOUT_NS
+        return
+    assert isinstance(outcome, RegistersReply)
+    assert outcome.registers == tuple(values)
+    assert outcome.raw == b"".join(v.to_bytes(2, "big") for v in values)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.lists(st.integers(0, 65535), min_size=1, max_size=20), st.data())
+def test_a_damaged_rtu_reply_is_never_a_value(values: list[int], data: st.DataObject) -> None:
+    """A burst of up to 16 bits is always found by the CRC; anything lost or cut is found by length."""
+    frame = framed("rtu", 0, registers_pdu(3, values))
+    at = data.draw(st.integers(0, len(frame) * 8 - 1))
+    burst = data.draw(st.integers(1, 0xFFFF)) << at
+    damaged = (int.from_bytes(frame, "big") ^ (burst & ((1 << len(frame) * 8) - 1))).to_bytes(len(frame), "big")
+    cut = data.draw(st.integers(0, len(frame) - 1))
+    request = ReadRegisters("holding", 0, len(values))
+    for received in (damaged, frame[:cut], frame[:cut] + frame[cut + 1 :]):
+        if received != frame:
+            assert isinstance(play(RtuFramer(), request, received, []), FieldtwinError)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.sampled_from(["rtu", "mbap"]),
+    st.integers(1, 20),
+    st.lists(st.integers(0, 65535), min_size=1, max_size=20),
+    st.sampled_from([1, 2, 3, 4, 6, 16, 23]),
+    st.integers(1, 3),
+    SPLITS,
+)
+def test_a_valid_frame_is_a_value_only_if_it_answers_the_request(
+    kind: str, count: int, values: list[int], function: int, unit: int, splits: list[tuple[int, int]]
+) -> None:
+    data = framed(kind, 1, registers_pdu(function, values), unit)
+    outcome = play(framer_of(kind), ReadRegisters("holding", 0, count), data, splits)
+    if (function, unit, len(values)) == (3, UNIT, count) and sum(pause for _, pause in splits) < TIMEOUT_NS:
+        assert isinstance(outcome, RegistersReply)
+    elif isinstance(outcome, RegistersReply):
+        assert (function, unit, outcome.registers) == (3, UNIT, tuple(values))
+    else:
+        assert isinstance(outcome, WireError)

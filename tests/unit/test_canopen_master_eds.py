@@ -1,0 +1,238 @@
+"""EDS and DCF files as vendors write them: what is read, what is mended, what is refused and where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.protocols.canopen.datatypes import DataType
+from gateway.protocols.canopen.dictionary import DictionaryEntry, load_dictionary, parse_dictionary
+
+EDS = """\
+[FileInfo]
+FileName=probe.eds
+
+[Comments]
+Lines=2
+Line1=free text = here
+
+[DeviceInfo]
+VendorName=Nobody
+VendorNumber=0x55
+ProductName=Probe
+ProductNumber=7
+
+[DummyUsage]
+Dummy0001=0
+
+[1000]
+ParameterName=Device type
+ObjectType=0x7
+DataType=0x0007
+AccessType=ro
+DefaultValue=0x2019A
+PDOMapping=0
+
+[1008]
+ParameterName=Name ; what a person calls it
+DataType=0x0009
+AccessType=const
+DefaultValue=probe
+
+[1800]
+ParameterName=TPDO1
+ObjectType=0x9
+SubNumber=2
+
+[1800sub0]
+ParameterName=Highest sub-index
+ObjectType=0x7
+DataType=0x0005
+AccessType=const
+DefaultValue=1
+
+[1800sub1]
+ParameterName=COB-ID
+ObjectType=0x7
+DataType=0x0007
+AccessType=rw
+DefaultValue=$NODEID+0x180
+
+[6010]
+ParameterName=Slope
+ObjectType=0x7
+DataType=0x0003
+AccessType=ro
+LowLimit=-900
+HighLimit=0x384
+PDOMapping=1
+"""
+
+
+def test_a_clean_file() -> None:
+    od = parse_dictionary(EDS, 5)
+    assert (od.vendor_name, od.vendor_number, od.product_name, od.product_number) == ("Nobody", 0x55, "Probe", 7)
+    assert (od.node_id, od.mended, len(od)) == (5, (), 5)
+    assert od.get(0x1000) == DictionaryEntry(0x1000, 0, "Device type", 7, "ro", 0x2019A)
+    assert od.get(0x1008) == DictionaryEntry(0x1008, 0, "Name", 9, "const", "probe")
+    assert od.get(0x1800, 1) == DictionaryEntry(0x1800, 1, "TPDO1.COB-ID", 7, "rw", 0x185)
+    assert od.get(0x6010) == DictionaryEntry(0x6010, 0, "Slope", DataType.INTEGER16, "ro", None, -900, 900, True)
+    assert od.get(0x6010, 1) is None
+    cob_id = od.find("COB-ID")
+    assert (cob_id.readable, cob_id.writable) == (True, True)
+    with pytest.raises(UsageError, match="did you mean 'Slope'"):
+        od.find("slope")
+
+
+def test_without_node_id_what_depends_on_it_is_unknown() -> None:
+    entry = parse_dictionary(EDS).get(0x1800, 1)
+    assert entry is not None
+    assert entry.default is None
+
+
+def test_a_dcf_brings_its_node_id_and_values() -> None:
+    text = EDS + "\n[DeviceComissioning]\nNodeID=0x09\nBaudrate=125\n"
+    od = parse_dictionary(text.replace("DefaultValue=probe", "DefaultValue=probe\nParameterValue=north"))
+    assert od.node_id == 9
+    assert [od.find(n).default for n in ("COB-ID", "Name")] == [0x189, "north"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("VendorNumber=0x55", "VendorNumber=", "VendorNumber: empty"),
+        ("PDOMapping=1", "PDOMapping=", "[6010] PDOMapping: empty"),
+        ("Name=Slope\nObjectType=0x7", "Name=Slope\nObjectType=", "[6010] ObjectType: empty, read as 0x7"),
+        (
+            "AccessType=const\nDefaultValue=probe",
+            "AccessType=const\nAccessType=const\nDefaultValue=probe",
+            "there twice",
+        ),
+        ("[1008]", "[1007sub1]\nParameterName=lost\nDataType=5\nAccessType=ro\n[1008]", "no [1007]"),
+        ("[1008]", "[1000sub1]\nParameterName=odd\nDataType=5\nAccessType=ro\n[1008]", "single variable"),
+        ("[DeviceInfo]", "[DeviceInfo]\nCompactPDO=0x1F", "CompactPDO"),
+    ],
+)
+def test_what_is_mended_is_said(old: str, new: str, said: str) -> None:
+    assert old in EDS
+    od = parse_dictionary(EDS.replace(old, new), 5)
+    assert any(said in line for line in od.mended), od.mended
+    assert od.get(0x1000) == parse_dictionary(EDS, 5).get(0x1000)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("ParameterName=Slope", "parametername=Slope"),
+        ("[1800sub1]", "[1800SUB01]"),
+        ("LowLimit=-900", "  LowLimit = -900"),
+        ("DataType=0x0003", "DataType=003"),
+        ("\n", "\r\n"),
+        ("[FileInfo]", "\ufeff[FileInfo]"),
+        ("[1800]\nParameterName=TPDO1\nObjectType=0x9\nSubNumber=2\n", ""),
+    ],
+)
+def test_harmless_ways_of_writing(old: str, new: str, tmp_path: Path) -> None:
+    text = EDS.replace(old, new)
+    if not new:
+        text += "\n" + old  # the object after its sub-objects
+    path = tmp_path / "probe.eds"
+    path.write_bytes(text.encode())
+    assert load_dictionary(path, 5).entries == parse_dictionary(EDS, 5).entries
+
+
+def test_compact_arrays_have_all_their_entries() -> None:
+    text = EDS + (
+        "[3000]\nParameterName=Valve\nObjectType=0x8\nCompactSubObj=3\nDataType=0x6\nAccessType=rw\nDefaultValue=4\n"
+        "[3000Name]\nNrOfEntries=1\n2=Big valve\n"
+        "[3001]\nParameterName=Plain\nObjectType=0x8\nCompactSubObj=2\nDataType=0x5\nAccessType=ro\n"
+        "[3002]\nParameterName=Not compact\nObjectType=0x8\nSubNumber=1\nCompactSubObj=0\n"
+        "[3002sub0]\nParameterName=Count\nDataType=5\nAccessType=ro\nDefaultValue=0\n"
+    )
+    od = parse_dictionary(text)
+    assert [(e.subindex, e.name, e.default) for e in od if e.index == 0x3000] == [
+        (0, "Valve.Number of entries", 3),
+        (1, "Valve.Valve1", 4),
+        (2, "Valve.Big valve", 4),
+        (3, "Valve.Valve3", 4),
+    ]
+    assert [e.subindex for e in od if e.index == 0x3001] == [0, 1, 2]
+    assert [e.subindex for e in od if e.index == 0x3002] == [0]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "match"),
+    [
+        ("DataType=0x0003", "DataType=word", 53, r"\[6010\] DataType: cannot be read; expected a number; got 'word'"),
+        ("DataType=0x0003\n", "", 50, r"\[6010\] DataType: is missing"),
+        ("AccessType=ro\nLowLimit", "AccessType=\nLowLimit", 54, r"\[6010\] AccessType: is missing"),
+        (
+            "ParameterName=Slope",
+            "ParameterName=Slope\nParameterName=Tilt",
+            52,
+            "ParameterName is there twice; got also line 51",
+        ),
+        ("[6010]", "[1000]", 50, r"\[1000\] is there twice"),
+        ("[6010]", "[6010", 50, "without its bracket"),
+        ("LowLimit=-900", "LowLimit", 55, "neither section nor key"),
+        ("PDOMapping=1", "PDOMapping=08", 57, "PDOMapping: cannot be read"),
+    ],
+)
+def test_what_is_refused_says_where(old: str, new: str, line: int, match: str) -> None:
+    assert old in EDS
+    with pytest.raises(FileInvalid, match=match) as caught:
+        parse_dictionary(EDS.replace(old, new), 5, path="probe.eds")
+    assert str(caught.value).startswith(f"probe.eds:{line}: ")
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid, match="cannot be read"):
+        load_dictionary(tmp_path / "none.eds")
+    with pytest.raises(FileInvalid, match="no object"):
+        parse_dictionary("[FileInfo]\nFileName=x\n")
+
+
+def test_an_encoding_other_than_utf8_is_read_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "probe.eds"
+    path.write_bytes(EDS.replace("Nobody", "Mößler").encode("cp1252"))
+    od = load_dictionary(path)
+    assert od.vendor_name == "Mößler"
+    assert od.mended == ("not UTF-8: read as Windows-1252",)
+
+
+KEYS = [
+    "ParameterName",
+    "ObjectType",
+    "DataType",
+    "AccessType",
+    "PDOMapping",
+    "DefaultValue",
+    "LowLimit",
+    "CompactSubObj",
+]
+LINES = st.one_of(
+    st.sampled_from(
+        ["[1000]", "[1000sub0]", "[1000sub1]", "[1000Name]", "[DeviceInfo]", "[DeviceComissioning]", "[x]"]
+    ),
+    st.builds(
+        lambda k, v: f"{k}={v}",
+        st.sampled_from([*KEYS, "VendorNumber", "NodeID", "NrOfEntries", "1"]),
+        st.sampled_from(["", "0", "1", "0x7", "8", "9", "0x1B", "0x40", "$NODEID+1", "ro", "99999999999", "%s", "é"]),
+    ),
+    st.text(max_size=12),
+)
+
+
+@given(lines=st.lists(LINES, max_size=25))
+def test_any_text_is_a_dictionary_or_refused(lines: list[str]) -> None:
+    try:
+        od = parse_dictionary("\n".join(lines), 5)
+    except FileInvalid:
+        return
+    for entry in od:
+        assert entry.access
+        assert od.get(entry.index, entry.subindex) is entry

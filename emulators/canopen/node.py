@@ -164,7 +164,16 @@ class CanopenNode:
         return self.tick(now_ns)
 
     def raise_error(self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"") -> list[CanFrame]:
-        """An error arises in the device: EMCY `code` with `info` (up to 5 bytes), active until `clear_error`."""
+        """An error arises in the device: EMCY `code` with `info` (up to 5 bytes), active until `clear_error`.
+
+        Raises `UsageError` for what no EMCY message can carry.
+        """
+        if not 0 < code <= 0xFFFF or not 0 <= register <= 0xFF or len(info) > 5:
+            raise UsageError(
+                "not an EMCY message",
+                expected="a code of 16 bits, a register of 8 bits, at most 5 bytes of information",
+                got=f"{code:X}h, {register:X}h, {len(info)} bytes",
+            )
         self._emergency.raise_error(code, now_ns, register=register, info=info)
         return self.tick(now_ns)
 

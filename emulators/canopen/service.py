@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from emulators.canopen.node_data import NodeData
 from gateway.core.canframe import CanFrame
@@ -53,8 +53,7 @@ class NodeCounters:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-@dataclass(frozen=True, slots=True)
-class SentPdo:
+class SentPdo(NamedTuple):
     """One TPDO that left the node."""
 
     t_ns: int

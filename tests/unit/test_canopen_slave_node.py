@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 
 import pytest
-from canopen_slave_rig import INCLINOMETER, NODE, RICH, U32, Rig, var
+from canopen_slave_rig import INCLINOMETER, NODE, RICH, U32, Rig, mux, var
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from emulators.canopen.dictionary import load_eds
 from emulators.canopen.node import CanopenNode, NmtState, NodeContext
@@ -143,6 +145,13 @@ def test_co_036_consumer_starts_with_the_first_heartbeat(rig: Rig) -> None:
     assert rig.send(0x70A, "7F") == ["085#0000000000000000"]
     assert rig.node.active_errors == ()
     assert len(times(rig.advance(400), "085#3081")) == 1, "monitoring goes on"
+
+
+def test_co_035_a_monitored_node_that_boots_is_watched_anew(rig: Rig) -> None:
+    rig.write(0x1016, 1, 0x0A << 16 | 100, 4)
+    rig.send(0x70A, "05")
+    rig.send(0x70A, "00")
+    assert rig.advance(1000) == [], "not missed while it starts"
 
 
 @pytest.mark.parametrize(("reaction", "state"), [(0, 127), (1, 5), (2, 4)])
@@ -407,6 +416,47 @@ def test_no_emcy_when_stopped_or_invalid(rig: Rig) -> None:
     rig.nmt(STOP)
     assert rig.node.raise_error(0x3100, rig.now_ns) == []
     assert rig.node.counters.emcys_dropped == 2
+
+
+def test_what_no_emcy_can_carry(rig: Rig) -> None:
+    for code, register, info in ((0x10000, 1, b""), (0, 1, b""), (0x1000, 256, b""), (0x1000, 1, bytes(6))):
+        with pytest.raises(UsageError, match="EMCY"):
+            rig.node.raise_error(code, rig.now_ns, register=register, info=info)
+
+
+# -- anything ------------------------------------------------------------------------------------------------------
+
+SOME_IDS = [0x000, 0x080, 0x185, 0x205, 0x305, 0x605, 0x705, 0x70A]
+SETTINGS = [0x1005, 0x1014, 0x1015, 0x1016, 0x1017, 0x1019, 0x1400, 0x1600, 0x1800, 0x1A00, 0x1801, 0x1A01]
+FRAMES = st.builds(
+    CanFrame,
+    st.sampled_from(SOME_IDS) | st.integers(0, 0x7FF),
+    st.binary(max_size=8) | st.builds(lambda command: bytes([command, 0]), st.sampled_from([1, 2, 128, 129, 130])),
+)
+WRITES = st.builds(
+    lambda index, sub, size, value: CanFrame(
+        0x600 + NODE, bytes([0x23 | (4 - size) << 2]) + mux(index, sub) + value.to_bytes(4, "little")
+    ),
+    st.sampled_from(SETTINGS),
+    st.integers(0, 6),
+    st.sampled_from([1, 2, 4]),
+    st.sampled_from([0, 1, 2, 254, 0x20000010, 0x20020010, 0x80000185, 0x185, 0xA0064]) | st.integers(0, 2**32 - 1),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.tuples(FRAMES | WRITES, st.integers(0, 300)), max_size=40))
+def test_any_frames_leave_a_node_that_obeys(traffic: list[tuple[CanFrame, int]]) -> None:
+    rig = Rig()
+    for frame, ms in traffic:
+        rig.node.feed(frame, rig.now_ns)
+        sent = len(rig.node.journal)
+        state = rig.node.state
+        rig.advance(ms)
+        assert state is NmtState.OPERATIONAL or len(rig.node.journal) == sent, "no TPDO outside OPERATIONAL"
+    assert "705#00" in rig.nmt(RESET_NODE)
+    assert rig.read(0x1017) == 0
+    assert rig.nmt(START) == ["185#00000000"]
 
 
 # -- the reference device -----------------------------------------------------------------------------------------

@@ -214,7 +214,7 @@ def test_co_031_store_and_restore(rig: Rig) -> None:
     rig.write(0x1017, 0, 250, 2)
     assert rig.write(0x1010, 1, load, 4) == "08000020"
     assert rig.write(0x1010, 3, save, 4) == ""
-    assert rig.read(0x1010, 1) == 1, "the signature is not read back"
+    assert rig.read(0x1010, 3) == 1, "the signature is not read back"
     rig.nmt(129)
     assert (rig.read(0x2006), rig.read(0x1017)) == (99, 0), "3 is the application's parameters only"
     assert rig.write(0x1011, 1, save, 4) == "08000020"

@@ -6,9 +6,7 @@ control channel; nothing in it is written for a screen.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import Connector
@@ -83,11 +81,10 @@ class Gateway:
             if isinstance(d, TransmitterDriver)
         ]
         sources = self._message_sources()
-        self._sources = sources
         self.exchange = ImageExchange(image, self.tags, sources)
         self.plc_alive = False
         self.plc_losses = 0
-        self.outputs_by_plc: Mapping[str, Any] = {}
+        self._stopping = False
 
     def _declare(self, driver: RegisterDriver | CanopenDriver) -> None:
         """Tags read again and again grow stale; those read once, at identification, do not."""
@@ -175,6 +172,8 @@ class Gateway:
 
     def _judge_plc(self, now_ns: int) -> None:
         """A PLC whose heartbeat stopped, or which says that it stopped, commands nothing any more."""
+        if self._stopping:
+            return
         x = self.exchange
         age_ms = x.plc_age_ms(now_ns)
         alive = age_ms <= self.config.plc_lost_ms and not x.plc_stopped
@@ -191,13 +190,18 @@ class Gateway:
         self.plc_alive = alive
 
     async def shut_down(self, timeout_s: float = 1.0) -> bool:
-        """While `run` still runs: safe outputs, nodes stopped. True when every output was confirmed in time."""
+        """While `run` still runs: safe outputs, nodes stopped, polls ended. True when every output was confirmed in time."""
+        if self._stopping:
+            return self.outputs.settled
         deadline_ns = self.clock.monotonic_ns() + int(timeout_s * NS_PER_S)
-        self.plc_alive = False
+        self._stopping = True
         self.outputs.make_safe("the gateway stops")
+        self.outputs.tick(self.clock.monotonic_ns())
         while not self.outputs.settled and self.clock.monotonic_ns() < deadline_ns:
             await self.clock.sleep_until_ns(self.clock.monotonic_ns() + 5 * NS_PER_MS)
         for bus in self.buses.values():
             if isinstance(bus, CanopenBus):
                 await bus.stop_nodes(timeout_s / 2)
+            else:
+                await bus.halt(timeout_s / 2)
         return self.outputs.settled

@@ -92,6 +92,8 @@ class ModbusBus:
         self._on_offline = on_offline
         self._jobs: deque[Job] = deque()
         self._wake = asyncio.Event()
+        self._idle = asyncio.Event()
+        self._halted = False
         self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
 
@@ -114,6 +116,17 @@ class ModbusBus:
     def totals(self) -> Counter[str]:
         """Counters over all connections so far: requests, replies, timeouts..."""
         return self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
+
+    async def halt(self, timeout_s: float) -> None:
+        """Send nothing more: return when the request under way has ended, or after `timeout_s` seconds."""
+        self._halted = True
+        self._wake.set()
+        if self._client is not None:
+            try:
+                async with asyncio.timeout(timeout_s):
+                    await self._idle.wait()
+            except TimeoutError:
+                pass  # a device that takes its time; the process ends all the same
 
     # -- running --------------------------------------------------------------------------------------------------------
 
@@ -166,6 +179,10 @@ class ModbusBus:
     async def _serve(self, backoff: Backoff) -> None:
         while True:
             self._wake.clear()
+            if self._halted:
+                self._idle.set()
+                await self._wake.wait()
+                continue
             if self._jobs:
                 await self._run_job(self._jobs.popleft())
                 continue

@@ -60,9 +60,9 @@ class ExchangeLog:
 
     def flush(self) -> int:
         """Write what is queued in one transaction; how many rows. Raises `Unreachable` when the disk refuses, keeping them."""
-        if not self._queue:
+        rows = [self._queue.popleft() for _ in range(len(self._queue))]
+        if not rows:
             return 0
-        rows = list(self._queue)
         try:
             with self._db:
                 self._db.execute("BEGIN")
@@ -71,9 +71,8 @@ class ExchangeLog:
                     [(self._run, *row) for row in rows],
                 )
         except sqlite3.OperationalError as e:
+            self._queue.extendleft(reversed(rows))
             raise Unreachable(f"cannot write the exchange log: {e}", where=str(self._path)) from e
-        for _ in rows:
-            self._queue.popleft()
         self.stored += len(rows)
         return len(rows)
 

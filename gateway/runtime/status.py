@@ -1,0 +1,110 @@
+"""A gateway's status as plain data, for the control channel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gateway.core.values import TagValue
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.canopen_bus import CanopenBus
+from gateway.runtime.gateway import Gateway
+
+
+def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
+    """Devices, buses, tags with quality and age, outputs, mailboxes and the PLC as the gateway sees it."""
+    return {
+        "devices": _devices(gateway),
+        "buses": {name: _bus(bus) for name, bus in gateway.buses.items()},
+        "tags": {name: tag_dict(gateway.tags.current(name, now_ns), now_ns) for name in gateway.tags.names},
+        "outputs": [
+            {"tag": o.tag, "wanted": o.wanted, "held": o.held, "by": o.by, "refused": o.refused is not None}
+            for o in gateway.outputs.outputs
+        ],
+        "writes": {
+            "allowed": gateway.outputs.allow_writes,
+            "done": gateway.outputs.writes,
+            "failed": gateway.outputs.failures,
+            "refused": gateway.outputs.refusals,
+            "repeated": gateway.outputs.rewrites,
+            "safe": gateway.outputs.safe_active,
+        },
+        "mailboxes": {
+            pump.driver.config.name: {
+                "received": pump.driver.received,
+                "sent": pump.driver.sent,
+                "taken": pump.driver.taken,
+                "waits": pump.driver.mailbox_waits,
+                "queued": len(pump.driver.consumer.queue),
+                "dropped": pump.driver.consumer.dropped + pump.inbox.dropped,
+                "commands_refused": pump.commands_refused,
+            }
+            for pump in gateway.pumps
+        },
+        "plc": {
+            "alive": gateway.plc_alive,
+            "age_ms": _finite(gateway.exchange.plc_age_ms(now_ns)),
+            "losses": gateway.plc_losses,
+            "stopped": gateway.exchange.plc_stopped,
+        },
+        "published": gateway.tags.published,
+        "logged": gateway.log.stored,
+        "log_dropped": gateway.log.dropped,
+    }
+
+
+def _devices(gateway: Gateway) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for bus in gateway.buses.values():
+        if isinstance(bus, CanopenBus):
+            for status in bus.nodes.values():
+                driver = status.driver
+                found[driver.config.name] = {
+                    "bus": bus.config.name,
+                    "address": driver.node,
+                    "online": status.online,
+                    "error": status.error,
+                    "identity_error": driver.identity_error,
+                    "boots": status.boots,
+                    "bring_ups": status.bring_ups,
+                    "emcys": status.emcys,
+                    "errors": driver.malformed_pdos,
+                }
+        else:
+            for state in bus.devices:
+                found[state.driver.config.name] = {
+                    "bus": bus.config.name,
+                    "address": state.driver.config.address,
+                    "online": state.online,
+                    "error": state.error,
+                    "identity_error": state.driver.identity_error,
+                    "polls": state.polls,
+                    "errors": state.poll_errors,
+                    "samples_missed": state.driver.samples_missed,
+                    "mailbox": isinstance(state.driver, TransmitterDriver),
+                }
+    return {name: found[name] for name in gateway.drivers}
+
+
+def _bus(bus: Any) -> dict[str, Any]:
+    return {
+        "endpoint": str(bus.config.endpoint),
+        "connected": bus.connected,
+        "opens": bus.opens,
+        "error": bus.error,
+        "counters": dict(bus.totals()),
+    }
+
+
+def tag_dict(value: TagValue, now_ns: int) -> dict[str, Any]:
+    """A tag for JSON: value, quality, reason, age in seconds (None when there never was a value)."""
+    plain = value.value.hex() if isinstance(value.value, bytes) else value.value
+    return {
+        "value": plain,
+        "quality": str(value.quality),
+        "reason": str(value.reason),
+        "age_s": _finite(value.age_s(now_ns)),
+    }
+
+
+def _finite(number: float) -> float | None:
+    return None if number == float("inf") else number

@@ -1,0 +1,153 @@
+"""The gateway's process: ``python -m twin.controller CONFIG.json``. The same for a plant and for its prototype.
+
+The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
+mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, stop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gateway.connections.os_connector import OsConnector
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import Connector
+from gateway.core.control import ControlServer
+from gateway.core.errors import FieldtwinError, Unreachable
+from gateway.core.nursery import Nursery
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.gateway import Gateway
+from gateway.runtime.status import describe
+from gateway.store.exchange_log import ExchangeLog
+from gateway.wallclock import WallClock
+from twin.child import end_with_parent
+from twin.mapping import MappedConnector, mapping_from_json
+from twin.physical import attached, gateway_config, image_layout
+from twin.system import load_system
+
+FLUSH_EVERY_NS = NS_PER_S // 2
+
+
+class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the process is told. `mapping` is None on a plant; `taps` is a file for what goes over the wires, or empty."""
+
+    system: str
+    run_dir: str
+    allow_writes: bool
+    mapping: dict[str, str] | None = None
+    profiles: tuple[str, ...] = ()
+    capture: str = ""
+
+
+class GatewayProcess:
+    """One gateway with its control channel, until told to stop."""
+
+    def __init__(self, config: ControllerConfig) -> None:
+        self._config = config
+        self._clock = WallClock()
+        self._stop = asyncio.Event()
+        self._store_error = ""
+
+    async def run(self) -> int:
+        run_dir = Path(self._config.run_dir)
+        system = load_system(self._config.system, [Path(p) for p in self._config.profiles])
+        connector: Connector = OsConnector()
+        if self._config.mapping is not None:
+            connector = MappedConnector(connector, mapping_from_json(self._config.mapping))
+        tap = None
+        if self._config.capture:
+            from gateway.connections.tap import TapFile, TappedConnector
+
+            tap = TapFile(Path(self._config.capture))
+            connector = TappedConnector(connector, [tap], self._clock)
+        audit = AuditLog(run_dir / "audit.jsonl", self._clock)
+        log = ExchangeLog(run_dir / "store.sqlite", system=system.name, prototype=self._config.mapping is not None)
+        try:
+            with attached(image_layout(system), run_dir / "image") as image:
+                config = gateway_config(system, allow_writes=self._config.allow_writes)
+                self._gateway = Gateway(config, connector, self._clock, image, audit, log)
+                await self._serve(run_dir / "gateway.sock")
+        finally:
+            log.close()
+            audit.close()
+            if tap is not None:
+                tap.close()
+        return 0
+
+    async def _serve(self, socket: Path) -> None:
+        server = ControlServer(
+            {"ready": self._ready, "get": self._get, "published": self._published, "stop": self._request_stop}
+        )
+        await server.listen_unix(socket)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._stop.set)
+        try:
+            async with Nursery() as nursery:
+                running = nursery.start(self._gateway.run(), "gateway")
+                nursery.start(self._flush(), "store")
+                stopping = asyncio.ensure_future(self._stop.wait())
+                try:
+                    await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    stopping.cancel()
+                if running.done():
+                    running.result()
+                await self._gateway.shut_down()
+        finally:
+            await server.aclose()
+            socket.unlink(missing_ok=True)
+
+    async def _flush(self) -> None:
+        """Store what was logged, twice a second. A disk that refuses is reported in the status and tried again."""
+        while True:
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + FLUSH_EVERY_NS)
+            try:
+                await asyncio.to_thread(self._gateway.log.flush)
+                self._store_error = ""
+            except Unreachable as e:
+                self._store_error = str(e)
+
+    async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"ready": True, "pid": os.getpid()}
+
+    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {**describe(self._gateway, self._clock.monotonic_ns()), "store_error": self._store_error}
+
+    async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
+        since = int(args.get("since", 0))
+        tags = self._gateway.tags
+        entries = [(p.number, p.tag, p.raw.hex(), p.t_ns, _plain(p.value)) for p in tags.journal_since(since)]
+        return {"entries": entries, "published": tags.published, "dropped": tags.journal_dropped}
+
+    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""
+        safe = await self._gateway.shut_down()
+        status = describe(self._gateway, self._clock.monotonic_ns())
+        asyncio.get_running_loop().call_later(0.05, self._stop.set)
+        return {"safe": safe, "status": status}
+
+
+def _plain(value: object) -> object:
+    return value.hex() if isinstance(value, bytes) else value
+
+
+def main(argv: list[str]) -> int:
+    """Run the process; errors go to stderr as one line."""
+    end_with_parent()
+    try:
+        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=ControllerConfig)
+        return asyncio.run(GatewayProcess(config).run())
+    except FieldtwinError as e:
+        print(f"fieldtwin gateway: {e}", file=sys.stderr)
+        return e.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,276 @@
+"""The field side: the emulators of a prototype, on real wires, in one process.
+
+For each emulated bus one listener (a pty, a TCP socket, a software CAN bus or a kernel CAN interface) with every device of
+that bus behind it. Here the paper's emulators meet the system file; what gateway and PLC do is not known here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from emulators.canopen.codec import encode as encode_object
+from emulators.canopen.dictionary import load_eds
+from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.canopen.serve import serve_node
+from emulators.context import WhenUsedUp
+from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.can_end import open_can_end
+from emulators.endpoints.pty import PtyEnd
+from emulators.endpoints.socket_end import OnClient, SocketListener
+from emulators.journal import HeldJournal
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.rtu import RtuSlave
+from emulators.modbus.serve import serve_mbap, serve_rtu
+from emulators.modbus.unit import ModbusUnit, UnitLimits
+from emulators.models.mailbox_modem import ModemPair
+from emulators.models.played_objects import PlayedObjects
+from emulators.models.sampled_sensor import SampledSensor
+from emulators.signals import SignalPlayer, SignalTrack
+from gateway.core.clock import Clock
+from gateway.core.connection import ByteConnection, CanConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FileInvalid
+from gateway.core.nursery import Nursery
+from gateway.core.profile import DeviceProfile
+from gateway.devices.config import DeviceConfig
+from twin.prototype_file import EmulatedBus, EmulatedDevice, Prototype
+from twin.system import System
+
+
+class FieldDevice:
+    """An emulated device as the field side knows it: its counters and what it held."""
+
+    def __init__(self, emulated: EmulatedDevice, unit: ModbusUnit | None, node: CanopenNode | None) -> None:
+        self.emulated = emulated
+        self.unit = unit
+        self.node = node
+        self.journal: HeldJournal = HeldJournal()
+
+    @property
+    def command_list(self) -> frozenset[str]:
+        """What this device accepts, by its own profile."""
+        return self.emulated.profile.command_list
+
+    def counters(self) -> dict[str, int]:
+        """Requests taken and replies sent, as the device counts them."""
+        if self.node is not None:
+            return dict(
+                self.node.counters.as_dict(),
+                requests=self.node.counters.sdo_requests,
+                replies=self.node.counters.sdo_replies,
+            )
+        assert self.unit is not None
+        c = self.unit.counters
+        return {"requests": c.requests, "replies": c.replies, "exceptions": c.exceptions, "broadcasts": c.broadcasts}
+
+
+class FieldSide:
+    """Builds every emulator of a prototype and runs them on their wires.
+
+    `run_dir` is where virtual serial ports get their links. After `open`, `listening` says where each emulated bus really
+    listens (free ports taken), and `far` where the far modems do.
+    """
+
+    def __init__(self, system: System, prototype: Prototype, run_dir: Path, clock: Clock) -> None:
+        self.system = system
+        self.prototype = prototype
+        self.devices: dict[str, FieldDevice] = {}
+        self.listening: dict[str, Endpoint] = {}
+        self.far: dict[str, Endpoint] = {}
+        self.far_units: dict[str, ModbusUnit] = {}
+        self._run_dir = run_dir
+        self._clock = clock
+        self._nursery = Nursery()
+        self._listeners: list[SocketListener | SoftBusServer] = []
+        self._connections: list[ByteConnection | CanConnection] = []
+        self._pairs: dict[str, ModemPair] = {}
+
+    async def open(self) -> None:
+        """Build and start listening. Raises `EndpointBusy`, `Unreachable` or `FileInvalid`; then nothing stays open."""
+        try:
+            for bus in self.prototype.buses.values():
+                if bus.listen is not None:
+                    await self._open_bus(bus, bus.listen)
+        except BaseException:
+            await self.aclose()
+            raise
+
+    async def run(self) -> None:
+        """Serve until cancelled; raises what an emulator raises."""
+        try:
+            await self._nursery.wait()
+        finally:
+            await self.aclose()
+
+    async def aclose(self) -> None:
+        """Stop every emulator and close every wire."""
+        await self._nursery.__aexit__(None, None, None)
+        for listener in self._listeners:
+            await listener.aclose()
+        for connection in self._connections:
+            await connection.aclose()
+        self._listeners.clear()
+        self._connections.clear()
+
+    # -- wires ----------------------------------------------------------------------------------------------------------
+
+    async def _open_bus(self, bus: EmulatedBus, listen: Endpoint) -> None:
+        on_it = [d for d in self.system.devices_on(bus.name) if d.name in self.prototype.devices]
+        if listen.is_can:
+            await self._open_can(bus, listen, on_it)
+            return
+        units = {d.address: self._modbus_unit(d) for d in on_it}
+        latency_s = max((self.prototype.devices[d.name].form.latency_ms for d in on_it), default=0.0) / 1000
+        plant = self.system.buses[bus.name].endpoint
+        if listen.scheme == "pty":
+            pace = plant.serial if bus.pace else None
+            end = await PtyEnd.open(self._run_dir / listen.path, plant, pace)
+            self._connections.append(end)
+            self.listening[bus.name] = Endpoint("pty", path=str(end.link))
+            self._nursery.start(serve_rtu(end, RtuSlave(units), self._clock, latency_s), f"emulators on {bus.name}")
+        elif plant.is_serial:
+            line = RtuSlave(units)
+            self.listening[bus.name] = await self._listen(
+                listen, lambda c: serve_rtu(c, line, self._clock, latency_s), 1
+            )
+        else:
+            self.listening[bus.name] = await self._listen(
+                listen, lambda c: serve_mbap(c, MbapSlave(units), self._clock, latency_s)
+            )
+        for device in on_it:
+            await self._open_far(device, latency_s)
+
+    async def _listen(self, endpoint: Endpoint, on_client: OnClient, max_clients: int = 32) -> Endpoint:
+        listener = await SocketListener.open(endpoint, on_client, max_clients)
+        self._listeners.append(listener)
+        return listener.bound
+
+    async def _open_far(self, device: DeviceConfig, latency_s: float) -> None:
+        """The far modem of a transmitter, on a socket of its own."""
+        pair, form = self._pairs.get(device.name), self.prototype.devices[device.name].form
+        if pair is None or form.far is None:
+            return
+        unit = ModbusUnit(pair.far, _limits(self.prototype.devices[device.name].profile), name=f"{device.name} (far)")
+        self.far_units[device.name] = unit
+        self.far[device.name] = await self._listen(
+            Endpoint.parse(form.far), lambda c: serve_mbap(c, MbapSlave({device.address: unit}), self._clock, latency_s)
+        )
+
+    async def _open_can(self, bus: EmulatedBus, listen: Endpoint, on_it: list[DeviceConfig]) -> None:
+        bitrate = self.system.buses[bus.name].bitrate
+        nodes = [self._canopen_node(d) for d in on_it]
+        if listen.interface == "fieldtwin":
+            server = await SoftBusServer.open(listen, bitrate, paced=bus.pace)
+            self._listeners.append(server)
+            self.listening[bus.name] = server.bound
+            connections = [server.attach(d.name) for d in on_it]
+        else:
+            connections = [await open_can_end(listen, bitrate) for _ in on_it]
+            self.listening[bus.name] = listen
+        self._connections.extend(connections)
+        for device, node, connection in zip(on_it, nodes, connections, strict=True):
+            self._nursery.start(serve_node(connection, node, self._clock), f"node {device.name}")
+
+    # -- devices --------------------------------------------------------------------------------------------------------
+
+    def _modbus_unit(self, config: DeviceConfig) -> ModbusUnit:
+        emulated = self.prototype.devices[config.name]
+        if emulated.form.model == "mailbox":
+            link = emulated.form.far_link
+            pair = ModemPair(
+                emulated.profile,
+                bytes_per_s=link.bytes_per_s,
+                latency_s=link.latency_ms / 1000,
+                loss=link.loss,
+                seed=self.prototype.seed,
+            )
+            self._pairs[config.name] = pair
+            unit = ModbusUnit(pair.near, _limits(emulated.profile), name=config.name)
+            self.devices[config.name] = FieldDevice(emulated, unit, None)
+            return unit
+        bank = SampledSensor(emulated.profile, self._player(emulated), emulated.form.identity)
+        unit = ModbusUnit(bank, _limits(emulated.profile), name=config.name)
+        device = self.devices[config.name] = FieldDevice(emulated, unit, None)
+        device.journal = bank.journal
+        return unit
+
+    def _canopen_node(self, config: DeviceConfig) -> CanopenNode:
+        emulated = self.prototype.devices[config.name]
+        eds = emulated.profile.eds_path
+        assert eds is not None
+        dictionary = load_eds(eds)
+        played = PlayedObjects(emulated.profile.tags.values(), dictionary, self._player(emulated))
+        factory: dict[tuple[int, int], bytes] = {}
+        for name, text in emulated.form.identity.items():
+            tag = emulated.profile.tags[name]
+            assert tag.object is not None
+            entry = dictionary.entry(*tag.object)
+            if entry is None or not text.lstrip("-").isdigit():
+                raise FileInvalid(
+                    f"identity {name!r} of {config.name!r}", path=str(self.prototype.path), expected="a number"
+                )
+            raw = factory[tag.object] = encode_object(entry.data_type, int(text))
+            played.journal.note(name, raw, self._clock.monotonic_ns())
+        node = CanopenNode(dictionary, config.address, NodeContext(source=played, factory=factory))
+        device = self.devices[config.name] = FieldDevice(emulated, None, node)
+        device.journal = played.journal
+        return node
+
+    def _player(self, emulated: EmulatedDevice) -> SignalPlayer:
+        assert emulated.recording is not None
+        form = emulated.form
+        return SignalPlayer(
+            SignalTrack.load(emulated.recording),
+            self._clock.monotonic_ns(),
+            speed=form.speed,
+            at_end=WhenUsedUp.parse(form.at_end),
+        )
+
+    # -- what others see ------------------------------------------------------------------------------------------------
+
+    def status(self) -> dict[str, Any]:
+        """Counters by device, for the control channel."""
+        return {
+            "system": self.system.name,
+            "system_hash": self.system.hash,
+            "devices": {
+                name: {
+                    "profile": d.emulated.profile.name,
+                    "recording": str(d.emulated.recording or d.emulated.form.model),
+                    "commands": sorted(d.command_list),
+                    "counters": d.counters(),
+                    "held": d.journal.number,
+                    "held_dropped": d.journal.dropped,
+                }
+                for name, d in self.devices.items()
+            },
+            "listening": {bus: str(endpoint) for bus, endpoint in self.listening.items()},
+            "far": {device: str(endpoint) for device, endpoint in self.far.items()},
+            "links": {
+                name: {
+                    "sent": p.up.sent + p.down.sent,
+                    "resent": p.up.resent + p.down.resent,
+                    "delivered": p.up.delivered + p.down.delivered,
+                }
+                for name, p in self._pairs.items()
+            },
+            "buses": {
+                str(listener.bound): listener.bus_stats()
+                for listener in self._listeners
+                if isinstance(listener, SoftBusServer)
+            },
+        }
+
+    def held_since(self, numbers: dict[str, int]) -> dict[str, list[tuple[int, str, str, int]]]:
+        """What each device held after the given journal numbers: (number, tag, hex, monotonic ns)."""
+        return {
+            name: [(h.number, h.tag, h.raw.hex(), h.t_ns) for h in d.journal.since(numbers.get(name, 0))]
+            for name, d in self.devices.items()
+        }
+
+
+def _limits(profile: DeviceProfile) -> UnitLimits:
+    limits = profile.form.limits
+    functions = frozenset(limits.functions) if limits.functions is not None else UnitLimits().functions
+    return UnitLimits(functions=functions, read_registers=limits.read_registers, even_only=limits.even_only)

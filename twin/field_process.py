@@ -1,0 +1,149 @@
+"""The field side's process: ``python -m twin.field_process CONFIG.json``, or inside `fieldtwin emulate SYSTEM`.
+
+Control verbs: ready, get (listening endpoints, counters), held (what the devices really held), stop. On a Unix socket in the
+run directory, and on TCP where asked for, so that a controller elsewhere learns where each plant endpoint's emulator listens.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gateway.core.control import ControlServer
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FieldtwinError, UsageError
+from gateway.core.nursery import Nursery
+from gateway.wallclock import WallClock
+from twin.child import end_with_parent
+from twin.field import FieldSide
+from twin.physical import check_commands
+from twin.prototype_file import Prototype, load_prototype
+from twin.system import System, load_system
+
+
+class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the process is told. `recordings` maps a device to a file, `listen` a bus to an endpoint, over the prototype
+    file; `control` is ``HOST:PORT`` for a TCP control channel, or empty."""
+
+    system: str
+    run_dir: str
+    prototype: str = ""
+    profiles: tuple[str, ...] = ()
+    recordings: dict[str, str] = {}
+    speed: float = 0.0
+    listen: dict[str, str] = {}
+    control: str = ""
+    token: str = ""
+
+
+def resolve(config: FieldConfig) -> tuple[System, Prototype]:
+    """Read system and prototype file and apply what the command line says. Checks the command lists of both sides."""
+    system = load_system(config.system, [Path(p) for p in config.profiles])
+    prototype = load_prototype(system, Path(config.prototype) if config.prototype else None)
+    for device, path in config.recordings.items():
+        if device not in prototype.devices:
+            raise UsageError(f"no emulated device {device!r}", expected=", ".join(prototype.devices))
+        prototype = prototype.with_recording(device, Path(path))
+    if config.speed:
+        prototype = prototype.with_speed(config.speed)
+    for bus, url in config.listen.items():
+        if bus not in prototype.buses:
+            raise UsageError(f"no bus {bus!r}", expected=", ".join(prototype.buses))
+        prototype = prototype.with_listen(bus, Endpoint.parse(url))
+    check_command_lists(system, prototype)
+    return system, prototype
+
+
+def check_command_lists(system: System, prototype: Prototype) -> None:
+    """SPEC row EmulatedCommunication, ruling 12: driver and emulator accept the same commands, or nothing starts."""
+    from gateway.runtime.gateway import make_driver
+    from gateway.runtime.tags import TagTable
+
+    clock = WallClock()
+    for name, emulated in prototype.devices.items():
+        device = system.devices[name]
+        driver = make_driver(device, system.buses[device.bus], TagTable(clock), clock)
+        check_commands(driver, emulated.profile)
+
+
+class FieldProcess:
+    """One field side with its control channel, until told to stop."""
+
+    def __init__(self, config: FieldConfig) -> None:
+        self._config = config
+        self._stop = asyncio.Event()
+        self.control_port = 0
+
+    async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
+        """Open, call `on_ready`, serve until stopped."""
+        system, prototype = resolve(self._config)
+        run_dir = Path(self._config.run_dir)
+        self._field = FieldSide(system, prototype, run_dir, WallClock())
+        await self._field.open()
+        server = ControlServer(
+            {"ready": self._ready, "get": self._get, "held": self._held, "stop": self._request_stop},
+            token=self._config.token,
+        )
+        socket = run_dir / "field.sock"
+        try:
+            await server.listen_unix(socket)
+            if self._config.control:
+                host, _, port = self._config.control.rpartition(":")
+                if not port.isdigit():
+                    raise UsageError("the control channel's address", expected="HOST:PORT", got=self._config.control)
+                self.control_port = await server.listen_tcp(host or "127.0.0.1", int(port))
+            loop = asyncio.get_running_loop()
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, self._stop.set)
+            if on_ready is not None:
+                on_ready(self._field)
+            await self._serve()
+        finally:
+            await server.aclose()
+            socket.unlink(missing_ok=True)
+            await self._field.aclose()
+        return 0
+
+    async def _serve(self) -> None:
+        async with Nursery() as nursery:
+            running = nursery.start(self._field.run(), "field side")
+            stopping = nursery.start(self._stop.wait(), "until stopped")
+            await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
+            if running.done():
+                running.result()
+
+    async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"ready": True, "pid": os.getpid()}
+
+    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+        return self._field.status()
+
+    async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
+        since = {str(name): int(number) for name, number in (args.get("since") or {}).items()}
+        return self._field.held_since(since)
+
+    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+        asyncio.get_running_loop().call_later(0.05, self._stop.set)
+        return self._field.status()
+
+
+def main(argv: list[str]) -> int:
+    """Run the process; errors go to stderr as one line."""
+    end_with_parent()
+    try:
+        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=FieldConfig)
+        return asyncio.run(FieldProcess(config).run())
+    except FieldtwinError as e:
+        print(f"fieldtwin field side: {e}", file=sys.stderr)
+        return e.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,70 @@
+"""An instance: one running system on this host, with a run directory of its own (DESIGN.md, "Instances").
+
+Sockets, virtual serial ports, process image, logs and store live there; only its owner may enter. Two instances of one system
+run side by side; one name runs once.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from gateway.core.errors import EndpointBusy, Unreachable, UsageError
+
+SOCKET_PATH_MAX = 100
+"""A Unix socket's path is at most 107 bytes (sockaddr_un); our longest file name takes some of it."""
+
+
+def runtime_root() -> Path:
+    """Where run directories are made: FIELDTWIN_RUN, else the user's runtime folder, else a folder of theirs in /tmp."""
+    if chosen := os.environ.get("FIELDTWIN_RUN"):
+        return Path(chosen)
+    if base := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(base) / "fieldtwin"
+    return Path("/tmp") / f"fieldtwin-{os.getuid()}"
+
+
+class Instance:
+    """``with Instance("observatory") as instance``: the directory is ours until the end. Raises `EndpointBusy`."""
+
+    def __init__(self, name: str, root: Path | None = None) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,39}", name):
+            raise UsageError("an instance name", expected="1 to 40 letters, digits, . _ -", got=repr(name))
+        self.name = name
+        self.dir = (root or runtime_root()) / name
+        self._lock: TextIO | None = None
+        if len(str(self.dir)) > SOCKET_PATH_MAX - 12:
+            raise UsageError(
+                "the run directory's path is too long for sockets", got=str(self.dir), hint="set FIELDTWIN_RUN"
+            )
+
+    def __enter__(self) -> Instance:
+        try:
+            self.dir.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self.dir.mkdir(exist_ok=True, mode=0o700)
+            if self.dir.stat().st_uid != os.getuid():
+                raise Unreachable("the run directory belongs to somebody else", where=str(self.dir))
+            self._lock = (self.dir / "lock").open("w", encoding="utf-8")
+        except OSError as e:
+            raise Unreachable(f"cannot make the run directory: {e.strerror}", where=str(self.dir)) from e
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as e:
+            self._lock.close()
+            raise EndpointBusy(
+                f"the instance {self.name!r} is running already", where=str(self.dir), hint="choose another --instance"
+            ) from e
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def path(self, name: str) -> Path:
+        """A file of this instance."""
+        return self.dir / name

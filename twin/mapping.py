@@ -1,0 +1,52 @@
+"""Where the prototype differs from the plant: an endpoint is opened elsewhere. Applied below every driver.
+
+Emulators are unknown here: this is a Connector around a Connector (DESIGN.md, "Who opens a wire").
+"""
+
+from __future__ import annotations
+
+from gateway.core.connection import ByteConnection, CanConnection, Connector
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+
+
+class MappedConnector:
+    """Opens `mapping[plant endpoint]` instead of the plant endpoint. One that is not mapped is refused, never opened."""
+
+    def __init__(self, inner: Connector, mapping: dict[Endpoint, Endpoint]) -> None:
+        self._inner = inner
+        self._mapping = mapping
+
+    def _target(self, endpoint: Endpoint) -> Endpoint:
+        target = self._mapping.get(endpoint)
+        if target is None:
+            raise UsageError(
+                "a prototype may not open a plant endpoint that is not mapped",
+                where=str(endpoint),
+                hint="map the bus in the prototype file, or say `plant` there",
+            )
+        return target
+
+    async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
+        return await self._inner.open_bytes(self._target(endpoint))
+
+    async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
+        return await self._inner.open_can(self._target(endpoint), bitrate)
+
+
+def mapped_endpoint(plant: Endpoint, listening: Endpoint) -> Endpoint:
+    """What the controller opens for `plant` when its emulator listens on `listening`: a pty is opened as the serial
+    port that it stands for, with the plant's baud rate and frame."""
+    if listening.scheme == "pty":
+        return plant.with_path(listening.path)
+    if plant.is_serial:
+        raise UsageError("a serial line behind TCP needs a link to become a port", where=str(listening))
+    return plant.with_address(listening.host, listening.port) if not plant.is_can else listening
+
+
+def mapping_to_json(mapping: dict[Endpoint, Endpoint]) -> dict[str, str]:
+    return {str(plant): str(target) for plant, target in mapping.items()}
+
+
+def mapping_from_json(text: dict[str, str]) -> dict[Endpoint, Endpoint]:
+    return {Endpoint.parse(plant): Endpoint.parse(target) for plant, target in text.items()}

@@ -1,0 +1,154 @@
+"""The prototype file: what is emulated, with what, and where. Read by the field side and by whoever starts it; never by
+the plant, and never by gateway or PLC."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.profile import DeviceProfile, load_profile
+from gateway.core.yaml_file import YamlFile, load, validate
+from twin.data_files import find, find_recording
+from twin.system import System
+from twin.system_schema import EmulatedForm, PrototypeForm
+
+
+@dataclass(frozen=True)
+class EmulatedBus:
+    """Where the emulators of a bus listen; None: this bus is the plant's own."""
+
+    name: str
+    listen: Endpoint | None
+    pace: bool
+
+
+@dataclass(frozen=True)
+class EmulatedDevice:
+    """What stands in for a device: its own profile, and a recording or a model."""
+
+    name: str
+    profile: DeviceProfile
+    form: EmulatedForm
+    recording: Path | None
+
+
+@dataclass(frozen=True)
+class Prototype:
+    """A prototype file, resolved against its system."""
+
+    path: Path
+    seed: int
+    buses: dict[str, EmulatedBus]
+    devices: dict[str, EmulatedDevice]
+    file: YamlFile
+
+    def with_listen(self, bus: str, listen: Endpoint) -> Prototype:
+        """The same, with the emulators of `bus` listening elsewhere."""
+        return replace(self, buses={**self.buses, bus: replace(self.buses[bus], listen=listen)})
+
+    def with_recording(self, device: str, path: Path, speed: float | None = None) -> Prototype:
+        """The same, with `device` playing another recording."""
+        old = self.devices[device]
+        form = old.form.model_copy(update={"recording": str(path), **({"speed": speed} if speed else {})})
+        return replace(self, devices={**self.devices, device: replace(old, form=form, recording=path)})
+
+    def with_speed(self, speed: float) -> Prototype:
+        """The same, with every recording played `speed` times as fast."""
+        devices = {
+            n: replace(d, form=d.form.model_copy(update={"speed": speed})) if d.recording else d
+            for n, d in self.devices.items()
+        }
+        return replace(self, devices=devices)
+
+
+def prototype_path(system: System) -> Path:
+    """Where a system's prototype file is by default: beside it, ``NAME.prototype.yaml``."""
+    return system.path.with_name(f"{system.path.stem}.prototype.yaml")
+
+
+def load_prototype(system: System, path: Path | None = None) -> Prototype:
+    """Read the prototype file of `system`. Raises `FileInvalid` or `UsageError`."""
+    path = path or prototype_path(system)
+    file = load(path)
+    form = validate(file, PrototypeForm)
+    if Path(form.prototype_of).name != system.path.name:
+        raise file.error(
+            ("prototype_of",), "this is another system's prototype", expected=system.path.name, got=form.prototype_of
+        )
+    for name in form.buses:
+        if name not in system.buses:
+            raise file.error(("buses", name), f"the system has no bus {name!r}", expected=", ".join(system.buses))
+    for name in form.devices:
+        if name not in system.devices:
+            raise file.error(
+                ("devices", name), f"the system has no device {name!r}", expected=", ".join(system.devices)
+            )
+    buses = {name: _bus(file, system, form, name) for name in system.buses}
+    devices = {
+        name: _device(file, system, name, form.devices[name])
+        for name in system.devices
+        if name in form.devices and buses[system.devices[name].bus].listen is not None
+    }
+    missing = [n for n, d in system.devices.items() if buses[d.bus].listen is not None and n not in devices]
+    if missing:
+        raise file.error(("devices",), f"nothing stands in for {', '.join(missing)}", expected="an entry each")
+    return Prototype(path, form.seed, buses, devices, file)
+
+
+def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> EmulatedBus:
+    entry = form.buses.get(name)
+    if entry is None:
+        raise file.error(
+            ("buses",), f"the bus {name!r} is not mapped", expected=f"`{name}: {{listen: ...}}`, or `{name}: plant`"
+        )
+    if entry == "plant":
+        return EmulatedBus(name, None, False)
+    assert not isinstance(entry, str)
+    try:
+        listen = Endpoint.parse(entry.listen)
+    except UsageError as e:
+        raise file.error(("buses", name, "listen"), e.message, expected=e.expected, got=e.got) from e
+    plant = system.buses[name].endpoint
+    kinds = ("can",) if plant.is_can else ("pty", "tcp") if plant.is_serial else ("tcp",)
+    if listen.scheme not in kinds:
+        raise file.error(
+            ("buses", name, "listen"),
+            f"nothing that stands in for {plant}",
+            expected=" or ".join(kinds),
+            got=listen.scheme,
+        )
+    return EmulatedBus(name, listen, entry.pace)
+
+
+def _device(file: YamlFile, system: System, name: str, form: EmulatedForm) -> EmulatedDevice:
+    config = system.devices[name]
+    loc = ("devices", name)
+    profile = config.profile
+    if form.profile is not None:
+        try:
+            profile = load_profile(find("devices", form.profile, beside=file_path(file)))
+        except UsageError as e:
+            raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
+    if (form.recording is None) == (form.model is None):
+        raise file.error(loc, f"what stands in for {name!r}", expected="either `recording: FILE` or `model: NAME`")
+    if form.model == "mailbox" and (profile.inbox is None or form.far is None):
+        raise file.error(
+            loc, f"the mailbox model for {name!r}", expected="a profile with a mailbox, and `far: ENDPOINT`"
+        )
+    recording = None
+    if form.recording is not None:
+        try:
+            recording = find_recording(form.recording, beside=file_path(file))
+        except UsageError as e:
+            raise file.error((*loc, "recording"), e.message, expected=e.expected) from e
+    for tag in form.identity:
+        if tag not in profile.tags:
+            raise FileInvalid(f"{profile.name} has no tag {tag!r}", path=file.path, expected=", ".join(profile.tags))
+    return EmulatedDevice(name, profile, form, recording)
+
+
+def file_path(file: YamlFile) -> Path:
+    """The path that a parsed file came from."""
+    return Path(file.path)

@@ -20,6 +20,13 @@ from gateway.core.endpoint import Endpoint, SerialSettings
 from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
 READ_SIZE = 4096
+SETTLE_CHECK_S = 0.1
+_IDLE_FLAGS = termios.ECHOE | termios.ECHOK | termios.ECHONL
+"""Mean something in canonical mode only, and every program that makes a port raw clears one of them at least.
+
+A pty clears parity, and Debian's tcsetattr (glibc 2.36) then fails with EINVAL if nothing else changed either: a port that
+remembers the last program's settings could be opened with 8E1 once and not again. These flags always change.
+"""
 FIFO_CHARS = 16
 """A paced reply appears in pieces of this size, as out of a UART's FIFO: a timer a character would cost more."""
 
@@ -43,6 +50,7 @@ class PtyEnd(ByteConnection):
         self._writing = asyncio.Lock()
         self._room: asyncio.Future[None] | None = None
         self._reading = False
+        self._settle_check: asyncio.TimerHandle | None = None
 
     @classmethod
     async def open(cls, link: Path, endpoint: Endpoint, pace: SerialSettings | None = None) -> PtyEnd:
@@ -59,11 +67,16 @@ class PtyEnd(ByteConnection):
             _make_raw(spare, pace)
             end = cls(link, endpoint, pace, master, spare)
             _replace_link(link, end.device, endpoint)
+        except termios.error as e:
+            os.close(master)
+            os.close(spare)
+            raise Unreachable(f"the pty cannot be made raw: {e}", where=str(endpoint)) from e
         except BaseException:
             os.close(master)
             os.close(spare)
             raise
         end._resume_reading()
+        end._unsettle()
         return end
 
     async def write(self, data: bytes) -> None:
@@ -115,11 +128,17 @@ class PtyEnd(ByteConnection):
         except OSError as e:
             self._fail(e)
             return
+        _raise_idle_flags(self._spare)
         if self._inward is not None:
             self._inward.send(self._now_ns(), len(data))
         if not self.feed(data):
             self._reading = False
             self._loop.remove_reader(self._master)
+
+    def _unsettle(self) -> None:
+        """Keep the port open to the next program, whatever the last one set."""
+        _raise_idle_flags(self._spare)
+        self._settle_check = self._loop.call_later(SETTLE_CHECK_S, self._unsettle)
 
     async def _hand_over(self, data: bytes) -> None:
         while data:
@@ -156,6 +175,8 @@ class PtyEnd(ByteConnection):
     def _close(self) -> None:
         if self._master < 0:
             return
+        if self._settle_check is not None:
+            self._settle_check.cancel()
         self._loop.remove_reader(self._master)
         self._loop.remove_writer(self._master)
         self._on_writable()
@@ -177,6 +198,13 @@ def _make_raw(descriptor: int, pace: SerialSettings | None) -> None:
     control[termios.VMIN], control[termios.VTIME] = 1, 0
     cflag = termios.CS8 | termios.CREAD | termios.CLOCAL
     termios.tcsetattr(descriptor, termios.TCSANOW, [0, 0, cflag, 0, speed, speed, control])
+
+
+def _raise_idle_flags(descriptor: int) -> None:
+    settings = termios.tcgetattr(descriptor)
+    if settings[3] & _IDLE_FLAGS != _IDLE_FLAGS:
+        settings[3] |= _IDLE_FLAGS
+        termios.tcsetattr(descriptor, termios.TCSANOW, settings)
 
 
 def _replace_link(link: Path, device: str, endpoint: Endpoint) -> None:

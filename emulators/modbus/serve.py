@@ -79,10 +79,11 @@ async def _reply(
     latency_s: float,
     on_frame: OnFrame | None,
 ) -> None:
+    if on_frame is not None:
+        for exchange in exchanges:  # all of them came before any is answered
+            on_frame(Direction.SENT, now_ns, exchange.heard)
     due_ns = now_ns
     for exchange in exchanges:
-        if on_frame is not None:
-            on_frame(Direction.SENT, now_ns, exchange.heard)
         if not exchange.reply:
             continue
         if latency_s > 0:

@@ -26,7 +26,7 @@ def make_bank() -> MapBank:
         ]
     )
     # AP 6.1: coils 20 to 38 are CD 6B 05
-    bank.poke("coil", 19, *[0xCD6B05 >> shift & 1 for shift in (*range(16, 24), *range(8, 16), *range(0, 2))])
+    bank.poke("coil", 19, *[0xCD6B05 >> shift & 1 for shift in (*range(16, 24), *range(8, 16), *range(2))])
     bank.poke("holding", 107, 555, 0, 100)  # AP 6.3
     bank.poke("holding", 4, 0x12)  # AP 6.16
     bank.poke("input", 0, 0x4120, 0x0000)
@@ -170,9 +170,10 @@ def test_mb_041_a_veto_of_the_device_changes_nothing() -> None:
     def veto(table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
         seen.append((table, address, values, now_ns))
         if 99 in values:
-            raise refusal
+            raise refusing[-1]
 
     seen: list[object] = []
+    refusing: list[Refusal] = []
     bank = MapBank([Span("holding", 0, 4)], on_write=veto)
     unit = ModbusUnit(bank)
     for refusal, code in (
@@ -181,6 +182,7 @@ def test_mb_041_a_veto_of_the_device_changes_nothing() -> None:
         (Acknowledge("slow"), 5),
         (Refusal("broken"), 4),
     ):
+        refusing.append(refusal)
         assert unit.respond(bytes.fromhex("10 0000 0002 04 0001 0063"), 77) == bytes((0x90, code))
         assert [bank.peek("holding", a) for a in range(4)] == [0, 0, 0, 0]
     assert unit.respond(bytes.fromhex("10 0002 0001 02 0005"), 78) == bytes.fromhex("10 0002 0001")

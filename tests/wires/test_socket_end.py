@@ -1,0 +1,235 @@
+"""The listening side of TCP, with real sockets: limits, half-open and half-closed clients, and Modbus over it."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import struct
+
+import pytest
+from support import eventually, run
+
+from emulators.endpoints.socket_end import SocketListener
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.serve import serve_mbap
+from emulators.modbus.unit import ModbusUnit
+from gateway.core.connection import ByteConnection, Direction
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from gateway.wallclock import WallClock
+
+ANY_PORT = Endpoint.parse("tcp://127.0.0.1:0")
+READ = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
+REPLY = bytes.fromhex("0001 0000 0005 01 03 02 0007")
+
+
+async def echo(connection: ByteConnection) -> None:
+    while True:
+        await connection.write(await connection.read())
+
+
+async def connect(listener: SocketListener) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    return await asyncio.open_connection(*listener.bound.address)
+
+
+async def hang_up(writer: asyncio.StreamWriter) -> None:
+    writer.close()
+    try:
+        await writer.wait_closed()
+    except OSError:
+        pass
+
+
+def test_port_0_takes_a_free_one_and_says_which() -> None:
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, echo)
+        assert listener.bound.port > 0
+        assert str(listener.bound).startswith("tcp://127.0.0.1:")
+        reader, writer = await connect(listener)
+        writer.write(b"hello")
+        assert await reader.readexactly(5) == b"hello"
+        assert listener.clients[0].peer == "{}:{}".format(*writer.get_extra_info("sockname"))
+        await hang_up(writer)
+        await eventually(lambda: not listener.clients)
+        await listener.aclose()
+        await listener.aclose()
+
+    run(main())
+
+
+def test_a_port_in_use_is_named() -> None:
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, echo)
+        with pytest.raises(EndpointBusy, match=f"tcp://127.0.0.1:{listener.bound.port}: the port is in use"):
+            await SocketListener.open(listener.bound, echo)
+        with pytest.raises(Unreachable, match="cannot listen"):
+            await SocketListener.open(Endpoint.parse("tcp://192.0.2.1:0"), echo)
+        await listener.aclose()
+
+    run(main())
+
+
+def test_mb_065_the_oldest_unused_client_gives_way() -> None:
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, echo, max_clients=2)
+        first, second = await connect(listener), await connect(listener)
+        for reader, writer in (second, first):  # the second connected last and was used first
+            writer.write(b"x")
+            assert await reader.readexactly(1) == b"x"
+        third = await connect(listener)
+        assert await second[0].read() == b""
+        for reader, writer in (first, third):
+            writer.write(b"y")
+            assert await reader.readexactly(1) == b"y"
+        assert (listener.accepted, listener.evicted) == (3, 1)
+        for _, writer in (first, second, third):
+            await hang_up(writer)
+        await listener.aclose()
+
+    run(main())
+
+
+def test_a_client_that_only_stopped_sending_gets_its_answer() -> None:
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, echo)
+        reader, writer = await connect(listener)
+        writer.write(b"last words")
+        writer.write_eof()
+        assert await reader.read() == b"last words"
+        await hang_up(writer)
+        await listener.aclose()
+
+    run(main())
+
+
+def test_mb_064_a_reset_ends_the_client_and_nobody_else() -> None:
+    ends: list[str] = []
+
+    async def noting(connection: ByteConnection) -> None:
+        try:
+            await echo(connection)
+        except ConnectionLost as e:
+            ends.append(str(e))
+            raise
+
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, noting)
+        reader, writer = await connect(listener)
+        other = socket.create_connection(listener.bound.address)
+        await eventually(lambda: len(listener.clients) == 2)
+        other.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        other.close()  # with linger 0: RST
+        await eventually(lambda: len(listener.clients) == 1)
+        assert "reset" in ends[0]
+        writer.write(b"x")
+        assert await reader.readexactly(1) == b"x"
+        await listener.aclose()
+        assert await reader.read() == b""
+        await hang_up(writer)
+
+    run(main())
+
+
+def test_a_client_that_does_not_read_is_waited_for_and_closed_in_bounded_time() -> None:
+    async def flood(connection: ByteConnection) -> None:
+        while True:
+            await connection.write(bytes(65536))
+
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, flood)
+        lazy = socket.create_connection(listener.bound.address)
+        await eventually(lambda: bool(listener.clients) and listener.clients[0]._full)
+        loop = asyncio.get_running_loop()
+        before = loop.time()
+        await listener.aclose()
+        assert loop.time() - before < 3
+        lazy.close()
+
+    run(main())
+
+
+def test_a_client_that_floods_is_held_back() -> None:
+    gate = asyncio.Event()
+
+    async def slow(connection: ByteConnection) -> None:
+        await gate.wait()
+        await echo(connection)
+
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, slow)
+        reader, writer = await connect(listener)
+        payload = bytes(range(256)) * 4096 * 24
+        sending = asyncio.create_task(send_all(writer, payload))
+        await eventually(lambda: bool(listener.clients) and len(listener.clients[0].inbound.data_stream) == 16)
+        assert not sending.done()
+        gate.set()
+        async with asyncio.timeout(15):
+            assert await reader.readexactly(len(payload)) == payload
+        await sending
+        await hang_up(writer)
+        await listener.aclose()
+
+    async def send_all(writer: asyncio.StreamWriter, payload: bytes) -> None:
+        writer.write(payload)
+        await writer.drain()
+
+    run(main())
+
+
+def test_a_failure_of_ours_is_reported_and_ends_only_that_client() -> None:
+    reported: list[dict[str, object]] = []
+
+    async def broken(connection: ByteConnection) -> None:
+        if await connection.read() == b"bug":
+            raise ZeroDivisionError
+        await connection.write(b"fine")
+
+    async def main() -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: reported.append(context))
+        listener = await SocketListener.open(ANY_PORT, broken)
+        reader, writer = await connect(listener)
+        writer.write(b"bug")
+        assert await reader.read() == b""
+        await hang_up(writer)
+        reader, writer = await connect(listener)
+        writer.write(b"ok")
+        assert await reader.read() == b"fine"
+        await hang_up(writer)
+        await listener.aclose()
+
+    run(main())
+    assert [type(context["exception"]) for context in reported] == [ZeroDivisionError]
+
+
+def test_modbus_pipelined_in_order_and_told_to_the_tap() -> None:
+    bank = MapBank([Span("holding", 0, 4)])
+    bank.poke("holding", 0, 7)
+    unit = ModbusUnit(bank)
+    told: list[tuple[Direction, bytes]] = []
+    times: list[int] = []
+
+    def on_frame(direction: Direction, t_ns: int, data: bytes) -> None:
+        told.append((direction, data))
+        times.append(t_ns)
+
+    async def main() -> None:
+        listener = await SocketListener.open(
+            ANY_PORT, lambda c: serve_mbap(c, MbapSlave({1: unit}), WallClock(), latency_s=0.002, on_frame=on_frame)
+        )
+        reader, writer = await connect(listener)
+        requests = [i.to_bytes(2, "big") + READ[2:] for i in range(1, 9)]
+        writer.write(b"".join(requests))
+        replies = [await reader.readexactly(len(REPLY)) for _ in requests]
+        assert replies == [i.to_bytes(2, "big") + REPLY[2:] for i in range(1, 9)]
+        assert [data for direction, data in told if direction is Direction.SENT] == requests
+        await eventually(lambda: [data for direction, data in told if direction is Direction.RECEIVED] == replies)
+        assert times == sorted(times), "the tap's times go back"
+        assert times[-1] - times[0] >= 8 * 2_000_000, "latency of each reply"
+        writer.write(bytes.fromhex("0001 0000 FFFF 01 03"))
+        assert await reader.read() == b"", "MB-055: closed, as nothing can be understood any more"
+        await hang_up(writer)
+        await listener.aclose()
+
+    run(main())
+    assert (unit.counters.requests, unit.counters.replies) == (8, 8)

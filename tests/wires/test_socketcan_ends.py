@@ -9,6 +9,7 @@ import asyncio
 import fcntl
 import os
 import pty
+import select
 import shutil
 import socket
 import struct
@@ -132,7 +133,8 @@ class TestVcan:
     def test_cansend_and_candump_agree(self) -> None:
         async def main() -> None:
             ours = await SocketCanConnection.open(VCAN0, 125_000)
-            subprocess.run(["cansend", "vcan0", "585#4300100091010F00"], check=True, timeout=20)
+            sent = await asyncio.create_subprocess_exec("cansend", "vcan0", "585#4300100091010F00")
+            assert await sent.wait() == 0
             assert str(await ours.recv()) == "585#4300100091010F00"
             dump = await asyncio.create_subprocess_exec("candump", "-L", "-n", "1", "vcan0,605:7FF", stdout=-1)
             assert dump.stdout is not None
@@ -149,13 +151,13 @@ class TestVcan:
     def test_interface_missing_down_or_no_can(self) -> None:
         async def main() -> None:
             for opener in (SocketCanConnection.open, open_can_end):
-                with pytest.raises(Unreachable, match="can:socketcan/nosuch0.*no interface"):
+                with pytest.raises(Unreachable, match=r"can:socketcan/nosuch0.*no interface"):
                     await opener(Endpoint.parse("can:socketcan/nosuch0"), 125_000)
                 with pytest.raises(Unreachable, match="no CAN interface"):
                     await opener(Endpoint.parse("can:socketcan/lo"), 125_000)
                 ip("link", "set", "vcan1", "down")
                 try:
-                    with pytest.raises(Unreachable, match="vcan1 is down.*ip link set vcan1 up"):
+                    with pytest.raises(Unreachable, match=r"vcan1 is down.*ip link set vcan1 up"):
                         await opener(VCAN1, 125_000)
                 finally:
                     ip("link", "set", "vcan1", "up")
@@ -195,7 +197,13 @@ def slcan(bitrate: int) -> Iterator[tuple[str, int]]:
         (name,) = {name for _, name in socket.if_nameindex()} - before
         ip("link", "set", name, "type", "can", "bitrate", str(bitrate))
         ip("link", "set", name, "txqueuelen", "10")
-        ip("link", "set", name, "up")
+        os.set_blocking(master, False)
+        # The driver tells the adapter the bit rate and waits until that is read: the pty wakes a writer only then.
+        with subprocess.Popen(["ip", "link", "set", name, "up"]) as bringing_up:
+            while bringing_up.poll() is None:
+                if select.select([master], [], [], 0.05)[0]:
+                    os.read(master, 4096)
+        assert bringing_up.returncode == 0
         yield name, master
     finally:
         os.close(slave)  # takes the interface with it
@@ -222,8 +230,7 @@ class TestSlcan:
             loop = asyncio.get_running_loop()
             with slcan(125_000) as (name, master):
                 end = await opener(Endpoint.parse(f"can:socketcan/{name}"), 125_000)
-                os.set_blocking(master, False)
-                count, sent = 5000, 0
+                count, sent = 300, 0
 
                 async def send_all() -> None:
                     nonlocal sent
@@ -252,11 +259,14 @@ class TestSlcan:
         async def main() -> None:
             with slcan(125_000) as (name, master):
                 end = await SocketCanConnection.open(Endpoint.parse(f"can:socketcan/{name}"), 125_000)
-                with pytest.raises(WireError, match="stayed full"):
+
+                async def flood() -> None:
                     for i in range(100_000):
                         await end.send(CanFrame(0x100, i.to_bytes(8)))
+
+                with pytest.raises(WireError, match="stayed full"):
+                    await flood()
                 assert end.tx_retries > 10
-                os.set_blocking(master, False)
                 asyncio.get_running_loop().add_reader(master, lambda: os.read(master, 65536))
                 await end.send(CanFrame(0x100))
                 asyncio.get_running_loop().remove_reader(master)

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
+from emulators.endpoints.bus_server import SoftBusServer
 from gateway.connections.os_connector import OsConnector
 from gateway.connections.serial_line import SerialConnection
 from gateway.connections.tap import CaptureTap, TapFile, TappedConnector
@@ -70,6 +71,30 @@ def test_what_is_no_can_bus_or_an_unknown_interface_is_a_usage_error() -> None:
             await OsConnector().open_can(Endpoint.parse("tcp://h:1"), 125_000)
         with pytest.raises(UsageError, match="pcan"):
             await OsConnector().open_can(Endpoint.parse("can:pcan/usb1"), 125_000)
+
+    run(main())
+
+
+def test_a_software_can_bus_is_joined_and_tapped() -> None:
+    async def main() -> None:
+        server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000)
+        capture = CaptureTap()
+        connector = TappedConnector(OsConnector(), [capture], WallClock())
+        a = await connector.open_can(server.bound, 125_000)
+        b = await OsConnector().open_can(server.bound, 125_000)
+        await a.send(CanFrame(0x605, b"\x40"))
+        assert (await b.recv()).key() == CanFrame(0x605, b"\x40").key()
+        await b.send(CanFrame(0x585, b"\x43"))
+        assert (await a.recv()).key() == CanFrame(0x585, b"\x43").key()
+        assert [(c.direction.value, str(c.item)) for c in capture.captured] == [
+            ("sent", "605#40"),
+            ("received", "585#43"),
+        ]
+        await a.aclose()
+        await b.aclose()
+        await server.aclose()
+        with pytest.raises(Unreachable):
+            await connector.open_can(server.bound, 125_000)
 
     run(main())
 

@@ -98,6 +98,18 @@ def test_what_the_line_said_before_it_was_opened_is_thrown_away(line: Line) -> N
     run(main())
 
 
+def test_a_wake_up_with_nothing_to_read_is_no_hang_up(line: Line) -> None:
+    async def main() -> None:
+        connection = await SerialConnection.open(line.endpoint)
+        connection._on_readable()  # as after a flush by the driver between poll and read
+        assert connection.lost is None
+        os.write(line.master, b"x")
+        assert await connection.read() == b"x"
+        await connection.aclose()
+
+    run(main())
+
+
 def test_baud_rate_and_frame_reach_the_port(line: Line) -> None:
     async def main() -> None:
         connection = await SerialConnection.open(line.endpoint)

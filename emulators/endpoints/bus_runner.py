@@ -150,7 +150,7 @@ class AttachedConnection(CanConnection):
         async with self._turn:
             while True:
                 if self.lost is not None:
-                    raise self.lost
+                    raise self._loss()
                 if self._runner.submit(self._node, frame):
                     return
                 self._room.clear()

@@ -122,7 +122,7 @@ class SoftBusEnd(CanConnection):
         await self._slots.acquire()
         if self.lost is not None:
             self._slots.release()
-            raise self.lost
+            raise self._loss()
         self._unconfirmed += 1
         self._all_sent.clear()
         self._writer.write(pack_record(frame))
@@ -223,7 +223,7 @@ class KernelCanEnd(CanConnection):
                         raise WireError("the transmit queue stays full", where=str(self.endpoint)) from e
                     else:
                         await asyncio.sleep(TX_RETRY_S)
-            raise self.lost
+            raise self._loss()
 
     async def aclose(self) -> None:
         self._end(closed_here(self.endpoint))

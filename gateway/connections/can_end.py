@@ -92,7 +92,7 @@ class SocketCanConnection(CanConnection):
 
     def _try_send(self, message: can.Message) -> bool:
         if self._lost is not None:
-            raise self._lost
+            raise self._loss()
         try:
             self._bus.send(message, timeout=0)
         except can.CanOperationError as e:

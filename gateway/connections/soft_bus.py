@@ -100,7 +100,7 @@ class SoftBusConnection(CanConnection):
                 self._progress.clear()
                 await self._progress.wait()
             if self._lost is not None:
-                raise self._lost
+                raise self._loss()
             assert self._wire is not None
             self._in_flight += 1
             self._wire.write(pack_record(frame))

@@ -147,6 +147,28 @@ def test_another_value_is_accepted_and_read_back() -> None:
     assert status in (0, 1, 2)
 
 
+def accepted(address: int, value: int) -> tuple[bytes, bytes]:
+    return write(address, value), write(address, value)[:5]
+
+
+def test_a_register_reads_back_its_own_value_whatever_else_was_written() -> None:
+    read_back = [(read(5, 1, 3), reply(value, function=3)) for value in (1, 2)]
+    replay = session(accepted(5, 1), read_back[0], accepted(6, 1), accepted(5, 2), read_back[1])
+    replay.respond(1, write(5, 1))
+    replay.respond(1, write(6, 1))
+    assert words(replay, 5, 1, 3) == (1,)
+
+
+def test_in_a_new_situation_the_recorded_one_most_like_it_answers() -> None:
+    statuses = [(read(STATUS, 1, 3), reply(value, function=3)) for value in (10, 20)]
+    replay = session(accepted(5, 1), statuses[0], accepted(5, 2), statuses[1], accepted(6, 1))
+    replay.respond(1, write(6, 9))
+    replay.respond(1, write(5, 2))
+    assert words(replay, STATUS, 1, 3) == (20,)
+    replay.respond(1, write(5, 1))
+    assert words(replay, STATUS, 1, 3) == (10,)
+
+
 def test_a_register_that_was_only_ever_written_reads_what_was_written() -> None:
     replay = session((write(9, 4), write(9, 4)[:5]), (read(0, 1, 3), reply(0, function=3)))
     assert replay.respond(1, read(9, 1, 3)).reply == b"\x83\x02"

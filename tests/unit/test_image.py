@@ -151,6 +151,27 @@ def test_a_slot_that_is_never_whole_gives_the_last_snapshot_counted() -> None:
         image.writer("r")
 
 
+def test_a_slot_that_carries_another_number_is_not_believed() -> None:
+    image, _ = one_region(TagSpec("x", TagKind.INT))
+    writer, reader = image.writer("r"), image.reader("r")
+    writer.publish([good(1)], 1)
+    writer._words[0] = 5  # the counter is visible before the slot: a processor that reorders stores
+    assert reader.snapshot().counter == 0
+    assert reader.gave_up == 1
+
+
+def test_a_message_overwritten_or_damaged_while_it_is_read_is_missed_never_handed_out() -> None:
+    image, _ = one_region(message_tag("m", 4, 3))
+    writer, reader = image.writer("r"), image.reader("r")
+    writer.publish([good(0)], 1, {"m": [(1, b"a"), (2, b"b"), (3, b"c")]})
+    ring = writer.shape.rings[0]
+    writer._last["m"] = 6
+    writer._write_messages({"m": [(7, b"new")]})  # message 7 lies where message 1 was
+    writer._memory[ring.record_offset(2) + 24] ^= 1  # the payload of message 2
+    assert reader.snapshot().messages["m"] == (Message(3, 3, b"c"),)
+    assert reader.missed["m"] == 2
+
+
 def test_a_restarted_reader_resumes_after_what_it_dealt_with() -> None:
     image, _ = one_region(message_tag("m", 4, 8))
     writer = image.writer("r")

@@ -187,7 +187,8 @@ class FieldSide:
             )
             self._pairs[config.name] = pair
             unit = ModbusUnit(pair.near, _limits(emulated.profile), name=config.name)
-            self.devices[config.name] = FieldDevice(emulated, unit, None)
+            modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
+            modem.journal = pair.near.journal
             return unit
         bank = SampledSensor(emulated.profile, self._player(emulated), emulated.form.identity)
         unit = ModbusUnit(bank, _limits(emulated.profile), name=config.name)

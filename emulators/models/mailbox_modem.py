@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from random import Random
 
 from emulators.codec import encode
+from emulators.journal import HeldJournal
 from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
 from emulators.models.packet_link import PacketLink
 from gateway.core.errors import FileInvalid
@@ -29,6 +30,7 @@ class MailboxModem(RegisterBank):
         if profile.inbox is None or profile.outbox is None:
             raise FileInvalid("the profile has no mailbox", path=profile.path, expected="`mailbox:`")
         self._inbox, self._outbox = profile.inbox, profile.outbox
+        self.journal = HeldJournal()
         self._outgoing, self._incoming = outgoing, incoming
         self._tags = profile.tags
         self._cells = MapBank(_spans(profile), self._on_write)
@@ -68,7 +70,9 @@ class MailboxModem(RegisterBank):
         ):
             tag = self._tags.get(name)
             if tag is not None:
-                self._cells.poke(tag.registers.table, tag.registers.address, *encode(number, tag.type, tag.order))
+                words = encode(number, tag.type, tag.order)
+                self._cells.poke(tag.registers.table, tag.registers.address, *words)
+                self.journal.note(name, b"".join(w.to_bytes(2) for w in words), now_ns)
 
     def _on_write(self, table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
         """Sequence, length and payload come in one write, from the outbox's first register."""

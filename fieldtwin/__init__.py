@@ -1,0 +1,51 @@
+"""fieldtwin: run a plant's own control software without the plant.
+
+The public Python API, loaded when it is first used: importing this package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from fieldtwin.__about__ import __version__
+
+if TYPE_CHECKING:
+    from fieldtwin.running.options import RunOptions as RunOptions
+    from fieldtwin.running.session import RunSession as RunSession
+    from fieldtwin.running.summary import summarise as summarise
+    from gateway.core.errors import FieldtwinError as FieldtwinError
+    from gateway.core.profile import load_profile as load_profile
+    from twin.prototype_file import load_prototype as load_prototype
+    from twin.system import load_system as load_system
+
+_PUBLIC = {
+    "FieldtwinError": "gateway.core.errors",
+    "RunOptions": "fieldtwin.running.options",
+    "RunSession": "fieldtwin.running.session",
+    "load_profile": "gateway.core.profile",
+    "load_prototype": "twin.prototype_file",
+    "load_system": "twin.system",
+    "summarise": "fieldtwin.running.summary",
+}
+
+__all__ = [
+    "FieldtwinError",
+    "RunOptions",
+    "RunSession",
+    "__version__",
+    "load_profile",
+    "load_prototype",
+    "load_system",
+    "summarise",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _PUBLIC:
+        return getattr(import_module(_PUBLIC[name]), name)
+    raise AttributeError(f"module 'fieldtwin' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

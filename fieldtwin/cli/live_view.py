@@ -1,0 +1,247 @@
+"""What a person sees of a run: a live table on a terminal, one line a second elsewhere, and the summary at the end.
+
+Everything shown comes from the session's statuses; nothing is computed here but text.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from fieldtwin.running.session import RunSession
+
+COLOUR = {"good": "green", "uncertain": "yellow", "bad": "red", "substituted": "magenta", "simulated": "cyan"}
+REFRESH_S = 0.25
+LINE_S = 1.0
+MAX_TAGS = 40
+
+talk = Console(stderr=True, highlight=False)
+data = Console(highlight=False)
+
+
+def print_mapping(session: RunSession) -> None:
+    """Say once where each plant endpoint is really opened."""
+    if not session.options.prototype:
+        leave = "writes allowed" if session.options.allow_writes else "read-only"
+        talk.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
+        return
+    talk.print(
+        f"[bold]prototype[/bold] of {session.system.name}; instance {session.instance.name} in {session.instance.dir}"
+    )
+    for plant, target in session.mapping.items():
+        talk.print(f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's own)", soft_wrap=True)
+    for device, endpoint in session.far.items():
+        talk.print(f"  far end of {device}  →  {endpoint}", soft_wrap=True)
+
+
+class LiveView:
+    """``async with LiveView(session)``: shows the run while the body runs. On a terminal a table, otherwise lines."""
+
+    def __init__(self, session: RunSession, quiet: bool) -> None:
+        self._session = session
+        self._task: asyncio.Task[None] | None = None
+        self._table = talk.is_terminal and not quiet
+        self._quiet = quiet
+
+    async def __aenter__(self) -> LiveView:
+        if not self._quiet:
+            self._task = asyncio.get_running_loop().create_task(
+                self._show_table() if self._table else self._show_lines()
+            )
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            try:
+                await self._task
+            except asyncio.CancelledError:
+                pass  # that is what was asked for
+
+    async def _show_table(self) -> None:
+        with Live(render(self._session), console=talk, auto_refresh=False, transient=True) as live:
+            while True:
+                live.update(render(self._session), refresh=True)
+                await asyncio.sleep(REFRESH_S)
+
+    async def _show_lines(self) -> None:
+        while True:
+            await asyncio.sleep(LINE_S)
+            talk.print(line(self._session), soft_wrap=True, markup=False)
+
+
+def line(session: RunSession) -> str:
+    """The run in one line."""
+    gateway, plc = session.gateway_status or {}, session.plc_status or {}
+    parts = [f"t={session.elapsed_s:.0f}s"]
+    parts += [f"{program}={state}" for program, state in session.states.current.items()]
+    for name, device in gateway.get("devices", {}).items():
+        parts.append(f"{name}={'good' if device['online'] else 'bad'}")
+    tags = gateway.get("tags", {})
+    parts.append(f"tags_good={sum(t['quality'] == 'good' for t in tags.values())}/{len(tags)}")
+    requests = sum(_requests(bus) for bus in gateway.get("buses", {}).values())
+    parts.append(f"requests={requests}")
+    if plc:
+        parts.append(f"scans={plc.get('scans')} late_p99_us={_p99(plc)}")
+    parts.append(f"errors={len(session.errors)}")
+    if not gateway.get("plc", {}).get("alive", True):
+        parts.append("PLC LOST")
+    return " ".join(parts)
+
+
+def _requests(bus: dict[str, Any]) -> int:
+    return int(bus["counters"].get("requests", 0) or bus["counters"].get("sdo_requests", 0))
+
+
+def _p99(plc: dict[str, Any]) -> str:
+    value = plc.get("lateness_us", {}).get("p99")
+    return "-" if value is None else f"{value:.0f}"
+
+
+def render(session: RunSession) -> RenderableType:
+    """The live table, as wide as the terminal allows."""
+    kind = "prototype" if session.options.prototype else "plant"
+    left = session.options.duration_s
+    clock = f"{session.elapsed_s:5.1f} s" + (f" of {left:.0f} s" if left else "")
+    head = Text.assemble((f" {session.system.name} ", "bold reverse"), f" {kind}  {clock}  ", _states(session))
+    parts: list[RenderableType] = [head, _devices(session), _tags(session), _foot(session)]
+    parts += [Text(f"! {error}", style="red") for error in list(session.errors)[-3:]]
+    return Group(*parts)
+
+
+def _states(session: RunSession) -> Text:
+    text = Text()
+    for program, state in session.states.current.items():
+        text.append(f"{program} ", "dim")
+        text.append(state, "bold green" if state == "ACTIVE" else "bold")
+    return text
+
+
+def _devices(session: RunSession) -> Table:
+    table = Table(expand=False, pad_edge=False, box=None, header_style="dim")
+    for column, justify in (
+        ("device", "left"),
+        ("state", "left"),
+        ("bus", "left"),
+        ("requests", "right"),
+        ("replies", "right"),
+        ("errors", "right"),
+    ):
+        table.add_column(column, justify=justify, no_wrap=column != "state")  # type: ignore[arg-type]
+    gateway = session.gateway_status or {}
+    buses = gateway.get("buses", {})
+    for name, device in gateway.get("devices", {}).items():
+        counters = buses.get(device["bus"], {}).get("counters", {})
+        good = device["online"]
+        table.add_row(
+            name,
+            Text("good", "green") if good else Text(f"bad: {device['error']}", "red", overflow="ellipsis"),
+            f"{device['bus']}:{device['address']}",
+            str(counters.get("requests", counters.get("sdo_requests", 0))),
+            str(counters.get("replies", counters.get("sdo_replies", 0))),
+            str(device["errors"]),
+        )
+    return table
+
+
+def _tags(session: RunSession) -> Table:
+    table = Table(expand=False, pad_edge=False, box=None, header_style="dim")
+    table.add_column("tag", no_wrap=True)
+    table.add_column("value", justify="right", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    table.add_column("quality", no_wrap=True)
+    table.add_column("age", justify="right", no_wrap=True)
+    units = {f"{d.name}.{t.name}": t.unit for d in session.system.devices.values() for t in d.profile.tags.values()}
+    for name, tag in list((session.gateway_status or {}).get("tags", {}).items())[:MAX_TAGS]:
+        quality = tag["quality"] + (f" ({tag['reason']})" if tag["reason"] != "none" else "")
+        table.add_row(
+            name,
+            value_text(tag["value"]),
+            units.get(name, ""),
+            Text(quality, COLOUR.get(tag["quality"], "")),
+            age_text(tag["age_s"]),
+        )
+    return table
+
+
+def value_text(value: Any) -> str:
+    """A value for a person: floats with six digits, none as a dash."""
+    if value is None:
+        return "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def age_text(age_s: float | None) -> str:
+    return "-" if age_s is None else f"{age_s:.2f} s" if age_s < 100 else f"{age_s:.0f} s"
+
+
+def _foot(session: RunSession) -> Text:
+    gateway, plc = session.gateway_status or {}, session.plc_status or {}
+    text = Text()
+    if plc:
+        late = plc.get("lateness_us", {})
+        lateness = " ".join(f"{key} {_us(late, key)}" for key in ("p50", "p99", "max"))
+        text.append("scan ", "dim")
+        text.append(f"{plc.get('cycle_ms', 0):g} ms  #{plc.get('scans')}  late {lateness}")
+        text.append(f"  missed {plc.get('missed_periods')}  {plc.get('state')}")
+    elif session.children.get("plc"):
+        text.append("PLC: no answer", "bold red")
+    for name, box in gateway.get("mailboxes", {}).items():
+        text.append(f"\n{name} ", "dim")
+        text.append(f"received {box['received']}  sent {box['sent']}  taken {box['taken']}  waiting {box['queued']}")
+    text.append("\nlogged ", "dim")
+    text.append(f"{gateway.get('logged', 0)}")
+    if session.options.prototype:
+        oracle = session.oracle.describe()
+        text.append(f"   published values checked {oracle['checked']}, wrong {oracle['wrong']}")
+    return text
+
+
+def _us(late: dict[str, Any], key: str) -> str:
+    value = late.get(key)
+    return "-" if value is None else f"{value / 1000:.2f} ms"
+
+
+def print_summary(summary: dict[str, Any]) -> None:
+    """The end of a run, for a person, on stdout."""
+    kind = "prototype" if summary["prototype"] else "plant"
+    data.print(f"[bold]{summary['system']}[/bold] ({kind}), {summary['duration_s']:.1f} s")
+    for name, device in summary["devices"].items():
+        mark = "[green]good[/green]" if device["state"] == "good" else f"[red]bad[/red] {device['error']}"
+        data.print(f"  {name:<14} {mark}")
+    for program, states in summary["states"].items():
+        data.print(f"  {program:<14} {' → '.join(states) or 'no scan seen'}")
+    for bus, row in summary["exchanges"].items():
+        data.print(f"  {bus:<14} {_exchange_text(row)}", soft_wrap=True)
+    published = summary["published"]
+    if summary["prototype"]:
+        checked = f"{published['checked']} compared with what the devices held, {published['wrong']} wrong"
+        data.print(f"  published      {checked}", soft_wrap=True)
+    else:
+        data.print(f"  published      {published['values']} good values")
+    if far := summary["far_end"]:
+        data.print(f"  far end        commands {far['commands_sent']}, responses {far['responses']}")
+    data.print(f"  logged         {summary['logged']} exchanges")
+    for error in summary["errors"]:
+        data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
+    data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+
+
+def _exchange_text(row: dict[str, Any]) -> str:
+    gateway = row["gateway"]
+    text = f"gateway {gateway['requests']} requests, {gateway['replies']} replies"
+    if "pdos" in gateway:
+        text += f", {gateway['pdos']} PDOs, {gateway['heartbeats']} heartbeats"
+    if "emulators" in row:
+        text += f"; emulators {row['emulators']['requests']} / {row['emulators']['replies']}"
+    if row["timeouts"] or row["crc_errors"]:
+        text += f"; {row['timeouts']} timeouts, {row['crc_errors']} CRC errors"
+    return text

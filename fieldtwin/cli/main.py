@@ -1,0 +1,93 @@
+"""The command line: parses, calls, prints, and turns every error into one line and an exit code.
+
+Commands are imported when they are called, so that `--version` and completion cost next to nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+
+import click
+
+from fieldtwin.__about__ import __version__
+
+COMMANDS = {
+    "run": ("fieldtwin.cli.run_command", "Run a system: the plant, or its prototype."),
+    "emulate": ("fieldtwin.cli.emulate_command", "Emulate the field side of a system, or one device."),
+    "shore": ("fieldtwin.cli.shore_command", "The far end of a system's transmitter: send commands, show responses."),
+    "link": ("fieldtwin.cli.link_command", "The emulated connection on its own: a serial port carried over TCP."),
+    "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),
+    "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
+    "schema": ("fieldtwin.cli.schema_command", "Print the JSON schema of a kind of file."),
+    "doctor": ("fieldtwin.cli.doctor_command", "Check what this computer can do, and say what to change."),
+}
+INTERRUPTED = 130
+BUG = 70
+
+
+class LazyGroup(click.Group):
+    """Loads a command's module when the command is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        command = import_module(COMMANDS[cmd_name][0]).command
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.command(
+    cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "auto_envvar_prefix": "FIELDTWIN"}
+)
+@click.version_option(__version__, "--version", prog_name="fieldtwin")
+def cli() -> None:
+    """Run a plant's own control software without the plant: gateway, soft PLC and emulators on real wires.
+
+    Data goes to stdout, talk to stderr. Exit codes: 0 ok, 1 a check failed, 2 usage, 3 a file is invalid,
+    4 unreachable, 5 the device refused, 70 our bug, 130 interrupted.
+
+    fieldtwin is no safety function.
+    """
+
+
+def main() -> None:
+    """The console script. Never shows a traceback unless FIELDTWIN_TRACEBACK is set."""
+    from gateway.core.errors import FieldtwinError
+
+    try:
+        code = cli.main(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except click.exceptions.Abort:
+        sys.exit(INTERRUPTED)
+    except click.ClickException as e:
+        e.show()
+        sys.exit(e.exit_code)
+    except click.exceptions.Exit as e:
+        sys.exit(e.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:  # `fieldtwin ... | head`: the reader has what it wanted
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except FieldtwinError as e:
+        if os.environ.get("FIELDTWIN_TRACEBACK"):
+            raise
+        click.echo(f"fieldtwin: {e}", err=True)
+        sys.exit(getattr(e, "child_exit_code", e.exit_code) or e.exit_code)
+    except Exception as e:  # the last border: our bug, reported as such
+        if os.environ.get("FIELDTWIN_TRACEBACK"):
+            raise
+        click.echo(
+            f"fieldtwin: a bug of ours: {type(e).__name__}: {e} (run again with FIELDTWIN_TRACEBACK=1 and report it)",
+            err=True,
+        )
+        sys.exit(BUG)

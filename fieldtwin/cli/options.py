@@ -1,0 +1,47 @@
+"""Options that several commands share, and reading what they say."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import click
+
+from gateway.core.errors import UsageError
+
+_DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|m|min|h)?$")
+_UNIT_S = {"ms": 0.001, "s": 1.0, "": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+
+
+class Duration(click.ParamType[float]):
+    """``20s``, ``500ms``, ``2m``, ``1h``, or seconds."""
+
+    name = "duration"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        if isinstance(value, float):
+            return value
+        match = _DURATION.match(str(value))
+        if not match:
+            self.fail(f"{value!r} is no duration such as 20s, 500ms or 2m", param, ctx)
+        return float(match[1]) * _UNIT_S[match[2] or ""]
+
+
+def pairs(values: tuple[str, ...], what: str) -> dict[str, str]:
+    """``NAME=VALUE`` options as a dictionary. Raises `UsageError`."""
+    out: dict[str, str] = {}
+    for value in values:
+        name, equals, rest = value.partition("=")
+        if not equals or not name or not rest:
+            raise UsageError(f"cannot read {what} {value!r}", expected="NAME=VALUE")
+        out[name] = rest
+    return out
+
+
+json_option = click.option("--json", "as_json", is_flag=True, help="Print data as JSON on stdout.")
+profiles_option = click.option(
+    "--profiles",
+    multiple=True,
+    type=click.Path(exists=True, file_okay=False),
+    help="A folder with devices/ and systems/, searched before FIELDTWIN_PROFILES, ./profiles and the shipped ones.",
+)

@@ -1,0 +1,143 @@
+"""`fieldtwin run`: a plant, or its prototype, from one and the same system file."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from pathlib import Path
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option, pairs, profiles_option
+from fieldtwin.running.options import RunOptions
+from fieldtwin.running.session import RunSession
+from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
+from fieldtwin.running.summary import summarise
+from gateway.core.errors import UsageError
+
+NEITHER = """run needs --plant or --prototype; neither is a default.
+  --prototype   the field side is emulated, as NAME.prototype.yaml says: nothing real is touched
+  --plant       the endpoints in the system file, on real hardware; read-only without --allow-writes"""
+
+
+@click.command("run")
+@click.argument("system")
+@click.option("--prototype", is_flag=True, help="Emulate the field side, as NAME.prototype.yaml says.")
+@click.option("--plant", is_flag=True, help="Use the endpoints in the system file: real hardware.")
+@click.option("--allow-writes", is_flag=True, help="With --plant: write what the system file marks writable.")
+@click.option(
+    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+)
+@click.option("--instance", default="", help="Name of the run directory; default: the system's name.")
+@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False), help="Another prototype file.")
+@click.option(
+    "--field",
+    "field_host",
+    default="",
+    metavar="HOST[:PORT]",
+    help="The field side runs there already (fieldtwin emulate).",
+)
+@click.option("--token", default="", help="Token of that field side's control channel.")
+@click.option(
+    "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Play this recording for a device."
+)
+@click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
+@click.option("--listen", multiple=True, metavar="BUS=ENDPOINT", help="Let a bus's emulators listen elsewhere.")
+@click.option(
+    "--can", default="", metavar="INTERFACE/CHANNEL", help="Emulated CAN buses on this interface, e.g. socketcan/vcan0."
+)
+@click.option(
+    "--commands",
+    default=None,
+    metavar="1,2,0,-1",
+    help="Periods to command from the far end, spread over the run; or none.",
+)
+@click.option(
+    "--capture", type=click.Path(dir_okay=False), help="Write what goes over the wires to this file (JSON lines)."
+)
+@profiles_option
+@json_option
+def command(
+    system: str,
+    prototype: bool,
+    plant: bool,
+    allow_writes: bool,
+    duration_s: float,
+    instance: str,
+    prototype_file: str | None,
+    field_host: str,
+    token: str,
+    recordings: tuple[str, ...],
+    speed: float,
+    listen: tuple[str, ...],
+    can: str,
+    commands: str | None,
+    capture: str | None,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Run SYSTEM: gateway and PLC, each in its own process.
+
+    SYSTEM is a file, or the name of a shipped one such as `observatory`.
+
+    With --prototype the field side is emulated in a process of its own, on real wires: a pty for each serial line, TCP sockets, a
+    software CAN bus (or a kernel one, with --can). The same system file runs the plant with --plant.
+    """
+    if prototype == plant:
+        raise UsageError(NEITHER if not plant else "--plant and --prototype exclude each other")
+    if plant and (field_host or recordings or listen or can or speed or prototype_file or commands):
+        raise UsageError(
+            "a plant is not emulated",
+            hint="--field, --recording, --speed, --listen, --can, --commands go with --prototype",
+        )
+    if prototype and allow_writes:
+        raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
+    options = RunOptions(
+        system=system,
+        prototype=prototype,
+        allow_writes=allow_writes,
+        duration_s=duration_s,
+        instance=instance,
+        profiles=tuple(Path(p) for p in profiles),
+        prototype_file=Path(prototype_file) if prototype_file else None,
+        field_host=field_host,
+        token=token,
+        recordings=pairs(recordings, "--recording"),
+        speed=speed,
+        listen=pairs(listen, "--listen"),
+        can=can,
+        commands=parse_periods(commands) if commands is not None else DEFAULT_SCRIPT,
+        capture=Path(capture) if capture else None,
+    )
+    return asyncio.run(_run(options, as_json))
+
+
+async def _run(options: RunOptions, as_json: bool) -> int:
+    from fieldtwin.cli.live_view import LiveView, print_mapping, print_summary
+
+    session = RunSession(options)
+    interrupted = False
+
+    def interrupt() -> None:
+        nonlocal interrupted
+        interrupted = True
+        session.stopped.set()
+
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, interrupt)
+    async with session:
+        print_mapping(session)
+        async with LiveView(session, quiet=as_json):
+            await session.wait()
+    summary = summarise(session)
+    if as_json:
+        json.dump(summary, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_summary(summary)
+    if interrupted and options.duration_s:
+        return 130
+    return 0 if summary["ok"] else 1

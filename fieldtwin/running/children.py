@@ -1,0 +1,90 @@
+"""Processes that a run starts: each with a log of its own, asked through its control channel, ended in time."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from pathlib import Path
+
+from gateway.core.control import ControlClient
+from gateway.core.errors import Bug, FieldtwinError, ReplyTimeout, Unreachable
+
+START_TIMEOUT_S = 30.0
+POLL_S = 0.02
+
+
+class ChildFailed(FieldtwinError):
+    """A process that we started ended by itself. Its own exit code is ours."""
+
+    def __init__(self, name: str, code: int, said: str, log: Path) -> None:
+        self.child_exit_code = code
+        text = said or f"ended with {'signal ' + str(-code) if code < 0 else 'exit code ' + str(code)}"
+        super().__init__(f"{name}: {text}", hint=f"log: {log}")
+
+
+class Child:
+    """One process. In a session of its own, so that Ctrl-C reaches only us and we end it in order."""
+
+    def __init__(self, name: str, module: str, config: Path, run_dir: Path) -> None:
+        self.name = name
+        self.log = run_dir / f"{name}.log"
+        self.socket = run_dir / f"{name}.sock"
+        self.socket.unlink(missing_ok=True)
+        with self.log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", module, str(config)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def returncode(self) -> int | None:
+        """The exit code once it ended, negative for a signal; None while it runs."""
+        return self._process.poll()
+
+    def failure(self) -> ChildFailed | None:
+        """Why it ended, or None while it runs."""
+        code = self.returncode
+        if code is None:
+            return None
+        lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return ChildFailed(self.name, code, lines[-1] if lines else "", self.log)
+
+    async def connect(self, timeout_s: float = START_TIMEOUT_S) -> ControlClient:
+        """Wait until it says that it is ready. Raises `ChildFailed` when it ends instead."""
+        deadline = asyncio.get_running_loop().time() + timeout_s
+        while True:
+            failed = self.failure()
+            if failed is not None:
+                raise failed
+            try:
+                client = await ControlClient.connect_unix(self.socket)
+            except Unreachable:
+                if asyncio.get_running_loop().time() > deadline:
+                    raise ReplyTimeout(f"the {self.name} process did not get ready", hint=f"log: {self.log}") from None
+                await asyncio.sleep(POLL_S)
+                continue
+            answer = await client.call("ready")
+            if not answer.get("ready"):
+                raise Bug(f"the {self.name} process answered, and is not ready", got=str(answer))
+            return client
+
+    async def end(self, timeout_s: float = 1.5) -> int | None:
+        """SIGTERM, then SIGKILL after `timeout_s`; the exit code."""
+        if self.returncode is None:
+            self._process.terminate()
+        deadline = asyncio.get_running_loop().time() + timeout_s
+        while self.returncode is None:
+            if asyncio.get_running_loop().time() > deadline:
+                self._process.kill()
+                await asyncio.to_thread(self._process.wait)
+                break
+            await asyncio.sleep(POLL_S)
+        return self.returncode

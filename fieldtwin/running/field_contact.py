@@ -1,0 +1,106 @@
+"""Contact with a field side: here, as a process of ours, or elsewhere, started by hand or in another container.
+
+What comes out is the same: a control client, where to open each plant endpoint, and where the far modems listen. A pty
+does not cross hosts: a serial line of a field side elsewhere comes over TCP, and an emulated connection (`fieldtwin link`)
+is started here.
+"""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+from fieldtwin.running.link_child import LinkChild
+from gateway.core.control import ControlClient
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FileInvalid, UsageError
+from twin.mapping import mapped_endpoint
+from twin.system import System
+
+DEFAULT_CONTROL_PORT = 7420
+LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")
+
+
+class FieldContact:
+    """A field side that was reached."""
+
+    def __init__(self, client: ControlClient, mapping: dict[Endpoint, Endpoint], far: dict[str, Endpoint]) -> None:
+        self.client = client
+        self.mapping = mapping
+        self.far = far
+        self.links: list[LinkChild] = []
+
+    async def aclose(self) -> None:
+        await self.client.aclose()
+        for link in self.links:
+            await link.end()
+
+
+async def contact_here(client: ControlClient, system: System) -> FieldContact:
+    """The field side is a process of ours."""
+    return await _contact(client, system, "localhost", None)
+
+
+async def contact_elsewhere(host_port: str, token: str, system: System, run_dir: Path) -> FieldContact:
+    """The field side was started elsewhere; `host_port` is its control channel, ``HOST`` or ``HOST:PORT``."""
+    host, colon, port = host_port.rpartition(":")
+    if not colon:
+        host, port = host_port, str(DEFAULT_CONTROL_PORT)
+    if not port.isdigit():
+        raise UsageError("the field side's address", expected="HOST or HOST:PORT", got=host_port)
+    client = await ControlClient.connect_tcp(host, int(port), token)
+    return await _contact(client, system, host, run_dir)
+
+
+async def _contact(client: ControlClient, system: System, host: str, run_dir: Path | None) -> FieldContact:
+    status = await client.call("get")
+    if status["system_hash"] != system.hash:
+        raise FileInvalid(
+            f"the field side runs another version of {system.name!r}",
+            path=str(system.path),
+            expected=f"the same file (hash {system.hash})",
+            got=f"{status['system']!r} (hash {status['system_hash']})",
+        )
+    contact = FieldContact(client, {}, {})
+    try:
+        for bus_name, url in status["listening"].items():
+            plant = system.buses[bus_name].endpoint
+            listening = _reachable(Endpoint.parse(url), host)
+            if plant.is_serial and listening.scheme != "pty":
+                assert run_dir is not None
+                link = LinkChild(run_dir / bus_name, listening, run_dir / f"link-{bus_name}.log")
+                contact.links.append(link)
+                await link.ready()
+                listening = Endpoint("pty", path=str(run_dir / bus_name))
+            contact.mapping[plant] = mapped_endpoint(plant, listening)
+        contact.far = {device: _reachable(Endpoint.parse(url), host) for device, url in status["far"].items()}
+    except BaseException:
+        await contact.aclose()
+        raise
+    for name, bus in system.buses.items():
+        if name not in status["listening"]:
+            contact.mapping[bus.endpoint] = bus.endpoint  # the prototype file says `plant` for this bus
+    return contact
+
+
+def _reachable(listening: Endpoint, host: str) -> Endpoint:
+    """The endpoint as seen from here: a wildcard address is the host that we reached the field side at."""
+    if listening.scheme == "pty":
+        if host not in LOCAL_HOSTS:
+            raise UsageError(
+                "a virtual serial port does not cross hosts",
+                where=str(listening),
+                hint="let that bus listen on tcp:// in the prototype file",
+            )
+        return listening
+    if listening.is_can and listening.interface != "fieldtwin":
+        return listening
+    bound, port = listening.address
+    if bound in ("0.0.0.0", "::"):
+        return listening.with_address(socket.gethostbyname(host), port)
+    if bound in LOCAL_HOSTS and host not in LOCAL_HOSTS:
+        raise UsageError(
+            f"the field side listens on its own loopback only: {listening}",
+            hint="let that bus listen on 0.0.0.0 in the prototype file",
+        )
+    return listening

@@ -1,0 +1,46 @@
+"""`fieldtwin link` as a process of ours: a virtual serial port here whose line is carried over TCP."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from pathlib import Path
+
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ReplyTimeout, Unreachable
+
+
+class LinkChild:
+    """Makes the port `link` and carries it to `target`. `ready` waits until the port is there."""
+
+    def __init__(self, link: Path, target: Endpoint, log: Path) -> None:
+        self._link = link
+        self._log = log
+        link.unlink(missing_ok=True)
+        with log.open("wb") as out:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "fieldtwin", "link", str(link), str(target)],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    async def ready(self, timeout_s: float = 10.0) -> None:
+        deadline = asyncio.get_running_loop().time() + timeout_s
+        while not self._link.exists():
+            if self._process.poll() is not None:
+                text = self._log.read_text(encoding="utf-8", errors="replace").strip()
+                raise Unreachable(f"the link ended: {text.splitlines()[-1] if text else 'no reason given'}")
+            if asyncio.get_running_loop().time() > deadline:
+                raise ReplyTimeout("the link made no port", where=str(self._link))
+            await asyncio.sleep(0.02)
+
+    async def end(self) -> None:
+        self._process.terminate()
+        try:
+            await asyncio.to_thread(self._process.wait, 2.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            await asyncio.to_thread(self._process.wait)

@@ -1,0 +1,27 @@
+"""What a run was asked to do: the command line's options, checked for sense, before anything starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """A run. `duration_s` 0 means until stopped; `field_host` is ``HOST[:PORT]`` of a field side started elsewhere."""
+
+    system: str
+    prototype: bool
+    allow_writes: bool = False
+    duration_s: float = 0.0
+    instance: str = ""
+    profiles: tuple[Path, ...] = ()
+    prototype_file: Path | None = None
+    field_host: str = ""
+    token: str = ""
+    recordings: dict[str, str] = field(default_factory=dict)
+    speed: float = 0.0
+    listen: dict[str, str] = field(default_factory=dict)
+    can: str = ""
+    commands: tuple[int, ...] = ()
+    capture: Path | None = None

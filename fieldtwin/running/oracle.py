@@ -1,0 +1,62 @@
+"""The oracle of a prototype run: was every value that was published as good one that the device held.
+
+Fetches what the gateway published and what the emulators held, by number, so that nothing is compared twice and memory stays
+bounded. A value is right when the device held those very bytes for that tag at some time not after the value's own.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from typing import Any
+
+from gateway.core.control import ControlClient
+
+KEPT = 100_000
+"""Held values kept a tag, newest first to be forgotten last."""
+EXAMPLES = 10
+
+
+class Oracle:
+    """Call `update` about once a second and once at the end."""
+
+    def __init__(self) -> None:
+        self.checked = 0
+        self.wrong: list[str] = []
+        self.wrong_count = 0
+        self._published = 0
+        self._held_numbers: dict[str, int] = {}
+        self._held: dict[str, set[str]] = defaultdict(set)
+        self._order: dict[str, deque[str]] = defaultdict(deque)
+        self._emulated: set[str] = set()
+
+    async def update(self, gateway: ControlClient, field: ControlClient) -> None:
+        """Fetch published first, then held: what was published before is held by then."""
+        answer = await gateway.call("published", since=self._published)
+        for device, entries in (await field.call("held", since=self._held_numbers)).items():
+            self._emulated.add(device)
+            for number, tag, raw, _ in entries:
+                self._held_numbers[device] = number
+                self._keep(f"{device}.{tag}", raw)
+        for number, tag, raw, _, value in answer["entries"]:
+            self._published = number
+            self._judge(tag, raw, value)
+
+    def _keep(self, tag: str, raw: str) -> None:
+        if raw in self._held[tag]:
+            return
+        self._held[tag].add(raw)
+        self._order[tag].append(raw)
+        if len(self._order[tag]) > KEPT:
+            self._held[tag].discard(self._order[tag].popleft())
+
+    def _judge(self, tag: str, raw: str, value: Any) -> None:
+        if tag.split(".", 1)[0] not in self._emulated:
+            return  # a real device in a mixed prototype: nobody knows what it held
+        self.checked += 1
+        if raw not in self._held[tag]:
+            self.wrong_count += 1
+            if len(self.wrong) < EXAMPLES:
+                self.wrong.append(f"{tag} was published as {value!r} ({raw}); the device never held that")
+
+    def describe(self) -> dict[str, Any]:
+        return {"checked": self.checked, "wrong": self.wrong_count, "examples": list(self.wrong)}

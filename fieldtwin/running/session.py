@@ -1,0 +1,251 @@
+"""A run: the field side (of a prototype), the PLC and the gateway as processes, the far end, and what they all tell.
+
+Start order: process image, field side, PLC, gateway, far end. Stop order is the reverse, with safe outputs in between and
+the counters of both sides read when nothing is on the wire any more. A process that dies does not end the run: the others show
+what they make of it, and the run's verdict is no.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.running.children import Child
+from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
+from fieldtwin.running.options import RunOptions
+from fieldtwin.running.oracle import Oracle
+from fieldtwin.running.shore import Scripted, Shore, script
+from fieldtwin.running.states import StateWatch
+from gateway.core.control import ControlClient
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FieldtwinError
+from gateway.core.nursery import Nursery
+from gateway.wallclock import WallClock
+from twin.controller import ControllerConfig
+from twin.field_process import FieldConfig, resolve
+from twin.instance import Instance
+from twin.mapping import mapping_to_json
+from twin.physical import image_layout, make_image, plc_config
+from twin.system import System, load_system
+
+WATCH_S = 0.02
+ORACLE_S = 1.0
+MAX_ERRORS = 100
+
+
+class RunSession:
+    """One run. ``async with RunSession(options) as run: await run.wait()``, then `summary`.
+
+    `gateway_status`, `plc_status` and `field_status` hold the latest of each, `None` while a process does not answer.
+    """
+
+    def __init__(self, options: RunOptions) -> None:
+        self.options = options
+        self.clock = WallClock()
+        self.system: System = load_system(options.system, options.profiles)
+        if options.prototype and not options.field_host:
+            resolve(
+                self._field_config(Path())
+            )  # everything that can be wrong in the files is wrong before anything starts
+        self.instance = Instance(options.instance or self.system.name)
+        self.mapping: dict[Endpoint, Endpoint] = {}
+        self.far: dict[str, Endpoint] = {}
+        self.children: dict[str, Child] = {}
+        self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
+        self.oracle = Oracle()
+        self.states = StateWatch(self.system)
+        self.shore: Shore | None = None
+        self.gateway_status: dict[str, Any] | None = None
+        self.plc_status: dict[str, Any] | None = None
+        self.field_status: dict[str, Any] | None = None
+        self.outputs_confirmed_safe: bool | None = None
+        self.started_ns = 0
+        self.stopped = asyncio.Event()
+        self._stack = AsyncExitStack()
+        self._nursery = Nursery()
+        self._clients: dict[str, ControlClient] = {}
+        self._field: FieldContact | None = None
+
+    # -- starting -------------------------------------------------------------------------------------------------------
+
+    async def __aenter__(self) -> RunSession:
+        try:
+            await self._start()
+        except BaseException:
+            await self._stack.aclose()
+            raise
+        return self
+
+    async def _start(self) -> None:
+        self._stack.enter_context(self.instance)
+        run_dir = self.instance.dir
+        layout = image_layout(self.system)
+        make_image(layout, run_dir / "image")
+        if self.options.prototype:
+            await self._start_field(run_dir)
+        config = run_dir / "plc.json"
+        config.write_bytes(plc_config(self.system, run_dir).to_json())
+        await self._start_child("plc", "plc", config)
+        gateway = ControllerConfig(
+            system=str(self.system.path.resolve()),
+            run_dir=str(run_dir),
+            allow_writes=self.options.prototype or self.options.allow_writes,
+            mapping=mapping_to_json(self.mapping) if self.options.prototype else None,
+            profiles=tuple(str(p.resolve()) for p in self.options.profiles),
+            capture=str(self.options.capture.resolve()) if self.options.capture else "",
+        )
+        await self._start_child("gateway", "twin.controller", self._write("gateway.json", gateway))
+        self._stack.enter_context(self.states.attached(layout, run_dir / "image"))
+        self.started_ns = self.clock.monotonic_ns()
+        self._start_watching()
+
+    def _field_config(self, run_dir: Path) -> FieldConfig:
+        o = self.options
+        listen = dict(o.listen)
+        if o.can:
+            listen |= {name: f"can:{o.can}" for name, bus in self.system.buses.items() if bus.endpoint.is_can}
+        return FieldConfig(
+            system=str(self.system.path.resolve()),
+            run_dir=str(run_dir),
+            prototype=str(o.prototype_file.resolve()) if o.prototype_file else "",
+            profiles=tuple(str(p.resolve()) for p in o.profiles),
+            recordings={d: str(Path(p).resolve()) for d, p in o.recordings.items()},
+            speed=o.speed,
+            listen=listen,
+        )
+
+    def _write(self, name: str, config: msgspec.Struct) -> Path:
+        path = self.instance.path(name)
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(config), indent=2))
+        path.chmod(0o600)
+        return path
+
+    async def _start_child(self, name: str, module: str, config: Path) -> ControlClient:
+        child = Child(name, module, config, self.instance.dir)
+        self.children[name] = child
+        self._stack.push_async_callback(child.end)
+        client = await child.connect()
+        self._clients[name] = client
+        self._stack.push_async_callback(client.aclose)
+        return client
+
+    async def _start_field(self, run_dir: Path) -> None:
+        if self.options.field_host:
+            self._field = await contact_elsewhere(self.options.field_host, self.options.token, self.system, run_dir)
+        else:
+            client = await self._start_child(
+                "field", "twin.field_process", self._write("field.json", self._field_config(run_dir))
+            )
+            self._field = await contact_here(client, self.system)
+        self._stack.push_async_callback(self._field.aclose)
+        self.mapping, self.far = self._field.mapping, self._field.far
+
+    def _start_watching(self) -> None:
+        self._nursery.start(self._watch(), "states")
+        self._nursery.start(self._ask(), "status")
+        device = next(iter(self.far), None)
+        if device is not None and self.options.prototype and self.options.commands is not None:
+            self.shore = Shore(self.system, device, self.far[device], self.clock)
+            commands: list[Scripted] = []
+            if self.options.commands:
+                commands = script(self.options.commands, self.options.duration_s or 20.0)
+            self._nursery.start(self.shore.run(commands), "far end")
+
+    # -- while it runs --------------------------------------------------------------------------------------------------
+
+    async def wait(self) -> None:
+        """Until the time asked for is over, `stopped` is set, or our own watching fails."""
+        waiting = self._nursery.start(self.stopped.wait(), "until stopped")
+        done = asyncio.ensure_future(self._nursery.wait())
+        try:
+            timeout = self.options.duration_s or None
+            await asyncio.wait([waiting, done], timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
+            if done.done():
+                done.result()
+        finally:
+            done.cancel()
+
+    @property
+    def elapsed_s(self) -> float:
+        return (self.clock.monotonic_ns() - self.started_ns) / 1e9
+
+    async def _watch(self) -> None:
+        while True:
+            self.states.look(self.clock.monotonic_ns())
+            self._notice_deaths()
+            await asyncio.sleep(WATCH_S)
+
+    def _notice_deaths(self) -> None:
+        for name, child in self.children.items():
+            failed = child.failure()
+            if failed is not None and name in self._clients:
+                del self._clients[name]
+                self.note_error(str(failed))
+
+    def note_error(self, text: str) -> None:
+        """Something went wrong; each text once."""
+        if text not in self.errors:
+            self.errors.append(text)
+
+    async def _ask(self) -> None:
+        """Refresh the three statuses twice a second and let the oracle judge once a second."""
+        next_oracle = 0.0
+        while True:
+            await self.refresh()
+            if self.elapsed_s >= next_oracle:
+                next_oracle = self.elapsed_s + ORACLE_S
+                await self._judge()
+            await asyncio.sleep(0.4)
+
+    async def refresh(self) -> None:
+        """Ask every process for its status."""
+        self.gateway_status = await self._get(self._clients.get("gateway"))
+        self.plc_status = await self._get(self._clients.get("plc"))
+        self.field_status = await self._get(self._field.client if self._field else None)
+
+    async def _get(self, client: ControlClient | None) -> dict[str, Any] | None:
+        if client is None:
+            return None
+        try:
+            answer: dict[str, Any] = await client.call("get")
+        except FieldtwinError:
+            return None  # it is dying or gone: _notice_deaths says so with its reason
+        return answer
+
+    async def _judge(self) -> None:
+        gateway = self._clients.get("gateway")
+        if gateway is None or self._field is None:
+            return
+        try:
+            await self.oracle.update(gateway, self._field.client)
+        except FieldtwinError:
+            pass  # as above
+
+    # -- stopping -------------------------------------------------------------------------------------------------------
+
+    async def __aexit__(self, *exc: object) -> None:
+        try:
+            await self._stop_in_order()
+        finally:
+            await self._nursery.__aexit__(None, None, None)
+            await self._stack.aclose()
+
+    async def _stop_in_order(self) -> None:
+        self._notice_deaths()
+        if self.shore is not None:
+            await self.shore.halt()
+        await self.refresh()
+        gateway = self._clients.get("gateway")
+        if gateway is not None:
+            try:
+                answer = await gateway.call("stop", timeout_s=2.0)
+                self.outputs_confirmed_safe, self.gateway_status = answer["safe"], answer["status"]
+            except FieldtwinError as e:
+                self.note_error(f"the gateway did not stop in order: {e}")
+        self.field_status = await self._get(self._field.client if self._field else None) or self.field_status
+        await self._judge()

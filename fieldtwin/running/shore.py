@@ -1,0 +1,158 @@
+"""The far end: a transmitter of its own at the other side of the modems' link, and a script of commands.
+
+It is served by the same `TransmitterDriver` as the plant's side, over the same runtime; only what comes in and what goes
+out are the other way round. Commands are periods in seconds; the next is sent when its time has come and the transmitter
+took the last.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from gateway.connections.os_connector import OsConnector
+from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from gateway.core.connection import Connector
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FieldtwinError, UsageError
+from gateway.core.events import Consumer
+from gateway.core.nursery import Nursery
+from gateway.core.statemachine import encode_period
+from gateway.core.values import DATA, RESPONSE
+from gateway.devices.config import BusConfig, DeviceConfig
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.tags import TagTable
+from twin.system import System
+
+TICK_NS = 20 * NS_PER_MS
+KEPT_RESPONSES = 1000
+DEFAULT_SCRIPT = (1, 2, 0, -1)
+SCRIPT_TIMES = (0.1, 0.35, 0.65, 0.82)
+"""When the commands of a script are sent, as parts of the run: time for each state to be seen, and for the last to arrive."""
+
+
+@dataclass(frozen=True)
+class Scripted:
+    """A command: seconds after the start, and the period to command."""
+
+    at_s: float
+    period_s: int
+
+
+def script(periods: tuple[int, ...], duration_s: float) -> list[Scripted]:
+    """Spread commands over a run of `duration_s` seconds."""
+    if len(periods) == len(SCRIPT_TIMES):
+        return [Scripted(part * duration_s, p) for part, p in zip(SCRIPT_TIMES, periods, strict=True)]
+    return [Scripted((i + 0.5) * 0.85 * duration_s / len(periods), p) for i, p in enumerate(periods)]
+
+
+def parse_periods(text: str) -> tuple[int, ...]:
+    """``1,2,0,-1`` or ``none``. Raises `UsageError`."""
+    if text.strip().lower() in ("", "none"):
+        return ()
+    try:
+        periods = tuple(int(part) for part in text.split(","))
+        for period in periods:
+            encode_period(period)
+    except (ValueError, FieldtwinError) as e:
+        raise UsageError(
+            "a script of commands", expected="periods in seconds such as 1,2,0,-1, or none", got=text
+        ) from e
+    return periods
+
+
+class Shore:
+    """The far end of one transmitter of `system`, reached at `endpoint`."""
+
+    def __init__(
+        self, system: System, device: str, endpoint: Endpoint, clock: Clock, connector: Connector | None = None
+    ) -> None:
+        config: DeviceConfig = system.devices[device]
+        far = DeviceConfig(
+            name=f"{device}_far",
+            profile=config.profile,
+            bus="far",
+            address=config.address,
+            poll={"inbox": config.poll.get("inbox", 200)},
+        )
+        self._clock = clock
+        self._driver = TransmitterDriver(far, TagTable(clock), incoming=RESPONSE)
+        self._inbox: Consumer[DATA] = Consumer(self._driver.emitter.event, capacity=256)
+        self._driver.emitter.subscribe(self._inbox)
+        bus = BusConfig("far", endpoint, system.buses[config.bus].timeout_s, 1)
+        self._bus = ModbusBus(bus, [self._driver], connector or OsConnector(), clock, TagTable(clock), lambda d: None)
+        self._busy = False
+        self._halted = False
+        self.commands_sent: list[int] = []
+        self.responses: deque[bytes] = deque(maxlen=KEPT_RESPONSES)
+        self.responses_received = 0
+
+    async def run(self, commands: list[Scripted]) -> None:
+        """Serve the far end until cancelled, sending each command at its time."""
+        async with Nursery() as nursery:
+            nursery.start(self._bus.run(), "far transmitter")
+            nursery.start(self._cycle(deque(commands)), "far end")
+            await nursery.wait()
+
+    async def halt(self) -> None:
+        """Send and ask nothing more."""
+        self._halted = True
+        await self._bus.halt(0.5)
+
+    async def _cycle(self, commands: deque[Scripted]) -> None:
+        start_ns = self._clock.monotonic_ns()
+        while not self._halted:
+            now_ns = self._clock.monotonic_ns()
+            while commands and now_ns - start_ns >= commands[0].at_s * NS_PER_S:
+                self.send(commands.popleft().period_s)
+            for response in self._inbox.drain():
+                self.responses_received += 1
+                self.responses.append(response.data)
+            if not self._busy and self._bus.online(self._driver):
+                self._exchange()
+            await self._clock.sleep_until_ns(now_ns + TICK_NS)
+
+    def send(self, period_s: int) -> None:
+        """Command a period."""
+        self._driver.consumer.observe(encode_period(period_s))
+        self.commands_sent.append(period_s)
+
+    def _exchange(self) -> None:
+        driver = self._driver
+        if driver.to_acknowledge:
+            self._submit(Job(driver, driver.acknowledge, self._done))
+        elif driver.consumer.queue:
+            self._submit(Job(driver, driver.send if driver.outbox_free else self._ask, self._done))
+
+    async def _ask(self) -> None:
+        await self._driver.check_outbox()
+
+    def _submit(self, job: Job) -> None:
+        self._busy = True
+        self._bus.submit(job)
+
+    def _done(self, error: FieldtwinError | None) -> None:
+        self._busy = False
+
+    def describe(self) -> dict[str, Any]:
+        """What the far end did and saw, for a summary."""
+        return {
+            "connected": self._bus.connected,
+            "error": self._bus.error,
+            "commands_sent": list(self.commands_sent),
+            "commands_waiting": len(self._driver.consumer.queue),
+            "responses": self.responses_received,
+            "last_response": self.responses[-1].hex() if self.responses else "",
+        }
+
+
+async def run_for(shore: Shore, commands: list[Scripted], duration_s: float) -> None:
+    """Run a far end for a time: for the shore service on its own."""
+    try:
+        async with asyncio.timeout(duration_s or None):
+            await shore.run(commands)
+    except TimeoutError:
+        pass  # the time asked for is over

@@ -1,0 +1,152 @@
+"""The verdict on a run: what both sides counted, what was published, which states were seen, and whether all of it agrees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.running.session import RunSession
+from gateway.core.statemachine import delta
+
+
+def summarise(run: RunSession) -> dict[str, Any]:
+    """Plain data for `--json` and for people. `ok` is False when any check failed; `errors` says which and why."""
+    gateway = run.gateway_status or {}
+    plc = run.plc_status or {}
+    exchanges = _exchanges(run)
+    checks = [*_device_checks(gateway), *_plc_checks(plc), *_loss_checks(gateway)]
+    if run.options.prototype:
+        checks += _exchange_checks(exchanges) + _oracle_checks(run) + _state_checks(run)
+    errors = [*run.errors, *checks]
+    return {
+        "fieldtwin": __version__,
+        "system": run.system.name,
+        "system_hash": run.system.hash,
+        "prototype": run.options.prototype,
+        "instance": run.instance.name,
+        "duration_s": round(run.elapsed_s, 3),
+        "mapping": {str(plant): str(target) for plant, target in run.mapping.items()},
+        "devices": _devices(gateway),
+        "states": {program: run.states.sequence(program) for program in run.system.plc.programs},
+        "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
+        "exchanges": exchanges,
+        "published": {"values": gateway.get("published", 0), **run.oracle.describe()},
+        "mailboxes": gateway.get("mailboxes", {}),
+        "far_end": run.shore.describe() if run.shore else None,
+        "logged": gateway.get("logged", 0),
+        "writes": gateway.get("writes", {}),
+        "outputs_safe": run.outputs_confirmed_safe,
+        "plc": {
+            k: plc[k]
+            for k in (
+                "state",
+                "stop_reason",
+                "scans",
+                "missed_periods",
+                "overruns",
+                "lateness_us",
+                "duration_us",
+                "realtime",
+                "error",
+            )
+            if k in plc
+        },
+        "tags": gateway.get("tags", {}),
+        "errors": errors,
+        "ok": not errors,
+    }
+
+
+def _devices(gateway: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: {"state": "good" if d["online"] else "bad", "error": d["error"]}
+        for name, d in gateway.get("devices", {}).items()
+    }
+
+
+def _exchanges(run: RunSession) -> dict[str, Any]:
+    """Requests and replies a bus, as counted by the gateway and by the emulators on it."""
+    gateway, field = run.gateway_status or {}, run.field_status or {}
+    out: dict[str, Any] = {}
+    for name, bus in gateway.get("buses", {}).items():
+        counters = bus["counters"]
+        can = run.system.buses[name].endpoint.is_can
+        prefix = "sdo_" if can else ""
+        row: dict[str, Any] = {
+            "gateway": {
+                "requests": counters.get(f"{prefix}requests", 0),
+                "replies": counters.get(f"{prefix}replies", 0),
+            },
+            "timeouts": counters.get(f"{prefix}timeouts", 0),
+            "crc_errors": counters.get("crc_errors", 0),
+        }
+        if can:
+            row["gateway"]["pdos"] = counters.get("pdos", 0)
+            row["gateway"]["heartbeats"] = counters.get("heartbeats", 0)
+        devices = [d for d in run.system.devices_on(name) if d.name in field.get("devices", {})]
+        if devices:
+            row["emulators"] = {
+                what: sum(field["devices"][d.name]["counters"][what] for d in devices)
+                for what in ("requests", "replies")
+            }
+        out[name] = row
+    return out
+
+
+def _exchange_checks(exchanges: dict[str, Any]) -> list[str]:
+    failed = []
+    for bus, row in exchanges.items():
+        for what in ("requests", "replies"):
+            if "emulators" in row and row["gateway"][what] != row["emulators"][what]:
+                failed.append(
+                    f"{bus}: the gateway counted {row['gateway'][what]} {what}, the emulators {row['emulators'][what]}"
+                )
+        if "emulators" in row and not row["emulators"]["replies"]:
+            failed.append(f"{bus}: nothing was exchanged")
+    return failed
+
+
+def _device_checks(gateway: dict[str, Any]) -> list[str]:
+    return [f"{name}: {d['error']}" for name, d in gateway.get("devices", {}).items() if not d["online"] or d["error"]]
+
+
+def _plc_checks(plc: dict[str, Any]) -> list[str]:
+    if not plc:
+        return []  # its death is in the run's errors already
+    error = plc.get("error")
+    return [f"PLC: {error}"] if error else []
+
+
+def _loss_checks(gateway: dict[str, Any]) -> list[str]:
+    failed = [
+        f"{n}: {m['dropped']} messages were dropped" for n, m in gateway.get("mailboxes", {}).items() if m["dropped"]
+    ]
+    if gateway.get("log_dropped"):
+        failed.append(f"{gateway['log_dropped']} entries of the exchange log were dropped")
+    if gateway.get("store_error"):
+        failed.append(gateway["store_error"])
+    return failed
+
+
+def _oracle_checks(run: RunSession) -> list[str]:
+    oracle = run.oracle
+    if oracle.wrong_count:
+        return [f"{oracle.wrong_count} published values were never held by their device", *oracle.wrong]
+    return [] if oracle.checked else ["no value was published as good"]
+
+
+def _state_checks(run: RunSession) -> list[str]:
+    """The states must be those that the commands of the far end ask for, in order, beginning with STANDBY."""
+    if run.shore is None:
+        return []
+    expected = ["STANDBY"]
+    for period_s in run.shore.commands_sent:
+        state = delta(period_s).name
+        if state != expected[-1]:
+            expected.append(state)
+    failed = []
+    for program in run.system.plc.programs:
+        seen = run.states.sequence(program)
+        if seen and seen != expected:
+            failed.append(f"{program}: the commands ask for {' '.join(expected)}, seen were {' '.join(seen)}")
+    return failed

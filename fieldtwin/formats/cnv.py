@@ -1,9 +1,9 @@
 """Sea-Bird casts (.cnv, plain, .gz or .bz2) into recordings of the `ctd`.
 
 The format is Sea-Bird's "converted data file": header lines that begin with ``*`` (instrument) or ``#`` (processing), one
-line ``*END*``, then a row a scan of columns 11 characters wide (SBE Data Processing manual, file
-formats and short variable names). Text is Latin-1 in practice. Everything streams: memory does not
-grow with the file.
+line ``*END*``, then a row a scan of columns 11 characters wide (SBE Data Processing manual, file formats and short variable
+names). Text is Latin-1 in practice. Everything streams: memory does not grow with the file. It knows nothing of runs,
+emulators or the command line.
 """
 
 from __future__ import annotations

@@ -188,7 +188,7 @@ def test_above_19200_the_silence_is_fixed() -> None:
 def test_the_deadline_counts_from_the_end_of_transmission() -> None:
     async def scenario(client: ModbusClient, _: Device) -> None:
         start = CLOCK.monotonic_ns()
-        with pytest.raises(ReplyTimeout, match="rtu:/dev/ttyS9.*unit 1"):
+        with pytest.raises(ReplyTimeout, match=r"rtu:/dev/ttyS9.*unit 1"):
             await client.read_registers(1, "holding", 0, 1)
         waited_s = (CLOCK.monotonic_ns() - start) / 1e9
         assert waited_s >= 0.06 + 8 * 10 / 1200  # eight characters of ten bits

@@ -53,9 +53,10 @@ def play(vector: dict[str, Any], chunks: list[bytes]) -> tuple[Reply | errors.Fi
             if reply is not None:
                 return reply, now_ns >= transaction.deadline_ns
     except errors.FieldtwinError as e:
-        assert transaction.done
-        assert "unit 17" in str(e)
-        return e, now_ns >= transaction.deadline_ns
+        error = e
+    assert transaction.done
+    assert "unit 17" in str(error)
+    return error, now_ns >= transaction.deadline_ns
 
 
 def check(vector: dict[str, Any], chunks: list[bytes]) -> None:
@@ -95,7 +96,9 @@ def test_byte_by_byte(vector: dict[str, Any]) -> None:
     check(vector, [bytes([b]) for b in bytes.fromhex(vector["received"])])
 
 
-@pytest.mark.parametrize("tail", [b"\x00\x00\x00", b"\xff\x55", b"\x11\x03\x02\x00\x07"], ids=["zeros", "noise", "half"])
+@pytest.mark.parametrize(
+    "tail", [b"\x00\x00\x00", b"\xff\x55", b"\x11\x03\x02\x00\x07"], ids=["zeros", "noise", "half"]
+)
 @pytest.mark.parametrize("vector", [v for v in VECTORS if v.get("tail", True)], ids=ids)
 def test_with_trailing_garbage(vector: dict[str, Any], tail: bytes) -> None:
     check(vector, [bytes.fromhex(vector["received"]) + tail])

@@ -22,7 +22,7 @@ from gateway.core.image_layout import CHECK, RECORD_HEAD, RegionShape, RingShape
 from gateway.core.values import Quality, Reason, Scalar, TagValue
 
 MAX_LOOKS = 16
-"""How often a reader looks before it gives up for this time. Retries are rare: 0.0015 a read when four slots were tried (DESIGN.md)."""
+"""How often a reader looks before it gives up for now. Trying four slots gave 0.0015 retries a read (DESIGN.md)."""
 
 _NO_VALUE = 0x80  # in the quality byte: the tag has a quality and no value
 

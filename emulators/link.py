@@ -194,6 +194,8 @@ class Link:
         self.connection = EmulatedConnection(PROTOCOL.RS232 if serial else PROTOCOL.TCP)
         self.sessions = 0
         """How often the carrier came up."""
+        self.failed_attempts = 0
+        """How often it could not be had."""
         self.connected = False
         self._on_event = on_event
         self._last_event = ""
@@ -227,6 +229,7 @@ class Link:
                 if loop.time() - began_s >= self.options.proven_after_s:
                     wait_s = self.options.backoff_s
             except Unreachable as e:
+                self.failed_attempts += 1
                 self._event(f"waiting: {e}")
             finally:
                 self.connected = False
@@ -244,10 +247,11 @@ class Link:
         await self._far.aclose()
 
     def stats(self) -> dict[str, int]:
-        """Counters since the start, in bytes and in sessions."""
+        """Counters since the start."""
         c = self.connection
         return {
             "sessions": self.sessions,
+            "failed_attempts": self.failed_attempts,
             "written_bytes": c.written_bytes,
             "read_bytes": c.read_bytes,
             "dropped_write_bytes": c.dropped_write_bytes,

@@ -193,6 +193,9 @@ class TcpDoor:
             self.refused += 1
             end.wire.transport.abort()
             return
+        if self._next is not None:  # has finished sending before anybody attended to it
+            self.refused += 1
+            self._next.wire.transport.abort()
         self._next = end
         self._knock.set()
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.link_ends import TtyEnd
+from emulators.endpoints.link_ends import MAX_PENDING, TcpEnd, TtyEnd
 from emulators.link import EmulatedConnection, Link, LinkOptions, run_link
 from gateway.core.connection import PROTOCOL, TCPConnection
 from gateway.core.endpoint import Endpoint
@@ -49,7 +49,8 @@ class Driver:
 
         def enough() -> bool:
             with contextlib.suppress(BlockingIOError):
-                got.extend(os.read(self.fd, 65536))
+                while len(got) < size:
+                    got.extend(os.read(self.fd, 65536))
             return len(got) >= size
 
         await eventually(enough, within_s)
@@ -147,6 +148,7 @@ def test_every_byte_passes_both_ways_exactly_once(tmp_path: Path) -> None:
                 await answering
                 assert link.stats() == {
                     "sessions": 1,
+                    "failed_attempts": 0,
                     "written_bytes": len(outward),
                     "read_bytes": len(inward),
                     "dropped_write_bytes": 0,
@@ -190,7 +192,7 @@ def test_what_is_said_while_there_is_no_carrier_is_lost_and_counted_never_delive
             async with running(port(tmp_path), endpoint) as (link, events):
                 driver = Driver(tmp_path / "line1")
                 await driver.send(b"a stale request")
-                await eventually(lambda: link.stats()["dropped_write_bytes"] == 15)
+                await eventually(lambda: link.stats()["dropped_write_bytes"] == 15 and link.failed_attempts > 3)
                 assert not link.connected
                 assert sum(text.startswith("waiting") for text in events) == 1, "said once, not at every attempt"
                 sleeping.listen()
@@ -200,6 +202,50 @@ def test_what_is_said_while_there_is_no_carrier_is_lost_and_counted_never_delive
                 await eventually(lambda: link.connected)
                 await driver.send(b"fresh")
                 assert await receive(field, 5) == b"fresh"
+                driver.close()
+                field.close()
+
+    run(main())
+
+
+@pytest.mark.parametrize("away", ["waiting for a client", "between two attempts"])
+def test_the_line_is_cut_for_as_long_as_there_is_no_carrier(tmp_path: Path, away: str) -> None:
+    async def main() -> None:
+        with socket.socket() as nobody:
+            nobody.bind(("127.0.0.1", 0))
+            if away == "waiting for a client":
+                far = Endpoint.parse("tcp://127.0.0.1:0?listen=1")
+            else:
+                far = Endpoint("tcp", host="127.0.0.1", port=nobody.getsockname()[1])
+            async with running(port(tmp_path), far, LinkOptions(backoff_s=60, backoff_max_s=60)) as (link, _):
+                if away == "between two attempts":
+                    await eventually(lambda: link.failed_attempts == 1)
+                driver = Driver(tmp_path / "line1")
+                await driver.send(b"a stale request")
+                await eventually(lambda: link.stats()["dropped_write_bytes"] == 15)
+                driver.close()
+
+    run(main())
+
+
+def test_what_is_in_flight_is_bounded_and_a_slow_driver_loses_nothing(tmp_path: Path) -> None:
+    sent = random.Random(3).randbytes(8_000_000)  # more than both sockets and the link together hold
+
+    async def main() -> None:
+        with Far() as far:
+            async with running(port(tmp_path), far.endpoint, LinkOptions(stall_s=60)) as (link, _):
+                field = await far.accept()
+                driver = Driver(tmp_path / "line1")
+                sending = asyncio.create_task(asyncio.get_running_loop().sock_sendall(field, sent))
+                end = link._far.connection
+                assert isinstance(end, TcpEnd)
+                await eventually(lambda: end.wire.paused)
+                assert len(end.inbound.data_stream) <= MAX_PENDING
+                assert not sending.done()
+                got = await driver.receive(1_000_000, within_s=10)
+                assert got == sent[: len(got)]
+                sending.cancel()
+                await asyncio.gather(sending, return_exceptions=True)
                 driver.close()
                 field.close()
 

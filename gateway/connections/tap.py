@@ -77,7 +77,7 @@ class _TappedBytes(ByteConnection):
         self._observers = observers
         for chunk in inner.inbound.data_stream:  # arrived while it was being opened
             observers.saw(endpoint, Direction.RECEIVED, chunk)
-        inner.on_arrival = lambda chunk: observers.saw(endpoint, Direction.RECEIVED, chunk)
+        inner.on_arrival = self._arrived
 
     @property
     def lost(self) -> FieldtwinError | None:
@@ -88,6 +88,11 @@ class _TappedBytes(ByteConnection):
 
     def feed_lost(self, error: FieldtwinError) -> None:
         self._inner.feed_lost(error)
+
+    def _arrived(self, chunk: bytes) -> None:
+        self._observers.saw(self.endpoint, Direction.RECEIVED, chunk)
+        if self.on_arrival is not None:  # another tapped connector around this one
+            self.on_arrival(chunk)
 
     async def read(self) -> bytes:
         return await self._inner.read()
@@ -112,7 +117,7 @@ class _TappedCan(CanConnection):
         super().__init__(cast(CANConnection, inner.inbound), endpoint, inner.max_pending)
         for frame in inner.inbound.data_stream:
             observers.saw(endpoint, Direction.RECEIVED, frame)
-        inner.on_arrival = lambda frame: observers.saw(endpoint, Direction.RECEIVED, frame)
+        inner.on_arrival = self._arrived
 
     @property
     def lost(self) -> FieldtwinError | None:
@@ -131,6 +136,11 @@ class _TappedCan(CanConnection):
 
     def feed_lost(self, error: FieldtwinError) -> None:
         self._inner.feed_lost(error)
+
+    def _arrived(self, frame: CanFrame) -> None:
+        self._observers.saw(self.endpoint, Direction.RECEIVED, frame)
+        if self.on_arrival is not None:
+            self.on_arrival(frame)
 
     async def recv(self) -> CanFrame:
         return await self._inner.recv()

@@ -209,6 +209,25 @@ def test_taps_see_frames_and_overruns_stay_visible(tmp_path: Path) -> None:
     run(main())
 
 
+def test_a_tapped_connector_may_be_tapped_again() -> None:
+    async def main() -> None:
+        near, far = CaptureTap(), CaptureTap()
+        async with Echo() as target:
+            connector = TappedConnector(TappedConnector(Mapped(target), [far], WallClock()), [near], WallClock())
+            connection = await connector.open_bytes(PLANT)
+            await connection.write(b"x")
+            await eventually(lambda: near.stream(PLANT, Direction.RECEIVED) == b"hellox")
+            assert far.stream(PLANT, Direction.RECEIVED) == b"hellox"
+            assert near.stream(PLANT, Direction.SENT) == far.stream(PLANT, Direction.SENT) == b"x"
+            await connection.aclose()
+        bus = await connector.open_can(PLANT_CAN, 125_000)
+        await bus.send(CanFrame(0x605))
+        assert [str(c.item) for c in near.captured[-2:]] == [str(c.item) for c in far.captured[-2:]] == ["606#", "605#"]
+        await bus.aclose()
+
+    run(main())
+
+
 class Broken(CaptureTap):
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
         raise ValueError("a tap with a bug")

@@ -151,7 +151,9 @@ class FieldSide:
         pair, form = self._pairs.get(device.name), self.prototype.devices[device.name].form
         if pair is None or form.far is None:
             return
-        unit = ModbusUnit(pair.far, _limits(self.prototype.devices[device.name].profile), name=f"{device.name} (far)")
+        unit = ModbusUnit(
+            pair.far, unit_limits(self.prototype.devices[device.name].profile), name=f"{device.name} (far)"
+        )
         self.far_units[device.name] = unit
         self.far[device.name] = await self._listen(
             Endpoint.parse(form.far), lambda c: serve_mbap(c, MbapSlave({device.address: unit}), self._clock, latency_s)
@@ -186,12 +188,12 @@ class FieldSide:
                 seed=self.prototype.seed,
             )
             self._pairs[config.name] = pair
-            unit = ModbusUnit(pair.near, _limits(emulated.profile), name=config.name)
+            unit = ModbusUnit(pair.near, unit_limits(emulated.profile), name=config.name)
             modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
             modem.journal = pair.near.journal
             return unit
         bank = SampledSensor(emulated.profile, self._player(emulated), emulated.form.identity)
-        unit = ModbusUnit(bank, _limits(emulated.profile), name=config.name)
+        unit = ModbusUnit(bank, unit_limits(emulated.profile), name=config.name)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = bank.journal
         return unit
@@ -271,7 +273,7 @@ class FieldSide:
         }
 
 
-def _limits(profile: DeviceProfile) -> UnitLimits:
+def unit_limits(profile: DeviceProfile) -> UnitLimits:
     limits = profile.form.limits
     functions = frozenset(limits.functions) if limits.functions is not None else UnitLimits().functions
     return UnitLimits(functions=functions, read_registers=limits.read_registers, even_only=limits.even_only)

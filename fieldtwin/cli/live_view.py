@@ -9,20 +9,18 @@ import asyncio
 from types import TracebackType
 from typing import Any
 
-from rich.console import Console, Group, RenderableType
+from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from fieldtwin.cli.talk import data, talk
 from fieldtwin.running.session import RunSession
 
 COLOUR = {"good": "green", "uncertain": "yellow", "bad": "red", "substituted": "magenta", "simulated": "cyan"}
 REFRESH_S = 0.25
 LINE_S = 1.0
 MAX_TAGS = 40
-
-talk = Console(stderr=True, highlight=False)
-data = Console(highlight=False)
 
 
 def print_mapping(session: RunSession) -> None:

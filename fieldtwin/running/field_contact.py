@@ -41,15 +41,24 @@ async def contact_here(client: ControlClient, system: System) -> FieldContact:
     return await _contact(client, system, "localhost", None)
 
 
-async def contact_elsewhere(host_port: str, token: str, system: System, run_dir: Path) -> FieldContact:
-    """The field side was started elsewhere; `host_port` is its control channel, ``HOST`` or ``HOST:PORT``."""
+async def connect_control(host_port: str, token: str) -> tuple[ControlClient, str]:
+    """Connect to the control channel at ``HOST`` or ``HOST:PORT``; the client and the host's name."""
     host, colon, port = host_port.rpartition(":")
     if not colon:
         host, port = host_port, str(DEFAULT_CONTROL_PORT)
     if not port.isdigit():
         raise UsageError("the field side's address", expected="HOST or HOST:PORT", got=host_port)
-    client = await ControlClient.connect_tcp(host, int(port), token)
-    return await _contact(client, system, host, run_dir)
+    return await ControlClient.connect_tcp(host, int(port), token), host
+
+
+async def contact_elsewhere(host_port: str, token: str, system: System, run_dir: Path) -> FieldContact:
+    """The field side was started elsewhere; `host_port` is its control channel."""
+    client, host = await connect_control(host_port, token)
+    try:
+        return await _contact(client, system, host, run_dir)
+    except BaseException:
+        await client.aclose()
+        raise
 
 
 async def _contact(client: ControlClient, system: System, host: str, run_dir: Path | None) -> FieldContact:
@@ -65,7 +74,7 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
     try:
         for bus_name, url in status["listening"].items():
             plant = system.buses[bus_name].endpoint
-            listening = _reachable(Endpoint.parse(url), host)
+            listening = reachable(Endpoint.parse(url), host)
             if plant.is_serial and listening.scheme != "pty":
                 assert run_dir is not None
                 link = LinkChild(run_dir / bus_name, listening, run_dir / f"link-{bus_name}.log")
@@ -73,7 +82,7 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
                 await link.ready()
                 listening = Endpoint("pty", path=str(run_dir / bus_name))
             contact.mapping[plant] = mapped_endpoint(plant, listening)
-        contact.far = {device: _reachable(Endpoint.parse(url), host) for device, url in status["far"].items()}
+        contact.far = {device: reachable(Endpoint.parse(url), host) for device, url in status["far"].items()}
     except BaseException:
         await contact.aclose()
         raise
@@ -83,7 +92,7 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
     return contact
 
 
-def _reachable(listening: Endpoint, host: str) -> Endpoint:
+def reachable(listening: Endpoint, host: str) -> Endpoint:
     """The endpoint as seen from here: a wildcard address is the host that we reached the field side at."""
     if listening.scheme == "pty":
         if host not in LOCAL_HOSTS:

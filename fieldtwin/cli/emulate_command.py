@@ -1,0 +1,115 @@
+"""`fieldtwin emulate`: the field side of a system in this terminal, or one device on a wire of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import click
+
+from fieldtwin.cli.options import pairs, profiles_option
+from fieldtwin.running.field_contact import DEFAULT_CONTROL_PORT
+from gateway.core.errors import UsageError
+from twin.data_files import data_root, find
+
+
+@click.command("emulate")
+@click.argument("what")
+@click.option(
+    "--on", "endpoints", multiple=True, metavar="ENDPOINT", help="For a device or recording: where it listens."
+)
+@click.option(
+    "--unit", type=click.IntRange(1, 247), default=None, help="For a device: its unit id; default as the profile says."
+)
+@click.option("--recording", "recordings", multiple=True, metavar="[DEVICE=]FILE", help="Play this recording.")
+@click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
+@click.option(
+    "--prototype-file", type=click.Path(exists=True, dir_okay=False), help="For a system: another prototype file."
+)
+@click.option(
+    "--listen", multiple=True, metavar="BUS=ENDPOINT", help="For a system: let a bus's emulators listen elsewhere."
+)
+@click.option(
+    "--control",
+    default=f"127.0.0.1:{DEFAULT_CONTROL_PORT}",
+    show_default=True,
+    metavar="HOST:PORT",
+    help="For a system: where `fieldtwin run --field` finds it.",
+)
+@click.option("--token", default="", help="Whoever connects to --control must know it; needed off loopback.")
+@click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field.")
+@profiles_option
+def command(
+    what: str,
+    endpoints: tuple[str, ...],
+    unit: int | None,
+    recordings: tuple[str, ...],
+    speed: float,
+    prototype_file: str | None,
+    listen: tuple[str, ...],
+    control: str,
+    token: str,
+    instance: str,
+    profiles: tuple[str, ...],
+) -> int:
+    """Emulate WHAT: a system, a device profile, or a recording; the file tells, a bare name is a profile, then a system.
+
+    \b
+    fieldtwin emulate observatory                                    the whole field side, for run --field localhost
+    fieldtwin emulate ctd-reference --on pty:/tmp/ctd                one sensor on a virtual serial port
+    fieldtwin emulate ctd-reference --on tcp://127.0.0.1:1502        the same on Modbus TCP
+    """
+    kind, path = _kind(what, tuple(Path(p) for p in profiles))
+    if kind == "system":
+        if endpoints or unit is not None:
+            raise UsageError(
+                "--on and --unit are for a single device", hint="a system's prototype file says where it listens"
+            )
+        from fieldtwin.running.field_here import FieldOptions, run_field
+
+        return asyncio.run(
+            run_field(
+                FieldOptions(
+                    system=path,
+                    prototype_file=Path(prototype_file) if prototype_file else None,
+                    recordings=pairs(recordings, "--recording"),
+                    speed=speed,
+                    listen=pairs(listen, "--listen"),
+                    control=control,
+                    token=token,
+                    instance=instance,
+                    profiles=tuple(Path(p) for p in profiles),
+                )
+            )
+        )
+    from fieldtwin.running.device_here import run_device
+
+    if not endpoints:
+        raise UsageError("where shall it listen?", expected="--on pty:PATH or --on tcp://HOST:PORT")
+    if len(recordings) > 1:
+        raise UsageError("one device plays one recording")
+    return asyncio.run(
+        run_device(kind, path, endpoints, unit, Path(recordings[0]) if recordings else None, speed or 1.0)
+    )
+
+
+def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
+    """What `what` names: ("system" | "device" | "recording", file)."""
+    direct = Path(what)
+    if direct.suffix == ".jsonl":
+        shipped = data_root() / "recordings" / what
+        return "recording", direct if direct.is_file() else shipped
+    if direct.is_file():
+        from gateway.core.yaml_file import load
+
+        return ("system" if "system" in load(direct).data else "device"), direct
+    try:
+        return "device", find("devices", what, extra=profiles)
+    except UsageError as no_device:
+        try:
+            return "system", find("systems", what, extra=profiles)
+        except UsageError as no_system:
+            raise UsageError(
+                f"no device profile, system or recording {what!r}",
+                expected=f"{no_device.expected}; or {no_system.expected}",
+            ) from None

@@ -1,0 +1,171 @@
+"""One emulated device on wires of its own: what `fieldtwin emulate DEVICE|RECORDING --on ENDPOINT...` runs.
+
+The same device may listen on several wires at once; its registers are one and the same behind all of them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+
+from emulators.canopen.dictionary import load_eds
+from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.canopen.serve import serve_node
+from emulators.context import WhenUsedUp
+from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.can_end import open_can_end
+from emulators.endpoints.pty import PtyEnd
+from emulators.endpoints.socket_end import OnClient, SocketListener
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.rtu import RtuSlave
+from emulators.modbus.serve import serve_mbap, serve_rtu
+from emulators.modbus.unit import ModbusUnit
+from emulators.models.mailbox_modem import ModemPair
+from emulators.models.played_objects import PlayedObjects
+from emulators.models.sampled_sensor import SampledSensor
+from emulators.replay.replay import ExchangeReplay
+from emulators.replay.unit import ReplayUnit
+from emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.cli.talk import talk
+from gateway.core.connection import ByteConnection, CanConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.nursery import Nursery
+from gateway.core.profile import DeviceProfile, load_profile
+from gateway.core.recording import RecordingReader
+from gateway.wallclock import WallClock
+from twin.data_files import find_recording
+from twin.field import unit_limits
+
+DEFAULT_RECORDINGS = {"fieldtwin/ctd-reference": "cast.jsonl", "fieldtwin/inclinometer-cia410": "incl.jsonl"}
+"""What a shipped reference device plays when nothing else is said."""
+
+
+async def run_device(
+    kind: str, path: Path, endpoints: tuple[str, ...], unit_id: int | None, recording: Path | None, speed: float
+) -> int:
+    """Serve until SIGINT or SIGTERM."""
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    host = DeviceHost(speed)
+    async with Nursery() as nursery:
+        try:
+            wires = [Endpoint.parse(url) for url in endpoints]
+            if kind == "recording":
+                units = host.replayed(path, unit_id)
+            else:
+                profile = load_profile(path)
+                if profile.protocol == "canopen":
+                    await host.serve_can(nursery, profile, wires, unit_id, recording)
+                    units = {}
+                else:
+                    units = {unit_id or profile.form.factory.unit: host.modbus(profile, recording)}
+            if units:
+                for wire in wires:
+                    await host.serve(nursery, units, wire)
+            stopping = nursery.start(stop.wait(), "until stopped")
+            await asyncio.wait([stopping])
+        finally:
+            await host.aclose()
+    return 0
+
+
+class DeviceHost:
+    """Builds a device and puts it on wires."""
+
+    def __init__(self, speed: float) -> None:
+        self._clock = WallClock()
+        self._speed = speed
+        self._closing: list[SocketListener | SoftBusServer | ByteConnection | CanConnection] = []
+
+    def modbus(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
+        """The unit that a Modbus profile describes."""
+        if profile.inbox is not None:
+            pair = ModemPair(profile, bytes_per_s=400, latency_s=0.2, loss=0.0, seed=1)
+            return ModbusUnit(pair.near, unit_limits(profile), name=profile.name)
+        identity = {t.name: "0000" for t in profile.tags.values() if t.type == "string"}
+        bank = SampledSensor(profile, self._player(profile, recording), identity)
+        return ModbusUnit(bank, unit_limits(profile), name=profile.name)
+
+    def replayed(self, path: Path, unit_id: int | None) -> dict[int, ModbusUnit]:
+        """The units of a recording of exchanges, or the one that is asked for."""
+        with RecordingReader(path) as reader:
+            if reader.header.kind != "exchanges":
+                raise UsageError(
+                    "a recording of signals needs a device to play it",
+                    where=str(path),
+                    hint=f"fieldtwin emulate PROFILE --recording {path.name} --on ...",
+                )
+            replay = ExchangeReplay(reader.exchanges())
+        wanted = [unit_id] if unit_id is not None else list(replay.units)
+        return {number: ReplayUnit(replay, number, f"{path.name}:{number}") for number in wanted}
+
+    def _player(self, profile: DeviceProfile, recording: Path | None) -> SignalPlayer:
+        name = recording or DEFAULT_RECORDINGS.get(profile.name)
+        if name is None:
+            raise UsageError(f"{profile.name} needs a recording to play", hint="--recording FILE")
+        track = SignalTrack.load(find_recording(str(name)))
+        return SignalPlayer(track, self._clock.monotonic_ns(), speed=self._speed, at_end=WhenUsedUp.LOOP)
+
+    async def serve(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
+        """Modbus units on a pty, on RTU over TCP, or on Modbus TCP."""
+        if wire.scheme == "pty":
+            plant = Endpoint("rtu", path=wire.path, params=wire.params)
+            end = await PtyEnd.open(Path(wire.path), plant, plant.serial)
+            self._closing.append(end)
+            nursery.start(serve_rtu(end, RtuSlave(units), self._clock), f"units on {wire}")
+            talk.print(
+                f"units {_list(units)} on {wire.path} ({plant.serial.baudrate} {plant.serial.frame})", soft_wrap=True
+            )
+        elif wire.scheme == "rtu+tcp":
+            line = RtuSlave(units)
+            await self._listen(wire, units, lambda c: serve_rtu(c, line, self._clock), 1)
+        elif wire.scheme == "tcp":
+            await self._listen(wire, units, lambda c: serve_mbap(c, MbapSlave(units), self._clock), 32)
+        else:
+            raise UsageError(f"cannot emulate on {wire}", expected="pty:PATH, tcp://HOST:PORT or rtu+tcp://HOST:PORT")
+
+    async def _listen(
+        self, wire: Endpoint, units: dict[int, ModbusUnit], on_client: OnClient, max_clients: int
+    ) -> None:
+        listener = await SocketListener.open(wire, on_client, max_clients)
+        self._closing.append(listener)
+        talk.print(f"units {_list(units)} on {listener.bound}", soft_wrap=True)
+
+    async def serve_can(
+        self,
+        nursery: Nursery,
+        profile: DeviceProfile,
+        wires: list[Endpoint],
+        node_id: int | None,
+        recording: Path | None,
+    ) -> None:
+        """A CANopen node on one bus: a software bus that is made here (``can:fieldtwin/HOST:PORT``), or a kernel interface."""
+        if len(wires) != 1 or not wires[0].is_can:
+            raise UsageError(
+                "a CANopen node stands on one bus", expected="--on can:fieldtwin/127.0.0.1:0 or can:socketcan/vcan0"
+            )
+        eds = profile.eds_path
+        assert eds is not None
+        dictionary = load_eds(eds)
+        source = PlayedObjects(profile.tags.values(), dictionary, self._player(profile, recording))
+        node = CanopenNode(dictionary, node_id or profile.form.factory.node, NodeContext(source=source))
+        if wires[0].interface == "fieldtwin":
+            bus = await SoftBusServer.open(wires[0], 125_000)
+            self._closing.append(bus)
+            connection, where = bus.attach(profile.name), bus.bound
+        else:
+            connection, where = await open_can_end(wires[0], 125_000), wires[0]
+        self._closing.append(connection)
+        nursery.start(serve_node(connection, node, self._clock), f"node on {where}")
+        talk.print(f"node {node.node_id} on {where}", soft_wrap=True)
+
+    async def aclose(self) -> None:
+        for thing in reversed(self._closing):
+            await thing.aclose()
+
+
+def _list(units: dict[int, ModbusUnit]) -> str:
+    return ", ".join(map(str, units))

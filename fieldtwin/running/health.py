@@ -1,0 +1,157 @@
+"""What this computer can do: each check says what it found and, where something is missing, what to change."""
+
+from __future__ import annotations
+
+import errno
+import os
+import platform
+import resource
+import shutil
+import socket
+import tty
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from fieldtwin.__about__ import __version__
+from gateway.core.errors import FieldtwinError
+from twin.data_files import data_root
+from twin.instance import runtime_root
+from twin.system import load_system
+
+MIN_FREE_BYTES = 200 * 1024 * 1024
+MIN_OPEN_FILES = 1024
+
+
+class Verdict(Enum):
+    """NOTE: something optional is missing, and everything else works."""
+
+    OK = "ok"
+    NOTE = "note"
+    BAD = "bad"
+
+
+@dataclass(frozen=True)
+class Check:
+    name: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+
+
+def examine() -> list[Check]:
+    """Run every check; none of them changes anything but temporary files."""
+    checks: tuple[Callable[[], Check], ...] = (
+        _python,
+        _data,
+        _run_directory,
+        _pty,
+        _serial,
+        _can,
+        _realtime,
+        _files,
+        _disk,
+    )
+    return [check() for check in checks]
+
+
+def _python() -> Check:
+    found = f"fieldtwin {__version__}, Python {platform.python_version()}, {platform.system()} {platform.machine()}"
+    return Check("python", Verdict.OK, found)
+
+
+def _data() -> Check:
+    try:
+        root = data_root()
+        system = load_system(str(root / "profiles" / "systems" / "observatory.yaml"))
+    except FieldtwinError as e:
+        return Check("shipped data", Verdict.BAD, str(e), "reinstall fieldtwin")
+    profiles = len(list((root / "profiles" / "devices").glob("*.yaml")))
+    recordings = len(list((root / "recordings").glob("*.jsonl")))
+    return Check(
+        "shipped data", Verdict.OK, f"system {system.name}, {profiles} profiles, {recordings} recordings in {root}"
+    )
+
+
+def _run_directory() -> Check:
+    root = runtime_root()
+    try:
+        root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        probe = root / f".doctor-{os.getpid()}"
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as e:
+        return Check("run directory", Verdict.BAD, f"{root}: {e.strerror}", "set FIELDTWIN_RUN to a folder of yours")
+    return Check("run directory", Verdict.OK, str(root))
+
+
+def _pty() -> Check:
+    try:
+        master, slave = os.openpty()
+        try:
+            tty.setraw(slave)
+            os.write(master, b"\x11\x03")
+            whole = os.read(slave, 2) == b"\x11\x03"
+        finally:
+            os.close(master)
+            os.close(slave)
+    except OSError as e:
+        return Check("virtual serial", Verdict.BAD, f"no pty: {e.strerror}", "mount devpts on /dev/pts")
+    if not whole:
+        return Check("virtual serial", Verdict.BAD, "a raw pty changes bytes", "report this")
+    return Check("virtual serial", Verdict.OK, "ptys work")
+
+
+def _serial() -> Check:
+    from serial.tools.list_ports import comports
+
+    ports = [p.device for p in comports()]
+    closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]
+    if closed:
+        return Check(
+            "serial ports", Verdict.NOTE, f"no access to {', '.join(closed)}", "join the group dialout and log in again"
+        )
+    return Check("serial ports", Verdict.OK, ", ".join(ports) or "none (prototypes need none)")
+
+
+def _can() -> Check:
+    if not hasattr(socket, "PF_CAN"):
+        return Check("kernel CAN", Verdict.NOTE, "this Python has no SocketCAN", "prototypes use the software CAN bus")
+    try:
+        socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError as e:
+        reason = "no CAN in this kernel" if e.errno in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT) else str(e.strerror)
+        return Check(
+            "kernel CAN", Verdict.NOTE, reason, "prototypes use the software CAN bus; a plant needs `modprobe can-raw`"
+        )
+    names = [p.parent.name for p in Path("/sys/class/net").glob("*/type") if p.read_text().strip() == "280"]
+    return Check(
+        "kernel CAN", Verdict.OK, ", ".join(names) or "available, no interface (`ip link add vcan0 type vcan`)"
+    )
+
+
+def _realtime() -> Check:
+    soft = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    allowed = os.geteuid() == 0 or soft > 0 or soft == resource.RLIM_INFINITY
+    if not allowed:
+        advice = "for a steadier scan: rtprio and memlock in /etc/security/limits.d, or CAP_SYS_NICE"
+        return Check("real time", Verdict.NOTE, "SCHED_FIFO is not allowed", advice)
+    return Check("real time", Verdict.OK, "SCHED_FIFO may be used")
+
+
+def _files() -> Check:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft < MIN_OPEN_FILES:
+        return Check("open files", Verdict.NOTE, f"limit {soft}", f"ulimit -n {min(hard, 4096)} for many devices")
+    return Check("open files", Verdict.OK, f"limit {soft}")
+
+
+def _disk() -> Check:
+    root = runtime_root()
+    existing = next(p for p in (root, *root.parents) if p.exists())
+    free = shutil.disk_usage(existing).free
+    found = f"{free // (1024 * 1024)} MiB free at {existing}"
+    if free < MIN_FREE_BYTES:
+        return Check("disk", Verdict.BAD, found, "logs and stores need room")
+    return Check("disk", Verdict.OK, found)

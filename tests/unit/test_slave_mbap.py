@@ -86,8 +86,8 @@ def test_mb_055_a_length_that_cannot_be(length: int) -> None:
 
 def test_mb_054_and_055_are_counted() -> None:
     slave = make_slave()
-    slave.feed(adu(7, 1, READ, protocol=1) + b"\x00\x07\x00\x00\x00\x00" + OURS, 0)
-    assert (slave.discarded, slave.requests) == (2, 1)
+    slave.feed(adu(7, 1, READ, protocol=1) + b"\x00\x07\x00\x00\x00\x00\x00\x07\x00\x00\x00\x01\x01" + OURS, 0)
+    assert (slave.discarded, slave.requests) == (3, 1)
 
 
 def test_mb_057_several_units_behind_one_address() -> None:

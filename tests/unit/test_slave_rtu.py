@@ -199,6 +199,20 @@ def test_mb_047_counters_are_true_to_the_wire() -> None:
     assert line.whole(crc("02 08 000F 0000")).replies[2:] == [crc("02 08 000F 0001")]
     one = slave.units[1].counters
     assert (one.requests, one.replies, one.broadcasts) == (1, 1, 1)
+    # four messages before that were not its own reply, three requests to 2 and their replies, and this one
+    assert line.whole(crc("01 08 000B 0000")).replies[3:] == [crc("01 08 000B 000B")]
+
+
+def test_mb_008_a_stray_byte_is_noise_and_no_damaged_frame() -> None:
+    slave = make_slave()
+    Line(slave).whole(b"\x00" + READ).pause().whole(b"\xff\xff\xff").pause().whole(READ)
+    assert (slave.counters.crc_errors, slave.counters.noise_bytes, slave.counters.frames) == (0, 4, 2)
+
+
+def test_mb_032_a_frame_of_unknown_length_between_others_is_no_noise() -> None:
+    slave = make_slave()
+    Line(slave).bytewise(crc("05 64 010203") + READ)
+    assert (slave.counters.noise_bytes, slave.counters.frames) == (0, 2)
 
 
 def test_unit_ids_of_a_line() -> None:

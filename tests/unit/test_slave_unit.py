@@ -63,6 +63,7 @@ ROWS = [
     pytest.param("2B 0E 01 00", "AB 01", id="MB-033 function the device has not"),
     pytest.param("83 02", None, id="MB-035 function from 80h: silence"),
     pytest.param("FF", None, id="MB-035 function FFh: silence"),
+    pytest.param("80 00", None, id="MB-035 function 80h: silence"),
     pytest.param("", None, id="no PDU at all"),
     pytest.param("03 00 00 00 00", "83 03", id="MB-036 no register"),
     pytest.param("03 00 00 00 7E", "83 03", id="MB-036 126 registers"),

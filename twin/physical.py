@@ -23,9 +23,9 @@ from plc.config import PlcConfig, ProgramConfig
 from twin.system import System
 
 MESSAGE_DEPTH = 16
-PLC_LOST_CYCLES = 30
+PLC_LOST_CYCLES = 50
 """The PLC's outputs count no more when it has not published for so many cycles, and for `PLC_LOST_MS` at least."""
-PLC_LOST_MS = 300
+PLC_LOST_MS = 500
 GATEWAY_LOST_MS = 1000
 
 

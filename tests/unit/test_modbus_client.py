@@ -453,10 +453,12 @@ def test_mb_002_the_rest_of_a_damaged_reply_does_not_reach_the_next_request() ->
         await device.send("00 99 88 77")
         with pytest.raises(CrcError):
             await first
+        damaged_ns = CLOCK.monotonic_ns()
         await device.send("66 55")
         answering(device, 6)
         assert (await client.read_registers(1, "holding", 0, 1)).registers == (6,)
         assert client.counters.late_bytes == 5
+        assert device.requests[1][0] - damaged_ns >= 20_000_000  # as long as a USB adapter may hold the rest back
 
     with_client(scenario)
 

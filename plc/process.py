@@ -22,7 +22,6 @@ from typing import Any
 from gateway.core.control import ControlServer
 from gateway.core.errors import FileInvalid, Unreachable
 from gateway.core.image import Image
-from gateway.core.values import TagValue
 from plc.binding import BoundProgram
 from plc.config import PlcConfig
 from plc.realtime import RealtimeReport, monotonic_ns, prepare, run_task
@@ -90,7 +89,7 @@ class PlcProcess:
             "counters": self._scan.counters(),
             "realtime": self._realtime.describe(),
             "programs": {p.name: type(p.program).__name__ for p in self._programs},
-            "inputs": {tag: _describe(value, now_ns) for tag, value in self._scan.inputs().items()},
+            "inputs": {tag: value.describe(now_ns) for tag, value in self._scan.inputs().items()},
             "outputs": outputs,
             "variables": {f"{p.name}.{v.name}": outputs[tag] for p in self._programs for v, tag in p.published()},
         }
@@ -110,12 +109,3 @@ def plc_main(config: PlcConfig) -> int:
         os.close(fd)
     with mapped, memoryview(mapped) as memory, config.image_layout().attach(memory) as image:
         return PlcProcess(config, image).run()
-
-
-def _describe(value: TagValue, now_ns: int) -> dict[str, Any]:
-    return {
-        "value": value.value,
-        "quality": str(value.quality),
-        "reason": str(value.reason),
-        "age_s": value.age_s(now_ns) if value.t_ns else None,
-    }

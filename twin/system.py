@@ -20,6 +20,9 @@ from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from twin.data_files import find
 from twin.system_schema import DeviceForm, PlcForm, SystemForm
 
+SCHEMES = ("rtu", "tcp", "rtu+tcp", "can")
+"""What the gateway can talk over so far."""
+
 
 @dataclass(frozen=True)
 class System:
@@ -66,6 +69,8 @@ def _bus(file: YamlFile, name: str, url: str, timeout_ms: int, retries: int, bit
         endpoint = Endpoint.parse(url)
         if endpoint.scheme == "pty":
             raise UsageError("a pty is made by an emulator", expected="the plant's endpoint, such as rtu:/dev/ttyS0")
+        if endpoint.scheme not in SCHEMES:
+            raise UsageError(f"this version does not speak {endpoint.scheme}", expected=", ".join(SCHEMES))
     except UsageError as e:
         raise file.error(("buses", name, "url"), e.message, expected=e.expected, got=e.got) from e
     return BusConfig(name, endpoint, timeout_ms / 1000, retries, bitrate)

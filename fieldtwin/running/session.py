@@ -20,7 +20,7 @@ from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, con
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.oracle import Oracle
 from fieldtwin.running.shore import Scripted, Shore, script
-from fieldtwin.running.states import StateWatch
+from fieldtwin.running.states import StateWatch, expected_states
 from gateway.core.control import ControlClient
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError
@@ -36,6 +36,7 @@ from twin.system import System, load_system
 WATCH_S = 0.02
 ORACLE_S = 1.0
 MAX_ERRORS = 100
+SETTLE_S = 4.0
 
 
 class RunSession:
@@ -167,8 +168,19 @@ class RunSession:
             await asyncio.wait([waiting, done], timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
             if done.done():
                 done.result()
+            elif not waiting.done():
+                await self._settle()
         finally:
             done.cancel()
+
+    async def _settle(self) -> None:
+        """The time is over; a command that is still under way may arrive, for `SETTLE_S` seconds at most."""
+        deadline_s = self.elapsed_s + SETTLE_S
+        while self.shore is not None and self.elapsed_s < deadline_s and not self.stopped.is_set():
+            expected = expected_states(self.shore.commands_sent)
+            if all(self.states.sequence(p) == expected for p in self.states.current):
+                return
+            await asyncio.sleep(WATCH_S)
 
     @property
     def elapsed_s(self) -> float:

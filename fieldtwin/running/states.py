@@ -7,12 +7,22 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gateway.core.image import OUTPUTS, ImageLayout, RegionReader
-from gateway.core.statemachine import STATES
+from gateway.core.statemachine import STATES, delta
 from twin.physical import attached
 from twin.system import System
 
 NAMES = list(STATES)
 MAX_TRANSITIONS = 10_000
+
+
+def expected_states(periods_s: list[int]) -> list[str]:
+    """The states that these commands ask for, in order, beginning with STANDBY; the same state twice is one."""
+    expected = ["STANDBY"]
+    for period_s in periods_s:
+        state = delta(period_s).name
+        if state != expected[-1]:
+            expected.append(state)
+    return expected
 
 
 class StateWatch:

@@ -6,7 +6,7 @@ from typing import Any
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.running.session import RunSession
-from gateway.core.statemachine import delta
+from fieldtwin.running.states import expected_states
 
 
 def summarise(run: RunSession) -> dict[str, Any]:
@@ -139,11 +139,7 @@ def _state_checks(run: RunSession) -> list[str]:
     """The states must be those that the commands of the far end ask for, in order, beginning with STANDBY."""
     if run.shore is None:
         return []
-    expected = ["STANDBY"]
-    for period_s in run.shore.commands_sent:
-        state = delta(period_s).name
-        if state != expected[-1]:
-            expected.append(state)
+    expected = expected_states(run.shore.commands_sent)
     failed = []
     for program in run.system.plc.programs:
         seen = run.states.sequence(program)

@@ -108,5 +108,14 @@ class TagValue:
         """Seconds since the source had this value; infinite when it never had one."""
         return (now_ns - self.t_ns) / 1e9 if self.t_ns else float("inf")
 
+    def describe(self, now_ns: int) -> dict[str, Scalar | None]:
+        """For JSON: value (bytes as hex), quality, reason, and age in seconds, None where there never was a value."""
+        return {
+            "value": self.value.hex() if isinstance(self.value, bytes) else self.value,
+            "quality": str(self.quality),
+            "reason": str(self.reason),
+            "age_s": self.age_s(now_ns) if self.t_ns else None,
+        }
+
 
 NEVER = TagValue(None, Quality.BAD, Reason.NEVER_READ)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import FieldtwinError, NotAllowed
+from gateway.core.errors import FieldtwinError, NotAllowed, Unreachable
 from gateway.core.values import Quality
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
@@ -116,10 +116,21 @@ class OutputWriter:
             self.refusals += 1
             self._audit.note("refuse", name, by=output.by, result=str(e), tag=output.tag, old=old, new=value)
             return
-        self._audit.note("write", name, by=output.by, result="asked", tag=output.tag, old=old, new=value)
+        if not self._on_record(output, name, old, value):
+            return
         output.pending = True
         output.driver.consumer.observe(command)
         output.bus.submit(Job(output.driver, output.driver.send, partial(self._done, output, value)))
+
+    def _on_record(self, output: Output, name: str, old: object, value: float) -> bool:
+        """Note the write before it happens. Without a record only a safe value is written; the rest is tried again."""
+        try:
+            self._audit.note("write", name, by=output.by, result="asked", tag=output.tag, old=old, new=value)
+        except Unreachable:
+            self.failures += 1
+            output.next_try_ns = self._now_ns + RETRY_NS
+            return self.safe_active
+        return True
 
     def _check(self, output: Output) -> None:
         where = output.driver.config.where
@@ -140,4 +151,7 @@ class OutputWriter:
             self.failures += 1
             output.driver.consumer.queue.clear()  # the command that failed must not go out ahead of a newer one
         result = "done" if error is None else f"failed: {error}"
-        self._audit.note("write", output.driver.config.name, by=output.by, result=result, tag=output.tag, new=value)
+        try:
+            self._audit.note("write", output.driver.config.name, by=output.by, result=result, tag=output.tag, new=value)
+        except Unreachable:
+            self.failures += 1  # counted; the next write will not start without a record

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateway.core.values import TagValue
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.canopen_bus import CanopenBus
 from gateway.runtime.gateway import Gateway
@@ -15,7 +14,7 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
     return {
         "devices": _devices(gateway),
         "buses": {name: _bus(bus) for name, bus in gateway.buses.items()},
-        "tags": {name: tag_dict(gateway.tags.current(name, now_ns), now_ns) for name in gateway.tags.names},
+        "tags": {name: gateway.tags.current(name, now_ns).describe(now_ns) for name in gateway.tags.names},
         "outputs": [
             {"tag": o.tag, "wanted": o.wanted, "held": o.held, "by": o.by, "refused": o.refused is not None}
             for o in gateway.outputs.outputs
@@ -92,17 +91,6 @@ def _bus(bus: Any) -> dict[str, Any]:
         "opens": bus.opens,
         "error": bus.error,
         "counters": dict(bus.totals()),
-    }
-
-
-def tag_dict(value: TagValue, now_ns: int) -> dict[str, Any]:
-    """A tag for JSON: value, quality, reason, age in seconds (None when there never was a value)."""
-    plain = value.value.hex() if isinstance(value.value, bytes) else value.value
-    return {
-        "value": plain,
-        "quality": str(value.quality),
-        "reason": str(value.reason),
-        "age_s": _finite(value.age_s(now_ns)),
     }
 
 

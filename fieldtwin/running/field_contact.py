@@ -36,9 +36,9 @@ class FieldContact:
             await link.end()
 
 
-async def contact_here(client: ControlClient, system: System) -> FieldContact:
+async def contact_here(client: ControlClient, system: System, run_dir: Path) -> FieldContact:
     """The field side is a process of ours."""
-    return await _contact(client, system, "localhost", None)
+    return await _contact(client, system, "localhost", run_dir)
 
 
 async def connect_control(host_port: str, token: str) -> tuple[ControlClient, str]:
@@ -61,7 +61,7 @@ async def contact_elsewhere(host_port: str, token: str, system: System, run_dir:
         raise
 
 
-async def _contact(client: ControlClient, system: System, host: str, run_dir: Path | None) -> FieldContact:
+async def _contact(client: ControlClient, system: System, host: str, run_dir: Path) -> FieldContact:
     status = await client.call("get")
     if status["system_hash"] != system.hash:
         raise FileInvalid(
@@ -76,7 +76,6 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
             plant = system.buses[bus_name].endpoint
             listening = reachable(Endpoint.parse(url), host)
             if plant.is_serial and listening.scheme != "pty":
-                assert run_dir is not None
                 link = LinkChild(run_dir / bus_name, listening, run_dir / f"link-{bus_name}.log")
                 contact.links.append(link)
                 await link.ready()

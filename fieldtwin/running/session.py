@@ -142,7 +142,7 @@ class RunSession:
             client = await self._start_child(
                 "field", "twin.field_process", self._write("field.json", self._field_config(run_dir))
             )
-            self._field = await contact_here(client, self.system)
+            self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far
 

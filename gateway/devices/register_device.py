@@ -1,57 +1,30 @@
 """Drivers of devices that are registers: poll groups in, single values out.
 
-A group is read in as few transactions as the profile's limits allow; a value or a message is never split over two (one
-transaction, one time stamp). Where a profile says that values are *samples*, they are as old as the sample and not as the
-poll: a sensor that answers and does not sample has no good values.
+A group is read in as few transactions as the profile's limits and the device's own holes allow (`read_plan`); a value or a
+message is never split over two (one transaction, one time stamp). Where a profile says that values are *samples*, they
+are as old as the sample and not as the poll: a sensor that answers and does not sample has no good values.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections import deque
+from dataclasses import replace
 
 from gateway.core.connection import PROTOCOL, ByteConnection
-from gateway.core.errors import Bug, NotAllowed, VerifyFailed, WrongDevice
-from gateway.core.profile import DeviceProfile, Message, RegisterRange, Tag
+from gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
+from gateway.core.profile import RegisterRange, Tag
 from gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, TagValue
 from gateway.devices.codec import decode, encode
 from gateway.devices.config import DeviceConfig
 from gateway.devices.driver import DeviceDriver, TagSink
+from gateway.devices.read_plan import GroupPlan, Read
 from gateway.protocols.modbus.client import ModbusClient
+
+TOO_MUCH = (0x02, 0x03)
+"""Exceptions that say that a read went over a hole (illegal address) or was too long (illegal value)."""
 
 SAMPLED_STEPS = 0x80000000
 """A sample counter that moved by more than this went backwards: the device restarted."""
-
-
-@dataclass(frozen=True)
-class Read:
-    """One transaction of a poll group."""
-
-    range: RegisterRange
-    tags: tuple[Tag, ...]
-    messages: tuple[Message, ...]
-
-
-def plan_reads(profile: DeviceProfile, group: str) -> tuple[Read, ...]:
-    """The fewest transactions that read `group`, in address order: gaps up to `max_gap` are read over, none is longer
-    than `read_registers`, no value or message is split. Messages come along with the tag that announces them."""
-    limits = profile.form.limits
-    members: list[tuple[RegisterRange, Tag | Message]] = [(t.registers, t) for t in profile.group(group)]
-    members += [(m.at, m) for m in profile.messages.values() if profile.tags[m.when].poll == group]
-    members.sort(key=lambda m: (m[0].table, m[0].address, -m[0].count))
-    reads: list[tuple[RegisterRange, list[Tag | Message]]] = []
-    for at, member in members:
-        if reads:
-            last, items = reads[-1]
-            end = max(last.end, at.end)
-            fits = end - last.address <= limits.read_registers and at.address - last.end <= limits.max_gap
-            if last.table == at.table and fits:
-                reads[-1] = (replace(last, count=end - last.address), [*items, member])
-                continue
-        reads.append((at, [member]))
-    return tuple(
-        Read(at, tuple(i for i in items if isinstance(i, Tag)), tuple(i for i in items if isinstance(i, Message)))
-        for at, items in reads
-    )
 
 
 class RegisterDriver(DeviceDriver):
@@ -61,7 +34,7 @@ class RegisterDriver(DeviceDriver):
 
     def __init__(self, config: DeviceConfig, sink: TagSink) -> None:
         super().__init__(config, sink)
-        self.plans = {group: plan_reads(self.profile, group) for group in self.profile.groups}
+        self.plans = {group: GroupPlan(self.profile, group) for group in self.profile.groups}
         self.samples_missed = 0
         self._client: ModbusClient | None = None
         self._sample_count: int | None = None
@@ -112,19 +85,28 @@ class RegisterDriver(DeviceDriver):
             )
 
     async def _read(self, what: str) -> list[DATA]:
-        occurred: list[DATA] = []
-        for read in self.plans[what]:
-            raw, t_ns = await self._transaction(read.range)
-            values = {t.name: decode(t, _slice(read.range, t.registers, raw), t_ns) for t in read.tags}
-            if self.profile.sampled is not None and what == self.profile.sampled.poll:
-                fresh = self._note_sample(values, t_ns)
-            else:
-                fresh = False
-            for name, value in values.items():
-                self._publish(name, value)
-            if fresh:
-                occurred += [MEASUREMENT(_slice(read.range, m.at, raw)) for m in read.messages]
-        return occurred
+        values: dict[str, TagValue] = {}
+        blocks: list[tuple[Read, bytes]] = []
+        todo = deque(self.plans[what].reads)
+        while todo:
+            read = todo.popleft()
+            try:
+                raw, t_ns = await self._transaction(read.range)
+            except ModbusExceptionReply as e:
+                if e.code not in TOO_MUCH:
+                    raise
+                todo.extendleft(reversed(self.plans[what].refused(read)))
+                self.sink.put_bad([f"{self.config.name}.{t.name}" for t in read.tags], Reason.REFUSED)
+                continue
+            blocks.append((read, raw))
+            values |= {t.name: decode(t, _slice(read.range, t.registers, raw), t_ns) for t in read.tags}
+        sampled = self.profile.sampled
+        fresh = sampled is not None and what == sampled.poll and sampled.count in values and self._note_sample(values)
+        for name, value in values.items():
+            self._publish(name, value)
+        if not fresh:
+            return []
+        return [MEASUREMENT(_slice(read.range, m.at, raw)) for read, raw in blocks for m in read.messages]
 
     async def _transaction(self, at: RegisterRange) -> tuple[bytes, int]:
         """Read a range; the bytes as on the wire (bits one a byte) and when the reply was complete."""
@@ -147,14 +129,14 @@ class RegisterDriver(DeviceDriver):
 
     # -- samples ----------------------------------------------------------------------------------------------------
 
-    def _note_sample(self, values: dict[str, TagValue], t_ns: int) -> bool:
+    def _note_sample(self, values: dict[str, TagValue]) -> bool:
         """Tell a new sample from an old one, and give every value of the group its age. True for a new sample.
 
         The first count seen is only a base line: how old that sample is, nobody knows.
         """
         sampled = self.profile.sampled
         assert sampled is not None
-        count = values[sampled.count].value
+        count, t_ns = values[sampled.count].value, values[sampled.count].t_ns
         assert isinstance(count, int)
         before, self._sample_count = self._sample_count, count
         fresh = before is not None and count != before and count != 0

@@ -141,11 +141,10 @@ class ModbusBus:
                 self._lost(e)
                 await self._pause(backoff.next_s())
                 continue
-            framing = "rtu" if endpoint.is_serial or endpoint.scheme == "rtu+tcp" else "mbap"
             client = ModbusClient(
                 connection,
                 self._clock,
-                framing="rtu" if framing == "rtu" else "mbap",
+                framing="rtu" if endpoint.is_serial or endpoint.scheme == "rtu+tcp" else "mbap",
                 serial=endpoint.serial if endpoint.is_serial else None,
                 timeout_s=self.config.timeout_s,
             )

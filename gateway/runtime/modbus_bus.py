@@ -19,6 +19,7 @@ from gateway.core.errors import (
     DeviceRefused,
     EndpointBusy,
     FieldtwinError,
+    ModbusExceptionReply,
     ReplyTimeout,
     Unreachable,
     WireError,
@@ -33,6 +34,8 @@ from gateway.runtime.backoff import Backoff
 from gateway.runtime.tags import TagTable
 
 MAX_JOBS = 256
+LATER = (0x05, 0x06)
+"""Exceptions that ask for time: acknowledge, and server device busy (AP 7)."""
 
 
 def reason_of(error: FieldtwinError) -> Reason:
@@ -226,15 +229,28 @@ class ModbusBus:
         except (WireError, WrongDevice, Unreachable) as e:
             device.poll_errors += 1
             self._offline(device, e)
-        except DeviceRefused as e:  # it answers, and says no to this group: the other groups go on
-            device.poll_errors += 1
-            device.error = str(e)
-            self._tags.put_bad(
-                [f"{device.driver.config.name}.{t.name}" for t in device.driver.profile.group(group)], reason_of(e)
-            )
+        except DeviceRefused as e:
+            self._refused(device, group, e)
         else:
             if device.online and group:
                 device.error = ""
+                device.backoff.reset()
+
+    def _refused(self, device: DeviceState, group: str, error: DeviceRefused) -> None:
+        """It answers, and says no to this group; the other groups go on.
+
+        Busy (06) and acknowledge (05, it takes long) mean later: the last value lives on until it is stale, never a 0
+        in its place, and the device is given time (MB-023, MB-024).
+        """
+        device.poll_errors += 1
+        device.error = str(error)
+        if isinstance(error, ModbusExceptionReply) and error.code in LATER and device.online:
+            device.due_ns[group] = self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S)
+            return
+        names = [t.name for t in device.driver.profile.group(group)] if group else list(device.driver.profile.tags)
+        self._tags.put_bad([f"{device.driver.config.name}.{n}" for n in names], reason_of(error))
+        if not group:
+            self._offline(device, error)
 
     async def _bring_online(self, device: DeviceState) -> None:
         """First contact, or contact again: is it the right device, and where do its mailboxes stand."""

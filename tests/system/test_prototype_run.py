@@ -1,0 +1,117 @@
+"""A whole run of the observatory's prototype, looked at from outside: files, streams, exit code, counters."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from procs import Fieldtwin, no_tracebacks, run_to_end
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> Fieldtwin:
+    """One run of 8 s with its script of commands; every test here looks at what it left."""
+    root = tmp_path_factory.mktemp("run")
+    return run_to_end(root, "run", "observatory", "--prototype", "--for", "8s", "--instance", "a", "--json")
+
+
+def test_it_ends_well_and_says_so(ended: Fieldtwin) -> None:
+    assert ended.process.returncode == 0, ended.err + ended.out
+    summary = ended.summary
+    assert summary["errors"] == []
+    assert summary["ok"] is True
+    assert summary["prototype"] is True
+    assert summary["outputs_safe"] is True
+    assert {n: d["state"] for n, d in summary["devices"].items()} == {
+        "ctd": "good", "inclinometer": "good", "modem": "good",
+    }  # fmt: skip
+
+
+def test_the_states_follow_the_commands(ended: Fieldtwin) -> None:
+    assert ended.summary["states"] == {"relay": ["STANDBY", "ACTIVE", "STANDBY", "OFF"]}
+    assert ended.summary["far_end"]["commands_sent"] == [1, 2, 0, -1]
+    assert ended.summary["far_end"]["responses"] > 0
+
+
+def test_both_sides_count_the_same(ended: Fieldtwin) -> None:
+    for bus, row in ended.summary["exchanges"].items():
+        gateway = {what: row["gateway"][what] for what in ("requests", "replies")}
+        assert gateway == row["emulators"], bus
+        assert gateway["replies"] > 0, bus
+
+
+def test_every_published_value_was_held(ended: Fieldtwin) -> None:
+    published = ended.summary["published"]
+    assert published["checked"] > 100
+    assert published["checked"] == published["values"]
+    assert published["wrong"] == 0
+
+
+def test_talk_is_on_stderr_and_names_the_mapping(ended: Fieldtwin) -> None:
+    json.loads(ended.out)  # the whole of stdout is one JSON document
+    for plant, target in ended.summary["mapping"].items():
+        assert f"{plant}  →  {target}" in ended.err
+    assert "\x1b" not in ended.err + ended.out
+
+
+def test_the_exchanges_of_active_times_are_stored(ended: Fieldtwin) -> None:
+    with closing(sqlite3.connect(ended.root / "a" / "store.sqlite")) as db:
+        assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        assert db.execute("SELECT system, prototype FROM run").fetchall() == [("observatory", 1)]
+        rows = db.execute("SELECT tag, sequence, payload FROM exchange ORDER BY id").fetchall()
+    assert len(rows) == ended.summary["logged"] > 2
+    assert {tag for tag, _, _ in rows} == {"relay.log"}
+    assert [sequence for _, sequence, _ in rows] == list(range(1, len(rows) + 1))
+    payloads = [payload for _, _, payload in rows]
+    assert any(len(p) == 20 for p in payloads)  # samples of ten registers
+    active = [p[-2:] for p in payloads if len(p) < 20]
+    assert (0).to_bytes(2) not in active  # nothing of STANDBY or OFF is logged
+    assert (-1).to_bytes(2, signed=True) not in active
+
+
+def test_every_write_is_on_record(ended: Fieldtwin) -> None:
+    entries = [json.loads(line) for line in (ended.root / "a" / "audit.jsonl").read_text().splitlines()]
+    assert all(e["utc_ns"] > 10**18 and e["by"] and e["result"] for e in entries)
+    writes = [e for e in entries if e["action"] == "write"]
+    asked = [(e["by"], e["old"], e["new"]) for e in writes if e["result"] == "asked"]
+    assert asked[0][:1] + asked[0][2:] == ("plc", 0)
+    assert [(by, new) for by, _, new in asked[1:5]] == [("plc", 1), ("plc", 2), ("plc", 0), ("plc", -1)]
+    assert [old for _, old, _ in asked[1:5]] == [0, 1, 2, 0]
+    assert asked[-1][2] == 0
+    assert asked[-1][0].startswith("safe: ")
+    done = [e["new"] for e in writes if e["result"] == "done"]
+    assert done == [new for _, _, new in asked]
+    others = {(e["action"], e["device"], e["by"]) for e in entries if e["action"] != "write"}
+    assert others == {("sdo", "inclinometer", "start-up"), ("nmt", "inclinometer", "start-up"), ("nmt", "inclinometer", "stop")}
+
+
+def test_no_process_wrote_a_traceback(ended: Fieldtwin) -> None:
+    no_tracebacks(ended.root)
+
+
+def test_nothing_of_it_is_left(ended: Fieldtwin) -> None:
+    left = {p.name for p in (ended.root / "a").iterdir()}
+    assert not {name for name in left if name.endswith(".sock")}
+    assert "line1" not in left  # the link of the virtual serial port
+
+
+def test_files_are_the_owners_only(ended: Fieldtwin) -> None:
+    def others(path: Path) -> int:
+        return path.stat().st_mode & 0o077
+
+    assert others(ended.root / "a") == 0
+    assert others(ended.root / "a" / "audit.jsonl") == 0
+    assert others(ended.root / "a" / "image") == 0
+
+
+def test_the_plc_kept_its_cycle(ended: Fieldtwin) -> None:
+    plc: dict[str, Any] = ended.summary["plc"]
+    assert plc["state"] == "running"  # when last asked, before the end
+    assert plc["scans"] > 500
+    assert plc["error"] == ""

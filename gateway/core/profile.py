@@ -24,10 +24,12 @@ PRINTED: tuple[tuple[Table, int], ...] = (("coil", 0), ("discrete", 1), ("input"
 READ_FUNCTION: dict[Table, int] = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 REGISTERS_OF = {
     "int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2, "int64": 4, "uint64": 4, "float64": 4, "bool": 1,
+    "bcd16": 1, "bcd32": 2,
 }  # fmt: skip
 INTEGER_RANGES = {
     "bool": (0, 1), "int16": (-0x8000, 0x7FFF), "uint16": (0, 0xFFFF), "int32": (-0x80000000, 0x7FFFFFFF),
     "uint32": (0, 0xFFFFFFFF), "int64": (-(1 << 63), (1 << 63) - 1), "uint64": (0, (1 << 64) - 1),
+    "bcd16": (0, 9999), "bcd32": (0, 99_999_999),
 }  # fmt: skip
 
 
@@ -71,6 +73,9 @@ class Tag:
     counter: bool
     secret: bool
     danger: str
+    scale_by: str | None = None
+    bits: tuple[int, int] | None = None
+    sentinels: tuple[int, ...] = ()
 
     @property
     def registers(self) -> RegisterRange:
@@ -93,13 +98,16 @@ class Tag:
     @property
     def is_integer(self) -> bool:
         """True when the engineering value is a whole number: an integer type without scale and offset."""
-        return self.type in INTEGER_RANGES and self.scale == 1.0 and self.offset == 0.0
+        plain = self.scale == 1.0 and self.offset == 0.0 and self.scale_by is None
+        return self.type in INTEGER_RANGES and plain
 
     @property
     def limits(self) -> tuple[float, float] | None:
         """The smallest and largest value that may be written, in engineering units; None where anything goes."""
         if self.range is not None:
             return self.range
+        if self.bits is not None:
+            return 0, (1 << (self.bits[1] - self.bits[0] + 1)) - 1
         if self.type in INTEGER_RANGES:
             low, high = INTEGER_RANGES[self.type]
             a, b = low * self.scale + self.offset, high * self.scale + self.offset
@@ -262,6 +270,8 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
             raise file.error(loc, f"the tag {name!r} is a {kind}", expected="`registers: N`, its length")
         first = _address(file, (*loc, "at"), form, t.at, t.registers or REGISTERS_OF[kind])
         indexes = None
+    if t.bits is not None and not (kind == "uint16" and 0 <= t.bits[0] <= t.bits[1] <= 15):
+        raise file.error((*loc, "bits"), f"the bits of {name!r}", expected="type uint16 and [low, high] within 0 to 15")
     match = re.fullmatch(r"(.*?)([0-9]+)\.\.([0-9]+)", name)
     names = [name]
     if match:
@@ -288,6 +298,9 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
             counter=t.counter,
             secret=t.secret,
             danger=t.danger,
+            scale_by=t.scale_by,
+            bits=t.bits,
+            sentinels=tuple(t.sentinels),
         )
 
 
@@ -313,6 +326,7 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
     wanted: list[tuple[tuple[Key, ...], str]] = [(("commands", c), t) for c, t in p.form.commands.items()]
     wanted += [(("messages", m.name, "when"), m.when) for m in p.messages.values()]
     wanted += [(("identify", i, "tag"), e.tag) for i, e in enumerate(p.form.identify)]
+    wanted += [(("tags", t.name, "scale_by"), t.scale_by) for t in p.tags.values() if t.scale_by is not None]
     if p.sampled:
         wanted += [(("sampled", "count"), p.sampled.count), (("sampled", "period"), p.sampled.period)]
     for loc, tag in wanted:

@@ -10,7 +10,19 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 ValueType = Literal[
-    "bool", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64", "string", "bytes"
+    "bool",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+    "float32",
+    "float64",
+    "bcd16",
+    "bcd32",
+    "string",
+    "bytes",
 ]
 Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
 Access = Literal["ro", "rw", "wo"]
@@ -63,6 +75,9 @@ class TagForm(Strict):
     unit: str = ""
     scale: float = 1.0
     offset: float = 0.0
+    scale_by: str | None = Field(default=None, description="tag that holds the power of ten to multiply by (SunSpec)")
+    bits: tuple[int, int] | None = Field(default=None, description="lowest and highest bit of one register, 0 to 15")
+    sentinels: list[int] = Field(default=[], description="raw values that mean: not there (SunSpec 0x8000, 0xFFFF)")
     values: dict[int, str] | None = None
     range: tuple[float, float] | None = None
     counter: bool = False

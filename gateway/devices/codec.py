@@ -36,7 +36,8 @@ def reorder(data: bytes, order: str) -> bytes:
 def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     """The value of `tag` from its register bytes as on the wire. Text ends at the first NUL.
 
-    Not a number is a bad value and never a good one.
+    Not a number, a digit that is none and a sentinel are bad values and never good ones; a value outside the profile's range
+    is uncertain.
     """
     if tag.type == "string":
         text = data.split(b"\0", 1)[0].decode("ascii", errors="replace").rstrip()
@@ -45,10 +46,37 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
         return TagValue(data, Quality.GOOD, Reason.NONE, t_ns, data)
     if tag.type == "bool":
         return TagValue(bool(int.from_bytes(data)), Quality.GOOD, Reason.NONE, t_ns, data)
-    (number,) = struct.unpack(_FORMATS[tag.type], reorder(data, tag.order))
-    if isinstance(number, float) and not math.isfinite(number):
+    ordered = reorder(data, tag.order)
+    if int.from_bytes(ordered) in tag.sentinels:
+        return TagValue(None, Quality.BAD, Reason.SENTINEL, t_ns, data)
+    number = _number(tag, ordered)
+    if number is None or not math.isfinite(number):
         return TagValue(None, Quality.BAD, Reason.NOT_A_NUMBER, t_ns, data)
-    return TagValue(_scaled(tag, number), Quality.GOOD, Reason.NONE, t_ns, data)
+    value = _scaled(tag, number)
+    if tag.range is not None and not tag.range[0] <= value <= tag.range[1]:
+        return TagValue(value, Quality.UNCERTAIN, Reason.OUT_OF_RANGE, t_ns, data)
+    return TagValue(value, Quality.GOOD, Reason.NONE, t_ns, data)
+
+
+def _number(tag: Tag, ordered: bytes) -> int | float | None:
+    """The raw number of big-endian bytes; None where they are none (a BCD digit above 9)."""
+    if tag.type.startswith("bcd"):
+        digits = ordered.hex()
+        return int(digits) if digits.isdigit() else None
+    if tag.bits is not None:
+        low, high = tag.bits
+        return int.from_bytes(ordered) >> low & (1 << (high - low + 1)) - 1
+    number: int | float = struct.unpack(_FORMATS[tag.type], ordered)[0]
+    return number
+
+
+def apply_scale(tag: Tag, value: TagValue, exponent: TagValue | None) -> TagValue:
+    """`value` times ten to the power that its scale-factor register holds (SunSpec). Without one it is bad, not unscaled."""
+    if not isinstance(value.value, int | float):
+        return value
+    if exponent is None or not isinstance(exponent.value, int) or not -10 <= exponent.value <= 10:
+        return replace(value, value=None, quality=Quality.BAD, reason=Reason.SENTINEL)
+    return replace(value, value=value.value * 10.0**exponent.value, quality=max(value.quality, exponent.quality))
 
 
 def decode_little(tag: Tag, data: bytes, t_ns: int) -> TagValue:
@@ -68,13 +96,18 @@ def encode(tag: Tag, value: Scalar) -> bytes:
         raise NotAllowed(f"{tag.name}: the value is outside its limits", expected=expected, got=f"{value:g}")
     if tag.type == "bool":
         return int(bool(value)).to_bytes(2)
+    if tag.bits is not None or tag.scale_by is not None:
+        raise NotAllowed(f"{tag.name}: part of a register, or scaled by another one, cannot be written")
     number = (value - tag.offset) / tag.scale
+    if tag.type.startswith("bcd"):
+        width = 4 if tag.type == "bcd16" else 8
+        return reorder(bytes.fromhex(f"{round(number):0{width}d}"), tag.order)
     if tag.type.startswith("float"):
         return reorder(struct.pack(_FORMATS[tag.type], number), tag.order)
     return reorder(struct.pack(_FORMATS[tag.type], round(number)), tag.order)
 
 
-def _scaled(tag: Tag, number: float) -> Scalar:
+def _scaled(tag: Tag, number: float) -> float:
     """Engineering units; whole numbers stay whole where nothing is scaled."""
     if tag.scale == 1.0 and tag.offset == 0.0:
         return number

@@ -14,7 +14,7 @@ from gateway.core.connection import PROTOCOL, ByteConnection
 from gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
 from gateway.core.profile import RegisterRange, Tag
 from gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, TagValue
-from gateway.devices.codec import decode, encode
+from gateway.devices.codec import apply_scale, decode, encode
 from gateway.devices.config import DeviceConfig
 from gateway.devices.driver import DeviceDriver, TagSink
 from gateway.devices.read_plan import GroupPlan, Read
@@ -100,6 +100,10 @@ class RegisterDriver(DeviceDriver):
                 continue
             blocks.append((read, raw))
             values |= {t.name: decode(t, _slice(read.range, t.registers, raw), t_ns) for t in read.tags}
+        for name, value in values.items():
+            tag = self.profile.tags[name]
+            if tag.scale_by is not None:
+                values[name] = apply_scale(tag, value, values.get(tag.scale_by) or self._held.get(tag.scale_by))
         sampled = self.profile.sampled
         fresh = sampled is not None and what == sampled.poll and sampled.count in values and self._note_sample(values)
         for name, value in values.items():

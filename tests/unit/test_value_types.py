@@ -18,7 +18,8 @@ from gateway.devices.codec import apply_scale, decode, encode
 
 def tag(form: str) -> Tag:
     """The tag `t` of a profile whose line for it is `form`."""
-    text = f'device: test/types\nsource: "a test"\nprotocol: modbus\ntags:\n  sf: {{at: 40002, type: int16}}\n  t: {{at: 40010, {form}}}\n'
+    head = 'device: test/types\nsource: "a test"\nprotocol: modbus\ntags:\n  sf: {at: 40002, type: int16}\n'
+    text = f"{head}  t: {{at: 40010, {form}}}\n"
     return resolve(parse(text, "types.yaml")).tags["t"]
 
 

@@ -7,7 +7,6 @@ is started here.
 
 from __future__ import annotations
 
-import socket
 from pathlib import Path
 
 from fieldtwin.running.link_child import LinkChild
@@ -92,7 +91,10 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
 
 
 def reachable(listening: Endpoint, host: str) -> Endpoint:
-    """The endpoint as seen from here: a wildcard address is the host that we reached the field side at."""
+    """The endpoint as seen from here: a wildcard address is the host that we reached the field side at.
+
+    The host stays a name: a field side that comes back (a container that was restarted) may have another address.
+    """
     if listening.scheme == "pty":
         if host not in LOCAL_HOSTS:
             raise UsageError(
@@ -105,7 +107,7 @@ def reachable(listening: Endpoint, host: str) -> Endpoint:
         return listening
     bound, port = listening.address
     if bound in ("0.0.0.0", "::"):
-        return listening.with_address(socket.gethostbyname(host), port)
+        return listening.with_address(host, port)
     if bound in LOCAL_HOSTS and host not in LOCAL_HOSTS:
         raise UsageError(
             f"the field side listens on its own loopback only: {listening}",

@@ -19,7 +19,7 @@ from fieldtwin.running.children import Child
 from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.oracle import Oracle
-from fieldtwin.running.shore import Scripted, Shore, script
+from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from gateway.core.control import ControlClient
 from gateway.core.endpoint import Endpoint
@@ -150,11 +150,10 @@ class RunSession:
         self._nursery.start(self._watch(), "states")
         self._nursery.start(self._ask(), "status")
         device = next(iter(self.far), None)
-        if device is not None and self.options.prototype and self.options.commands is not None:
+        if device is not None and self.options.prototype and self.options.commands:
+            # Without commands the far end belongs to somebody else (`fieldtwin shore`): two would share out the responses.
             self.shore = Shore(self.system, device, self.far[device], self.clock)
-            commands: list[Scripted] = []
-            if self.options.commands:
-                commands = script(self.options.commands, self.options.duration_s or 20.0)
+            commands = script(self.options.commands, self.options.duration_s or 20.0)
             self._nursery.start(self.shore.run(commands), "far end")
 
     # -- while it runs --------------------------------------------------------------------------------------------------

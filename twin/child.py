@@ -1,20 +1,53 @@
-"""A process that belongs to another: it ends, with its outputs safe, when the one that started it dies."""
+"""A process that belongs to another: it ends in order when the one that started it dies, however that dies.
+
+``python -m twin.child PARENT_PID LINGER_S MODULE [ARG...]`` runs ``python -m MODULE ARG...`` like this. What stands for the plant lingers:
+the gateway needs it for a moment more, to make its outputs safe.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import runpy
 import signal
 import sys
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
-def end_with_parent() -> None:
-    """Ask the kernel for SIGTERM when the parent ends, however it ends. Linux only; elsewhere nothing happens."""
+def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
+    """Let the kernel tell us when the process `parent` ends, and take it as SIGTERM `linger_s` seconds later.
+
+    Linux only; elsewhere nothing happens.
+    """
     if not sys.platform.startswith("linux"):
         return
-    parent = os.getppid()
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-    if os.getppid() != parent:  # it died before we asked
+
+    def parent_ended(number: int, frame: object) -> None:
+        signal.setitimer(signal.ITIMER_REAL, max(linger_s, 0.001))
+
+    def linger_over(number: int, frame: object) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
+
+    signal.signal(signal.SIGHUP, parent_ended)
+    signal.signal(signal.SIGALRM, linger_over)
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGHUP, 0, 0, 0)
+    if os.getppid() != parent:  # it died before we asked
+        os.kill(os.getpid(), signal.SIGHUP)
+
+
+def command(module: str, *args: str, linger_s: float = 0.0) -> list[str]:
+    """The command line that runs `module` as a child of this process."""
+    return [sys.executable, "-m", "twin.child", str(os.getpid()), str(linger_s), module, *args]
+
+
+def main(argv: list[str]) -> None:
+    """Become the module that is named."""
+    parent, linger_s, module = int(argv[0]), float(argv[1]), argv[2]
+    end_with_parent(parent, linger_s)
+    sys.argv = [module, *argv[3:]]
+    runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -26,7 +26,6 @@ from gateway.runtime.gateway import Gateway
 from gateway.runtime.status import describe
 from gateway.store.exchange_log import ExchangeLog
 from gateway.wallclock import WallClock
-from twin.child import end_with_parent
 from twin.mapping import MappedConnector, mapping_from_json
 from twin.physical import attached, gateway_config, image_layout
 from twin.system import load_system
@@ -140,7 +139,6 @@ def _plain(value: object) -> object:
 
 def main(argv: list[str]) -> int:
     """Run the process; errors go to stderr as one line."""
-    end_with_parent()
     try:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=ControllerConfig)
         return asyncio.run(GatewayProcess(config).run())

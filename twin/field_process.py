@@ -21,7 +21,6 @@ from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, UsageError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
-from twin.child import end_with_parent
 from twin.field import FieldSide
 from twin.physical import check_commands
 from twin.prototype_file import Prototype, load_prototype
@@ -136,7 +135,6 @@ class FieldProcess:
 
 def main(argv: list[str]) -> int:
     """Run the process; errors go to stderr as one line."""
-    end_with_parent()
     try:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=FieldConfig)
         return asyncio.run(FieldProcess(config).run())

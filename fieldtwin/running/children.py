@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import subprocess
-import sys
 from pathlib import Path
 
 from gateway.core.control import ControlClient
 from gateway.core.errors import Bug, FieldtwinError, ReplyTimeout, Unreachable
+from twin.child import command
 
 START_TIMEOUT_S = 30.0
 POLL_S = 0.02
@@ -24,16 +24,19 @@ class ChildFailed(FieldtwinError):
 
 
 class Child:
-    """One process. In a session of its own, so that Ctrl-C reaches only us and we end it in order."""
+    """One process. In a session of its own, so that Ctrl-C reaches only us and we end it in order.
 
-    def __init__(self, name: str, module: str, config: Path, run_dir: Path) -> None:
+    Should we be killed, it ends by itself after `linger_s` seconds.
+    """
+
+    def __init__(self, name: str, module: str, config: Path, run_dir: Path, linger_s: float = 0.0) -> None:
         self.name = name
         self.log = run_dir / f"{name}.log"
         self.socket = run_dir / f"{name}.sock"
         self.socket.unlink(missing_ok=True)
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", module, str(config)],
+                command(module, str(config), linger_s=linger_s),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
@@ -71,9 +74,13 @@ class Child:
                     raise ReplyTimeout(f"the {self.name} process did not get ready", hint=f"log: {self.log}") from None
                 await asyncio.sleep(POLL_S)
                 continue
-            answer = await client.call("ready")
-            if not answer.get("ready"):
-                raise Bug(f"the {self.name} process answered, and is not ready", got=str(answer))
+            try:
+                answer = await client.call("ready")
+                if not answer.get("ready"):
+                    raise Bug(f"the {self.name} process answered, and is not ready", got=str(answer))
+            except BaseException:
+                await client.aclose()
+                raise
             return client
 
     async def end(self, timeout_s: float = 1.5) -> int | None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import subprocess
-import sys
 from pathlib import Path
 
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ReplyTimeout, Unreachable
+from twin.child import command
+
+LINGER_S = 2.0
+"""The line outlives us for so long when we are killed: the gateway writes its safe values over it."""
 
 
 class LinkChild:
@@ -20,7 +23,7 @@ class LinkChild:
         link.unlink(missing_ok=True)
         with log.open("wb") as out:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "fieldtwin", "link", str(link), str(target)],
+                command("fieldtwin", "link", str(link), str(target), linger_s=LINGER_S),
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,

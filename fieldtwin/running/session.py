@@ -37,6 +37,8 @@ WATCH_S = 0.02
 ORACLE_S = 1.0
 MAX_ERRORS = 100
 SETTLE_S = 4.0
+FIELD_LINGER_S = 1.5
+"""Should we be killed, the emulators stay for so long: the gateway makes its outputs safe meanwhile."""
 
 
 class RunSession:
@@ -126,8 +128,8 @@ class RunSession:
         path.chmod(0o600)
         return path
 
-    async def _start_child(self, name: str, module: str, config: Path) -> ControlClient:
-        child = Child(name, module, config, self.instance.dir)
+    async def _start_child(self, name: str, module: str, config: Path, linger_s: float = 0.0) -> ControlClient:
+        child = Child(name, module, config, self.instance.dir, linger_s)
         self.children[name] = child
         self._stack.push_async_callback(child.end)
         client = await child.connect()
@@ -139,9 +141,8 @@ class RunSession:
         if self.options.field_host:
             self._field = await contact_elsewhere(self.options.field_host, self.options.token, self.system, run_dir)
         else:
-            client = await self._start_child(
-                "field", "twin.field_process", self._write("field.json", self._field_config(run_dir))
-            )
+            config = self._write("field.json", self._field_config(run_dir))
+            client = await self._start_child("field", "twin.field_process", config, FIELD_LINGER_S)
             self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far

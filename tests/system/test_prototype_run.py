@@ -49,7 +49,7 @@ def test_both_sides_count_the_same(ended: Fieldtwin) -> None:
 def test_every_published_value_was_held(ended: Fieldtwin) -> None:
     published = ended.summary["published"]
     assert published["checked"] > 100
-    assert published["checked"] == published["values"]
+    assert published["checked"] >= published["values"]  # some more while the run stops
     assert published["wrong"] == 0
 
 
@@ -68,11 +68,14 @@ def test_the_exchanges_of_active_times_are_stored(ended: Fieldtwin) -> None:
     assert len(rows) == ended.summary["logged"] > 2
     assert {tag for tag, _, _ in rows} == {"relay.log"}
     assert [sequence for _, sequence, _ in rows] == list(range(1, len(rows) + 1))
-    payloads = [payload for _, _, payload in rows]
-    assert any(len(p) == 20 for p in payloads)  # samples of ten registers
-    active = [p[-2:] for p in payloads if len(p) < 20]
-    assert (0).to_bytes(2) not in active  # nothing of STANDBY or OFF is logged
-    assert (-1).to_bytes(2, signed=True) not in active
+    entries = [json.loads(payload) for _, _, payload in rows]
+    assert [e["t_ns"] for e in entries] == sorted(e["t_ns"] for e in entries)
+    commands = [e["data"] for e in entries if e["kind"] == "command"]
+    assert commands == ["0001", "0002"]  # and neither 0 nor -1: nothing is logged in STANDBY and OFF
+    samples = [e["data"] for e in entries if e["kind"] == "response"]
+    assert samples
+    assert {len(bytes.fromhex(s)) for s in samples} == {20}  # ten registers, unaltered
+    assert samples[-1] == ended.summary["far_end"]["last_response"]
 
 
 def test_every_write_is_on_record(ended: Fieldtwin) -> None:
@@ -87,8 +90,8 @@ def test_every_write_is_on_record(ended: Fieldtwin) -> None:
     assert asked[-1][0].startswith("safe: ")
     done = [e["new"] for e in writes if e["result"] == "done"]
     assert done == [new for _, _, new in asked]
-    others = {(e["action"], e["device"], e["by"]) for e in entries if e["action"] != "write"}
-    assert others == {("sdo", "inclinometer", "start-up"), ("nmt", "inclinometer", "start-up"), ("nmt", "inclinometer", "stop")}
+    others = [(e["action"], e["by"]) for e in entries if e["device"] == "inclinometer"]
+    assert others == [("sdo", "start-up"), ("nmt", "start-up"), ("nmt", "stop")]
 
 
 def test_no_process_wrote_a_traceback(ended: Fieldtwin) -> None:

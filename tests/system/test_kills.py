@@ -1,0 +1,142 @@
+"""Processes that are killed mid-run, and a field side that goes away: what is left behind must be safe, and must say so.
+
+The far end is played by hand, so that each test decides when the observatory is ACTIVE.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from procs import (
+    Asking,
+    Fieldtwin,
+    alive,
+    command_from_far,
+    fieldtwin,
+    free_port,
+    held_by,
+    no_tracebacks,
+    wait_for,
+)
+
+pytestmark = pytest.mark.slow
+
+PROTOTYPE = ("run", "observatory", "--prototype", "--commands", "none", "--json")
+
+
+def state_of(plc: Asking) -> str:
+    return {0: "STANDBY", 1: "ACTIVE", 2: "OFF"}[plc("get")["variables"]["relay.state"]]
+
+
+def make_active(run: Fieldtwin, instance: str, field: Asking, sequence: int = 1) -> None:
+    """Command a period of 1 s from the far end and wait until the sensor samples."""
+    plc = run.control(instance, "plc")
+    gateway = run.control(instance, "gateway")
+    wait_for(lambda: all(d["online"] for d in gateway("get")["devices"].values()), 15, "every device online")
+    command_from_far(field("get")["far"]["modem"], sequence, 1)
+    wait_for(lambda: state_of(plc) == "ACTIVE", 10, "ACTIVE")
+    wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0001", 10, "the sensor samples")
+
+
+def test_a_killed_plc_leaves_the_sensor_safe_and_the_run_says_who_died(tmp_path: Path) -> None:
+    with fieldtwin(tmp_path, *PROTOTYPE, "--instance", "p") as run:
+        field = run.control("p", "field")
+        make_active(run, "p", field)
+        gateway = run.control("p", "gateway")
+        os.kill(run.pid_of("p", "plc"), signal.SIGKILL)
+        wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0000", 5, "the safe period")
+        status = gateway("get")
+        assert status["plc"]["alive"] is False
+        assert status["writes"]["safe"] is True
+        assert [o["by"] for o in status["outputs"]] == ["safe: the PLC's heartbeat was lost"]
+        assert status["tags"]["inclinometer.slope_long"]["quality"] == "good"  # the others go on
+        run.signal(signal.SIGINT)
+        assert run.wait(4) == 1
+        assert held_by_file(tmp_path / "p" / "audit.jsonl")[-1] == 0
+    summary = run.summary
+    assert summary["ok"] is False
+    assert any(error.startswith("plc: ended with signal 9") for error in summary["errors"]), summary["errors"]
+    no_tracebacks(tmp_path)
+
+
+def held_by_file(audit: Path) -> list[float]:
+    """The values of the writes that were confirmed, by the audit log."""
+    entries = [json.loads(line) for line in audit.read_text(encoding="utf-8").splitlines()]
+    return [e["new"] for e in entries if e["action"] == "write" and e["result"] == "done"]
+
+
+def test_a_killed_gateway_turns_the_plcs_inputs_bad(tmp_path: Path) -> None:
+    with fieldtwin(tmp_path, *PROTOTYPE, "--instance", "g") as run:
+        plc = run.control("g", "plc")
+        field = run.control("g", "field")
+        make_active(run, "g", field)
+        wait_for(lambda: plc("get")["inputs"]["inclinometer.slope_long"]["quality"] == "good", 10, "a good input")
+        os.kill(run.pid_of("g", "gateway"), signal.SIGKILL)
+
+        def all_bad() -> bool:
+            inputs = plc("get")["inputs"]
+            measured = {n: v for n, v in inputs.items() if n.startswith(("ctd.", "inclinometer."))}
+            return all((v["quality"], v["reason"]) == ("bad", "gateway dead") for v in measured.values())
+
+        wait_for(all_bad, 5, "inputs bad")
+        scans = plc("get")["scans"]
+        wait_for(lambda: plc("get")["scans"] > scans + 20, 5, "the PLC scans on")
+        assert plc("get")["gateway_alive"] is False
+        run.signal(signal.SIGTERM)
+        assert run.wait(4) == 1
+    assert any(error.startswith("gateway: ended with signal 9") for error in run.summary["errors"])
+    no_tracebacks(tmp_path)
+
+
+def test_a_field_side_that_dies_and_comes_back_and_a_parent_that_is_killed(tmp_path: Path) -> None:
+    """One system through it all: lost, back, written again; then the parent dies and the gateway leaves safe outputs."""
+    ports = {name: free_port() for name in ("control", "lan", "can", "far")}
+    prototype = tmp_path / "fixed.prototype.yaml"
+    shipped = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.prototype.yaml"
+    prototype.write_text(
+        shipped.read_text(encoding="utf-8").replace(
+            'far: "tcp://127.0.0.1:0"', f'far: "tcp://127.0.0.1:{ports["far"]}"'
+        ),
+        encoding="utf-8",
+    )
+    emulate = (
+        "emulate", "observatory", "--prototype-file", str(prototype), "--control", f"127.0.0.1:{ports['control']}",
+        "--listen", f"lan=tcp://127.0.0.1:{ports['lan']}", "--listen", f"can0=can:fieldtwin/127.0.0.1:{ports['can']}",
+    )  # fmt: skip
+    with fieldtwin(tmp_path, *emulate, name="field1") as first:
+        field = first.control("observatory-field", "field")
+        field_address = ("--field", f"127.0.0.1:{ports['control']}")
+        with fieldtwin(tmp_path, *PROTOTYPE, *field_address, "--instance", "r") as run:
+            make_active(run, "r", field)
+            gateway = run.control("r", "gateway")
+            wait_for(lambda: gateway("get")["tags"]["ctd.pressure"]["quality"] == "good", 5, "good samples")
+
+            first.signal(signal.SIGKILL)
+            first.wait(5)
+            wait_for(lambda: not any(d["online"] for d in gateway("get")["devices"].values()), 10, "all devices lost")
+            tags = gateway("get")["tags"]
+            for name in ("ctd.pressure", "inclinometer.slope_long", "modem.link_state"):
+                assert tags[name]["quality"] == "bad", name
+                assert tags[name]["reason"] in ("timeout", "unreachable", "heartbeat lost"), (name, tags[name])
+
+            with fieldtwin(tmp_path, *emulate, name="field2") as second:
+                field = second.control("observatory-field", "field")
+                wait_for(lambda: all(d["online"] for d in gateway("get")["devices"].values()), 15, "all devices back")
+                wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1:] == ["0001"], 5, "the period again")
+                for name in ("ctd.pressure", "inclinometer.slope_long", "modem.link_state"):
+                    wait_for(lambda n=name: gateway("get")["tags"][n]["quality"] == "good", 8, f"{name} good again")
+                command_from_far(field("get")["far"]["modem"], 1, 2)
+                wait_for(
+                    lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0002", 10, "a new command gets through"
+                )
+
+                children = [run.pid_of("r", name) for name in ("plc", "gateway")]
+                run.signal(signal.SIGKILL)
+                run.wait(5)
+                wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0000", 3, "safe outputs")
+                wait_for(lambda: not any(alive(pid) for pid in children), 3, "the children end by themselves")
+    no_tracebacks(tmp_path)

@@ -327,6 +327,8 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
     wanted += [(("messages", m.name, "when"), m.when) for m in p.messages.values()]
     wanted += [(("identify", i, "tag"), e.tag) for i, e in enumerate(p.form.identify)]
     wanted += [(("tags", t.name, "scale_by"), t.scale_by) for t in p.tags.values() if t.scale_by is not None]
+    if p.form.trigger is not None:
+        wanted.append((("trigger", "tag"), p.form.trigger.tag))
     if p.sampled:
         wanted += [(("sampled", "count"), p.sampled.count), (("sampled", "period"), p.sampled.period)]
     for loc, tag in wanted:

@@ -125,6 +125,18 @@ class IdentifyForm(Strict):
     """A read whose answer tells this device from others; `tag` names the value to compare with `expect`."""
 
     tag: str
+    between: tuple[float, float] | None = Field(default=None, description="plausibility only: no identity to read")
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class TriggerForm(Strict):
+    """The device measures when `tag` is written with `value`; the group `poll` can be read `wait_ms` later."""
+
+    tag: str
+    value: int
+    wait_ms: int = Field(ge=1, le=60_000)
+    poll: str = "values"
 
 
 class ProfileForm(Strict):
@@ -140,6 +152,7 @@ class ProfileForm(Strict):
     eds: str | None = None
     identify: list[IdentifyForm] = []
     sampled: SampledForm | None = None
+    trigger: TriggerForm | None = None
     mailbox: MailboxForm | None = None
     messages: dict[Name, MessageForm] = Field(default={}, max_length=1)
     tags: dict[Name, TagForm] = {}

@@ -1,7 +1,8 @@
 """YAML as users mean it, and errors that point at the spot.
 
-Scalars follow YAML 1.2's core schema: only ``true`` and ``false`` are booleans and nothing is sexagesimal, so ``OFF``, ``8E1``
-and ``1017:00`` stay strings (PyYAML's 1.1 reads them as False, a string and 61020). Duplicate keys are refused. The line and
+Scalars follow YAML 1.2's core schema: only ``true`` and ``false`` are booleans and nothing is sexagesimal, so ``OFF`` and
+``1017:00`` stay strings (PyYAML's 1.1 reads them as False and 61020). Stricter than 1.2 in one thing: a float has a point, so
+that ``8E1`` is a frame and not 80. Duplicate keys are refused. The line and
 column of every key and value are kept, so that a validation error can name them.
 
 `load` reads a file, `validate` turns it into a pydantic model; both raise `FileInvalid` and nothing else.
@@ -37,7 +38,7 @@ for _tag, _pattern, _first in (
     ("tag:yaml.org,2002:bool", r"^(?:true|false)$", "tf"),
     ("tag:yaml.org,2002:null", r"^(?:~|null|)$", ["~", "n", ""]),
     ("tag:yaml.org,2002:int", r"^[-+]?(?:0|[1-9][0-9]*|0x[0-9a-fA-F]+)$", "-+0123456789"),
-    ("tag:yaml.org,2002:float", r"^[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+|[0-9]+)(?:[eE][-+]?[0-9]+)?$", "-+.0123456789"),
+    ("tag:yaml.org,2002:float", r"^[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?$", "-+.0123456789"),
 ):
     _Loader.add_implicit_resolver(_tag, re.compile(_pattern), list(_first))
 

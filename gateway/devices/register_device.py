@@ -36,6 +36,8 @@ class RegisterDriver(DeviceDriver):
         super().__init__(config, sink)
         self.plans = {group: GroupPlan(self.profile, group) for group in self.profile.groups}
         self.samples_missed = 0
+        self.may_trigger = False
+        """Whether this driver may write what makes its device measure: the gateway says so."""
         self._client: ModbusClient | None = None
         self._sample_count: int | None = None
         self._sample_t_ns = 0
@@ -131,6 +133,18 @@ class RegisterDriver(DeviceDriver):
         self._held[name] = value
         self.sink.put(f"{self.config.name}.{name}", value)
 
+    def trigger_wait_ms(self, group: str) -> int:
+        """How long after `trigger` the values of `group` are there; 0 where they need no trigger."""
+        form = self.profile.form.trigger
+        return form.wait_ms if form is not None and form.poll == group else 0
+
+    async def trigger(self) -> None:
+        """Ask the device to measure. A write: only with leave (`may_trigger`)."""
+        form = self.profile.form.trigger
+        if form is None or not self.may_trigger:
+            raise NotAllowed("this device may not be triggered", where=self.config.where)
+        await self._write_tag(self.profile.tags[form.tag], encode(self.profile.tags[form.tag], form.value))
+
     # -- samples ----------------------------------------------------------------------------------------------------
 
     def _note_sample(self, values: dict[str, TagValue]) -> bool:
@@ -181,15 +195,7 @@ class RegisterDriver(DeviceDriver):
             raise Bug("a register device takes commands only", got=type(item).__name__, where=self.config.where)
         self.check(item)
         tag = self._tag_of(item)
-        at = tag.registers
-        functions = self.profile.form.limits.functions
-        if at.table == "coil":
-            await self.client.write_coil(self.config.address, at.address, bool(int.from_bytes(item.data)))
-        elif at.count == 1 and functions is not None and 16 not in functions:
-            await self.client.write_register(self.config.address, at.address, int.from_bytes(item.data))
-        else:
-            words = [int.from_bytes(item.data[i : i + 2]) for i in range(0, len(item.data), 2)]
-            await self.client.write_registers(self.config.address, at.address, words)
+        await self._write_tag(tag, item.data)
         if tag.readable:
             held = await self._read_tag(tag)
             if held.raw != item.data:
@@ -197,8 +203,20 @@ class RegisterDriver(DeviceDriver):
                     f"{item.name}: acknowledged, and not held",
                     expected=item.data.hex(),
                     got=held.raw.hex(),
-                    where=f"{self.config.where} {at}",
+                    where=f"{self.config.where} {tag.registers}",
                 )
+
+    async def _write_tag(self, tag: Tag, data: bytes) -> None:
+        """Write a tag's registers with one request: function 10h, or 05 and 06 where the device has no other."""
+        at = tag.registers
+        functions = self.profile.form.limits.functions
+        if at.table == "coil":
+            await self.client.write_coil(self.config.address, at.address, bool(int.from_bytes(data)))
+        elif at.count == 1 and functions is not None and 16 not in functions:
+            await self.client.write_register(self.config.address, at.address, int.from_bytes(data))
+        else:
+            words = [int.from_bytes(data[i : i + 2]) for i in range(0, len(data), 2)]
+            await self.client.write_registers(self.config.address, at.address, words)
 
     def _tag_of(self, command: COMMAND) -> Tag:
         name = self.profile.form.commands.get(command.name, command.name.removeprefix("set_"))

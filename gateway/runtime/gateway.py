@@ -70,6 +70,9 @@ class Gateway:
         self.buses: dict[str, ModbusBus | CanopenBus] = {}
         for device in config.devices.values():
             driver = make_driver(device, config.buses[device.bus], self.tags, clock)
+            trigger = device.profile.form.trigger
+            if isinstance(driver, RegisterDriver) and trigger is not None:
+                driver.may_trigger = config.allow_writes and trigger.tag in device.writable
             self.drivers[device.name] = driver
             self._declare(driver)
         for bus in config.buses.values():

@@ -70,6 +70,7 @@ class DeviceState:
     backoff: Backoff = field(default_factory=lambda: Backoff(0.25, 10.0))
     next_try_ns: int = 0
     due_ns: dict[str, int] = field(default_factory=dict)
+    triggered: set[str] = field(default_factory=set)
 
 
 class ModbusBus:
@@ -223,6 +224,8 @@ class ModbusBus:
                 period_ns = device.driver.config.poll[group] * NS_PER_MS
                 now_ns = self._clock.monotonic_ns()
                 device.due_ns[group] = max(device.due_ns[group] + period_ns, now_ns)
+                if await self._trigger(device, group, now_ns):
+                    return
                 await self._attempts(lambda: device.driver.receive(group))
         except ConnectionLost:
             raise
@@ -235,6 +238,22 @@ class ModbusBus:
             if device.online and group:
                 device.error = ""
                 device.backoff.reset()
+
+    async def _trigger(self, device: DeviceState, group: str, now_ns: int) -> bool:
+        """Where a device measures when asked: ask, and come back for the values; others have the bus meanwhile."""
+        driver = device.driver
+        wait_ms = driver.trigger_wait_ms(group)
+        if not wait_ms or group in device.triggered:
+            device.triggered.discard(group)
+            return False
+        if driver.may_trigger:
+            await self._attempts(driver.trigger)
+            device.triggered.add(group)
+            device.due_ns[group] = self._clock.monotonic_ns() + wait_ms * NS_PER_MS
+        else:
+            names = [f"{driver.config.name}.{t.name}" for t in driver.profile.group(group)]
+            self._tags.put_bad(names, Reason.NOT_SAMPLING)
+        return True
 
     def _refused(self, device: DeviceState, group: str, error: DeviceRefused) -> None:
         """It answers, and says no to this group; the other groups go on.

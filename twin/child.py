@@ -1,7 +1,7 @@
 """A process that belongs to another: it ends in order when the one that started it dies, however that dies.
 
-``python -m twin.child PARENT_PID LINGER_S MODULE [ARG...]`` runs ``python -m MODULE ARG...`` like this. What stands for the plant lingers:
-the gateway needs it for a moment more, to make its outputs safe.
+``python -m twin.child PARENT_PID LINGER_S MODULE [ARG...]`` runs ``python -m MODULE ARG...`` like this. What stands for the plant
+lingers: the gateway needs it for a moment more, to make its outputs safe.
 """
 
 from __future__ import annotations

@@ -121,7 +121,9 @@ class Comparison:
         self._close("all exchanges", "median latency in ms", *map(_latency, (reference, other)), rules.latency_within_ms)
 
     def _differ(self, where: str, what: str, expected: str, got: str) -> None:
-        self.differences.append(Difference(self._device, where, what, expected, got))
+        found = Difference(self._device, where, what, expected, got)
+        if found not in self.differences:
+            self.differences.append(found)
 
     def _close(self, where: str, what: str, expected: float | None, got: float | None, within: float | None) -> None:
         if within is not None and expected is not None and got is not None and abs(expected - got) > within:
@@ -155,18 +157,17 @@ class Comparison:
             self._close(where, "median interval in ms", _interval(a), _interval(b), rule.interval_within_ms)
 
     def _replies(self, rule: Rule, one: list[bytes], two: list[bytes]) -> None:
-        """Every distinct reply of one side must have been given by the other too; `spare` of them need not."""
+        """Every distinct reply of one side must have been given by the other too; but the last of the side with more."""
         a, b = list(dict.fromkeys(one)), list(dict.fromkeys(two))
         self.compared += len(a) + len(b)
-        for mine, others, swapped in ((a, b, True), (b, a, False)):
-            alone = [(r, _nearest(r, others, rule.fields)) for r in mine]
-            alone = [(r, near) for r, near in alone if reply_differences(near, r, rule.fields)]
-            for i, (reply, near) in enumerate(alone):
-                structure = next(iter(_structure(near, reply)), None)
-                if i < rule.spare.most and structure is None:
-                    continue
-                what, expected, got = structure or reply_differences(near, reply, rule.fields)[0]
-                self._differ(rule.request, what, *((got, expected) if swapped else (expected, got)))
+        for mine, others, mine_is_reference in ((a, b, True), (b, a, False)):
+            must = len(mine) - min(rule.spare.most, max(0, len(mine) - len(others)))
+            for i, reply in enumerate(mine):
+                near = _nearest(reply, others, rule.fields)
+                pair = (reply, near) if mine_is_reference else (near, reply)
+                found = reply_differences(*pair, rule.fields) if i < must else list(_structure(*pair))
+                for difference in found:
+                    self._differ(rule.request, *difference)
 
     # -- what was heard --------------------------------------------------------------------------------------------------
 

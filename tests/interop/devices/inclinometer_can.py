@@ -1,6 +1,6 @@
 """An independent inclinometer: a bare python-can program that answers SDO requests out of a table, beats and sends TPDO1.
 
-Run as ``python inclinometer_can.py INTERFACE CHANNEL TABLE ROWS [--plant abort|byte]``. TABLE is YAML (inclinometer.yaml
+Run as ``python inclinometer_can.py INTERFACE CHANNEL TABLE ROWS [--plant abort]``. TABLE is YAML (inclinometer.yaml
 beside this), ROWS is JSON: a list of [slope long, slope lateral] in hundredths of a degree, one row a TPDO. Any interface that
 python-can knows will do.
 """
@@ -24,7 +24,6 @@ class Node:
         self.sdo = {bytes.fromhex(request): bytes.fromhex(reply) for request, reply in table["sdo"].items()}
         for request, reply in table["planted"].get(plant, {}).items():
             self.sdo[bytes.fromhex(request)] = bytes.fromhex(reply)
-        self.longer = plant == "byte"
         self.state = PRE_OPERATIONAL
         self.next_beat = self.next_tpdo = None
         self.row = 0
@@ -48,8 +47,7 @@ class Node:
             self.send(0x700 + NODE, [self.state])
             self.next_beat += self.table["heartbeat_ms"] / 1000
         if self.next_tpdo is not None and self.next_tpdo <= now:
-            data = struct.pack("<hh", *self.rows[self.row % len(self.rows)])
-            self.send(0x180 + NODE, data + b"\0" if self.longer else data)
+            self.send(0x180 + NODE, struct.pack("<hh", *self.rows[self.row % len(self.rows)]))
             self.row += 1
             self.next_tpdo += self.table["tpdo_ms"] / 1000
 
@@ -69,7 +67,7 @@ def main():
     parser = argparse.ArgumentParser()
     for name in ("interface", "channel", "table", "rows"):
         parser.add_argument(name)
-    parser.add_argument("--plant", choices=["abort", "byte"])
+    parser.add_argument("--plant", choices=["abort"])
     args = parser.parse_args()
     with open(args.table, encoding="utf-8") as file:
         table = yaml.safe_load(file)

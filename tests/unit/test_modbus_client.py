@@ -21,8 +21,9 @@ from gateway.core.errors import (
     UsageError,
     VerifyFailed,
 )
-from gateway.protocols.modbus.client import Framing, ModbusClient
+from gateway.protocols.modbus.client import ModbusClient
 from gateway.protocols.modbus.crc import with_crc
+from gateway.protocols.modbus.framings import Framing
 from gateway.wallclock import WallClock
 
 CLOCK = WallClock()

@@ -9,7 +9,8 @@ import pytest
 
 from gateway.core.errors import CrcError, Desync, FieldtwinError, ReplyTimeout, UsageError
 from gateway.protocols.modbus.crc import crc16, with_crc
-from gateway.protocols.modbus.identity import Diagnostics, ReadDeviceIdentification, ReportServerId
+from gateway.protocols.modbus.diagnostics import Diagnostics
+from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
 from gateway.protocols.modbus.mbap import MbapFramer
 from gateway.protocols.modbus.replies import RegistersReply, Reply
 from gateway.protocols.modbus.request import Request

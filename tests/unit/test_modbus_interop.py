@@ -21,7 +21,8 @@ from gateway.connections.tcp import TcpConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ModbusExceptionReply
 from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.identity import Diagnostics, ReadDeviceIdentification
+from gateway.protocols.modbus.diagnostics import Diagnostics
+from gateway.protocols.modbus.identity import ReadDeviceIdentification
 from gateway.wallclock import WallClock
 
 INPUTS = [(i * 257) & 0xFFFF for i in range(125)]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gateway.core import errors
-from gateway.protocols.modbus import identity, requests
+from gateway.protocols.modbus import diagnostics, files, identity, requests, user
 from gateway.protocols.modbus.framing import Framer
 from gateway.protocols.modbus.mbap import MbapFramer
 from gateway.protocols.modbus.replies import Reply
@@ -28,7 +28,7 @@ def ids(vector: dict[str, Any]) -> str:
 
 def make_request(spec: list[Any]) -> Request[Any]:
     name, *args = spec
-    module = requests if hasattr(requests, name) else identity
+    module = next(m for m in (requests, diagnostics, files, identity, user) if hasattr(m, name))
     request: Request[Any] = getattr(module, name)(*[tuple(a) if isinstance(a, list) else a for a in args])
     return request
 
@@ -62,7 +62,7 @@ def play(vector: dict[str, Any], chunks: list[bytes]) -> tuple[Reply | errors.Fi
 def check(vector: dict[str, Any], chunks: list[bytes]) -> None:
     outcome, late = play(vector, chunks)
     if "error" in vector:
-        assert type(outcome) is getattr(errors, vector["error"]), repr(outcome)
+        assert isinstance(outcome, getattr(errors, vector["error"])), repr(outcome)
         assert late == (vector["error"] == "ReplyTimeout" or vector.get("at_deadline", False))
         if "code" in vector:
             assert isinstance(outcome, errors.ModbusExceptionReply)

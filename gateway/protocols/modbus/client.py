@@ -9,11 +9,11 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Self, TypeVar
 
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, closed_here
-from gateway.core.endpoint import SerialSettings
+from gateway.core.endpoint import Endpoint, SerialSettings
 from gateway.core.errors import (
     ConnectionLost,
     CrcError,
@@ -24,9 +24,8 @@ from gateway.core.errors import (
     UsageError,
     VerifyFailed,
 )
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.line import LineSilence
-from gateway.protocols.modbus.mbap import MbapFramer
+from gateway.protocols.modbus.framings import Framing, framing_of, make_framer
+from gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
 from gateway.protocols.modbus.replies import BitsReply, RegistersReply, Reply, WriteReply
 from gateway.protocols.modbus.request import Request
 from gateway.protocols.modbus.requests import (
@@ -41,12 +40,9 @@ from gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from gateway.protocols.modbus.rtu import RtuFramer
 from gateway.protocols.modbus.transaction import Transaction
 
 R = TypeVar("R", bound=Reply)
-
-Framing = Literal["rtu", "mbap"]
 
 
 @dataclass(slots=True)
@@ -55,8 +51,8 @@ class ClientCounters:
 
     Every request sent ends in exactly one of the others: requests = broadcasts + replies + exceptions + timeouts +
     crc_errors + desyncs + verify_failures + abandoned, plus the one under way. `replies` are normal replies only;
-    `abandoned` were cancelled or lost with the connection. Bytes: `late_bytes` answered no request that was waiting
-    (late, duplicate), `noise_bytes` were no part of our replies.
+    `broadcasts` all that nobody answers; `abandoned` were cancelled or lost with the connection. Bytes: `late_bytes`
+    answered no request that was waiting (late, duplicate), `noise_bytes` were no part of our replies.
     """
 
     requests: int = 0
@@ -76,9 +72,10 @@ class ClientCounters:
 class ModbusClient:
     """A Modbus client (master) on `connection`, which it owns from now on.
 
-    `serial` gives an RTU line its character time: silences, and deadlines that leave out the time on the wire.
-    Without it (RTU inside TCP) frames need no silence. `timeout_s` is how long a unit may take to answer. `echo` and
-    `strict` are as in `RtuFramer` and mean nothing to MBAP.
+    `serial` gives a line its character time: silences, and deadlines that leave out the time on the wire. Without it
+    (RTU inside TCP) frames need no silence. `timeout_s` is how long a unit may take to answer, `turnaround_s` what all
+    units get to execute a broadcast. `echo` and `strict` are as in `RtuFramer`, `accepts_zero_id` as in `MbapFramer`;
+    where the framing has no such thing, `UsageError`.
     """
 
     def __init__(
@@ -91,20 +88,53 @@ class ModbusClient:
         timeout_s: float = 1.0,
         echo: bool = False,
         strict: bool = False,
+        accepts_zero_id: bool = False,
+        turnaround_s: float = TURNAROUND_S,
     ) -> None:
         self._connection = connection
         self._clock = clock
-        self._char_time_ns = round(serial.char_time_s * NS_PER_S) if serial is not None and framing == "rtu" else 0
-        self._framer = _make_framer(framing, self._char_time_ns, echo, strict)
+        self._char_time_ns = round(serial.char_time_s * NS_PER_S) if serial is not None else 0
+        self._framer = make_framer(
+            framing,
+            char_time_ns=self._char_time_ns,
+            echo=echo,
+            strict=strict,
+            accepts_zero_id=accepts_zero_id,
+        )
         self._line = LineSilence(
-            t35_ns=self._framer.t35_ns if isinstance(self._framer, RtuFramer) else 0,
-            settle_ns=self._framer.gap_ns,
+            t35_ns=self._framer.t35_ns,
+            settle_ns=self._framer.rest_ns,
             quarantines=not self._framer.confirms_transmission,
+            turnaround_ns=round(_checked_timeout(turnaround_s) * NS_PER_S),
         )
         self._timeout_s = _checked_timeout(timeout_s)
         self._turn = asyncio.Lock()
         self._closed = False
         self.counters = ClientCounters()
+
+    @classmethod
+    def at(
+        cls,
+        endpoint: Endpoint,
+        connection: ByteConnection,
+        clock: Clock,
+        *,
+        timeout_s: float = 1.0,
+        echo: bool = False,
+        strict: bool = False,
+        accepts_zero_id: bool = False,
+    ) -> Self:
+        """A client with the framing and the character time that `endpoint`, which `connection` was opened for, says."""
+        return cls(
+            connection,
+            clock,
+            framing=framing_of(endpoint),
+            serial=endpoint.serial if endpoint.is_serial else None,
+            timeout_s=timeout_s,
+            echo=echo,
+            strict=strict,
+            accepts_zero_id=accepts_zero_id,
+        )
 
     @property
     def closed(self) -> bool:
@@ -180,8 +210,8 @@ class ModbusClient:
         timeout_ns = round(_checked_timeout(self._timeout_s if timeout_s is None else timeout_s) * NS_PER_S)
         if not 0 <= unit <= 255:
             raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
-        broadcast = unit == 0 and self._framer.has_broadcast
-        if broadcast:
+        unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)
+        if unanswered:
             request.unanswered(0)  # refuses what cannot be broadcast
         async with self._turn:
             if self._closed:
@@ -190,8 +220,8 @@ class ModbusClient:
             transaction = Transaction(
                 self._framer, unit, request, timeout_ns=timeout_ns, char_time_ns=self._char_time_ns
             )
-            if broadcast:
-                return await self._broadcast(transaction, request)
+            if unanswered:
+                return await self._send_only(transaction, request)
             return await self._exchange(transaction, timeout_ns)
 
     # -- one exchange --------------------------------------------------------------------------------------------
@@ -240,13 +270,13 @@ class ModbusClient:
         await connection.write(transaction.start(clock.monotonic_ns()))
         transaction.handed_over(clock.monotonic_ns())
         while True:
-            data = connection.read_pending() or await self._read_until(transaction.wake_ns)
+            data = await self._read_pending() or await self._read_until(transaction.wake_ns)
             now_ns = clock.monotonic_ns()
             reply = transaction.feed(data, now_ns) if data else transaction.poll(now_ns)
             if reply is not None:
                 return reply
 
-    async def _broadcast(self, transaction: Transaction[R], request: Request[R]) -> R:
+    async def _send_only(self, transaction: Transaction[R], request: Request[R]) -> R:
         self.counters.requests += 1
         try:
             await self._connection.write(transaction.start(self._clock.monotonic_ns()))
@@ -297,7 +327,14 @@ class ModbusClient:
             async with asyncio.timeout(left_s):
                 return await self._connection.read()
         except TimeoutError:
-            return self._connection.read_pending()
+            return await self._read_pending()
+
+    async def _read_pending(self) -> bytes:
+        """What arrived already, possibly nothing; of datagrams only the first, so that none is joined to another."""
+        connection = self._connection
+        if not self._framer.datagrams:
+            return connection.read_pending()
+        return await connection.read() if connection.inbound.data_stream else b""
 
     # -- small things --------------------------------------------------------------------------------------------
 
@@ -311,16 +348,6 @@ class ModbusClient:
 
     def _place(self, error: FieldtwinError) -> None:
         error.at(str(self._connection.endpoint))
-
-
-def _make_framer(framing: str, char_time_ns: int, echo: bool, strict: bool) -> Framer:
-    if framing == "mbap":
-        return MbapFramer()
-    if framing != "rtu":
-        raise UsageError(f"unknown Modbus framing {framing!r}", expected="rtu or mbap")
-    if strict and not char_time_ns:
-        raise UsageError("strict RTU timing needs the baud rate and frame of the line")
-    return RtuFramer(echo=echo, strict=strict, char_time_ns=char_time_ns)
 
 
 def _checked_timeout(timeout_s: float) -> float:

@@ -49,6 +49,10 @@ _COUNTED: dict[int, tuple[tuple[int, int], ...]] = {
 
 _EVEN = frozenset({0x03, 0x04, 0x10, 0x17})
 
+_FIFO = 0x18
+_MEI = 0x2B
+_DEVICE_IDENTIFICATION = 0x0E
+
 
 def frame_lengths(head: bytes | bytearray) -> tuple[list[int], bool]:
     """Lengths that a frame beginning with `head` can have, ascending, and whether more bytes could add one.
@@ -65,4 +69,30 @@ def frame_lengths(head: bytes | bytearray) -> tuple[list[int], bool]:
             open_ended = True
         elif head[at] and rest + head[at] <= MAX_FRAME and not (function in _EVEN and head[at] % 2):
             lengths.add(rest + head[at])
+    if function in (_FIFO, _MEI):
+        special, more = _fifo_reply(head) if function == _FIFO else _identification_reply(head)
+        lengths.update(special)
+        open_ended = more
     return sorted(lengths), open_ended
+
+
+def _fifo_reply(head: bytes | bytearray) -> tuple[list[int], bool]:
+    """AP 6.18: the byte count has two bytes."""
+    if len(head) < 4:
+        return [], True
+    length = 6 + int.from_bytes(head[2:4], "big")
+    return ([length], False) if 8 <= length <= MAX_FRAME and length % 2 == 0 else ([], False)
+
+
+def _identification_reply(head: bytes | bytearray) -> tuple[list[int], bool]:
+    """AP 6.21: eight bytes, then as many objects as the eighth says, each with a length of its own."""
+    if len(head) > 2 and head[2] != _DEVICE_IDENTIFICATION:
+        return [], False
+    if len(head) < 8:
+        return [], True
+    end = 8
+    for _ in range(head[7]):
+        if end + 2 > len(head):
+            return [], end + 4 <= MAX_FRAME
+        end += 2 + head[end + 1]
+    return ([end + 2], False) if end + 2 <= MAX_FRAME else ([], False)

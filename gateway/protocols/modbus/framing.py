@@ -1,6 +1,6 @@
 """What a framing is: request PDU in, frame out; bytes in, the one awaited reply PDU out.
 
-`RtuFramer` (in rtu) and `MbapFramer` (in mbap) implement it; ASCII, UDP and TLS have the same shape. A framing decides
+Modules rtu, ascii and mbap (TCP, TLS and UDP) implement it. A framing decides
 which bytes are the reply, and whether they arrived whole; what the reply says is the request's to judge. No clock here:
 `now_ns` is passed.
 """
@@ -27,13 +27,26 @@ class Framer(ABC):
     has_broadcast: bool = False
     """Whether unit 0 addresses everybody and nobody answers (SL 2.1); else it is a unit like any other (TG 4.4.1.2)."""
 
+    datagrams: bool = False
+    """Whether the wire keeps the borders of what is sent: then each `feed` gets one datagram, no more and no less."""
+
     gap_ns: int = 0
     """How long the wire must be silent before `settle` is called; 0: never."""
+
+    t35_ns: int = 0
+    """The silence that must precede a frame; 0: none."""
+
+    rest_ns: int = 0
+    """How late the rest of a damaged frame may come."""
 
     def __init__(self) -> None:
         self.late_bytes = 0
         self.noise_bytes = 0
         self.foreign_frames = 0
+
+    @abstractmethod
+    def wire_length(self, pdu_length: int) -> int:
+        """Characters on the wire of a frame whose PDU has `pdu_length` bytes."""
 
     @abstractmethod
     def begin(self, unit: int, request: Request[Any]) -> bytes:

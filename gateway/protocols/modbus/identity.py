@@ -1,21 +1,19 @@
-"""The requests that ask a device about itself: 07h, 08h, 11h and 2Bh/0Eh (AP 6.7, 6.8, 6.13, 6.21)."""
+"""The requests that ask a device about itself: 07h, 11h and 2Bh/0Eh (AP 6.7, 6.13, 6.21)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.errors import Desync, UsageError
+from gateway.core.errors import Desync
 from gateway.protocols.modbus import pdus
 from gateway.protocols.modbus.replies import (
     DeviceIdentificationReply,
-    DiagnosticsReply,
     ExceptionStatusReply,
     ServerIdReply,
 )
 from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
 from gateway.protocols.modbus.requests import check_range
 
-_FORCE_LISTEN_ONLY = 4
 _MEI_DEVICE_IDENTIFICATION = 0x0E
 _IDENTIFICATION_HEAD = 7  # function, MEI type, read code, conformity, more follows, next object id, number of objects
 
@@ -39,45 +37,6 @@ class ReadExceptionStatus(Request[ExceptionStatusReply]):
 
     def decode(self, pdu: bytes, t_ns: int) -> ExceptionStatusReply:
         return ExceptionStatusReply(pdu[1], bytes(pdu[1:]), t_ns)
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnostics(Request[DiagnosticsReply]):
-    """Function 08h with one data word: loopback (sub-function 0) and the counters (0Bh to 12h).
-
-    Force listen only (4) has no reply and is not sent by this request. Encoded here: pymodbus has a class per
-    sub-function, all of this one shape.
-    """
-
-    sub_function: int
-    value: int = 0
-
-    def __post_init__(self) -> None:
-        check_range("diagnostics sub-function", self.sub_function, 0, 0xFFFF)
-        if self.sub_function == _FORCE_LISTEN_ONLY:
-            raise UsageError("diagnostics sub-function 4 (force listen only) has no reply")
-        check_range("diagnostics data", self.value, 0, 0xFFFF)
-
-    @property
-    def function(self) -> int:
-        return 0x08
-
-    def encode(self) -> bytes:
-        return bytes([0x08]) + self.sub_function.to_bytes(2, "big") + self.value.to_bytes(2, "big")
-
-    def nominal_length(self) -> int:
-        return 5
-
-    def reply_length(self, head: bytes) -> int:
-        return 5
-
-    def decode(self, pdu: bytes, t_ns: int) -> DiagnosticsReply:
-        if pdu[1:3] != self.encode()[1:3]:
-            raise Desync("a reply to another diagnostics sub-function", got=bytes(pdu).hex(" "))
-        value = int.from_bytes(pdu[3:5], "big")
-        if self.sub_function == 0 and value != self.value:
-            raise Desync("the loopback came back changed", expected=f"{self.value:04X}h", got=f"{value:04X}h")
-        return DiagnosticsReply(value, bytes(pdu[1:]), t_ns)
 
 
 @dataclass(frozen=True, slots=True)

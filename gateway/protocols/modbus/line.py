@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 
-TURNAROUND_NS = 100 * NS_PER_MS
+TURNAROUND_S = 0.1
 """What units get to execute a broadcast (SL 2.4.1: 100 to 200 ms)."""
 
 _LONGEST_LATENCY_NS = 60 * NS_PER_S
@@ -22,10 +22,14 @@ _BABBLE_GRACE_NS = 500 * NS_PER_MS
 
 class LineSilence:
     """`t35_ns`: the silence between frames (SL 2.5.1.1), 0 where there is none. `settle_ns`: how late the rest of a
-    damaged frame may come. `quarantines`: whether replies cannot be told apart.
+    damaged frame may come. `quarantines`: whether replies cannot be told apart. `turnaround_ns`: the pause behind a
+    request that nobody answers.
     """
 
-    def __init__(self, *, t35_ns: int, settle_ns: int, quarantines: bool) -> None:
+    def __init__(
+        self, *, t35_ns: int, settle_ns: int, quarantines: bool, turnaround_ns: int = round(TURNAROUND_S * NS_PER_S)
+    ) -> None:
+        self._turnaround_ns = turnaround_ns
         self._t35_ns = t35_ns
         self._settle_ns = settle_ns
         self._quarantines = quarantines
@@ -89,7 +93,7 @@ class LineSilence:
     def broadcast(self, sent_ns: int) -> None:
         """Nobody answers; the units get time to execute."""
         self._end(sent_ns, self._t35_ns)
-        self._not_before_ns = sent_ns + TURNAROUND_NS
+        self._not_before_ns = sent_ns + self._turnaround_ns
 
     def _end(self, now_ns: int, required_ns: int) -> None:
         self._active_ns = now_ns

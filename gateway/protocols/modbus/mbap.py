@@ -1,8 +1,8 @@
-"""Modbus over TCP: the MBAP header (TG 3.1.3), read from a stream whose chunk borders mean nothing.
+"""Modbus over TCP, TLS and UDP: the MBAP header (TG 3.1.3).
 
-A reply is told by its transaction id, so a late one is recognised and thrown away. A header that cannot be right (its
-length out of bounds) or an ADU that never ends leaves no border to count from: then the stream is searched for the
-header of the reply awaited. Nothing here knows sockets.
+A reply is told by its transaction id, so a late one is recognised and thrown away. In a stream chunk borders mean
+nothing; a header that cannot be right (its length out of bounds) or an ADU that never ends leaves no border to count
+from, and then the stream is searched for the header of the reply awaited. Nothing here knows sockets.
 """
 
 from __future__ import annotations
@@ -21,18 +21,27 @@ _MAX_LENGTH = MAX_PDU + 1
 
 
 class MbapFramer(Framer):
-    """MBAP framing of one stream. Replies must carry our transaction id, protocol id 0 and our unit id."""
+    """MBAP framing of one stream. Replies must carry our transaction id, protocol id 0 and our unit id.
+
+    `accepts_zero_id`: a reply with transaction id 0 is ours too, for servers that always send 0 (case MB-056). It is a
+    quirk to be asked for, because then a late reply cannot be told any more: such a wire is quarantined like a line.
+    """
 
     confirms_transmission = True
 
-    def __init__(self) -> None:
+    def __init__(self, *, accepts_zero_id: bool = False) -> None:
         super().__init__()
+        self.confirms_transmission = not accepts_zero_id
+        self._accepts_zero_id = accepts_zero_id
         self._buffer = bytearray()
         self._transaction = 0
         self._unit = 0
         self._awaiting = False
         self._lost = False
         self._seen = ""
+
+    def wire_length(self, pdu_length: int) -> int:
+        return _HEADER.size + pdu_length
 
     def begin(self, unit: int, request: Request[Any]) -> bytes:
         self._transaction = self._transaction % 0xFFFF + 1  # 0 is what broken servers always answer (case MB-056)
@@ -45,10 +54,13 @@ class MbapFramer(Framer):
         return _HEADER.pack(self._transaction, 0, len(pdu) + 1, unit) + pdu
 
     def feed(self, data: bytes, now_ns: int) -> bytes | None:
+        if self._awaiting and not self._buffer and not self._lost and data[: _HEADER.size] == self._header_for(data):
+            self._awaiting = False  # as a rule: the reply, whole and alone
+            return data[_HEADER.size :]
         self._buffer += data
         while (adu := self._next_adu()) is not None:
             transaction, protocol, _, unit = _HEADER.unpack_from(adu)
-            if self._awaiting and (transaction, protocol, unit) == (self._transaction, 0, self._unit):
+            if self._awaiting and self._is_ours(transaction) and (protocol, unit) == (0, self._unit):
                 self._awaiting = False
                 self._drop_rest()
                 return bytes(adu[_HEADER.size :])
@@ -67,6 +79,16 @@ class MbapFramer(Framer):
         return ReplyTimeout(
             f"no reply within {waited_s:g} s", expected=f"transaction {self._transaction}, unit {self._unit}", got=got
         )
+
+    def _header_for(self, adu: bytes) -> bytes | None:
+        """The header that `adu` has if it is the reply awaited and nothing follows it."""
+        length = len(adu) - _BEFORE_LENGTH_COUNTS
+        if not _MIN_LENGTH <= length <= _MAX_LENGTH:
+            return None
+        return _HEADER.pack(self._transaction, 0, length, self._unit)
+
+    def _is_ours(self, transaction: int) -> bool:
+        return transaction == self._transaction or (self._accepts_zero_id and transaction == 0)
 
     def _next_adu(self) -> bytearray | None:
         """Cut the next whole ADU off the buffer, whoever's it is."""
@@ -90,19 +112,25 @@ class MbapFramer(Framer):
 
     def _search(self) -> bool:
         """Throw away all before a header of the awaited reply; False while there is none."""
-        wanted = struct.pack(">HH", self._transaction, 0)
+        ids = (self._transaction, 0) if self._accepts_zero_id else (self._transaction,)
+        found = [at for at in (self._find_header(struct.pack(">HH", number, 0)) for number in ids) if at >= 0]
+        if not found:
+            self._skip(max(0, len(self._buffer) - 3))  # the first bytes of both ids may have come already
+            return False
+        self._skip(min(found))
+        self._lost = len(self._buffer) < _HEADER.size
+        return not self._lost
+
+    def _find_header(self, ids: bytes) -> int:
+        """Where the first header stands that begins with `ids` and can be the reply's, complete or not yet; else -1."""
         at = 0
-        while (at := self._buffer.find(wanted, at)) >= 0:
+        while (at := self._buffer.find(ids, at)) >= 0:
             head = self._buffer[at : at + _HEADER.size]
             length_ok = len(head) < 6 or _MIN_LENGTH <= int.from_bytes(head[4:6], "big") <= _MAX_LENGTH
             if length_ok and (len(head) < 7 or head[6] == self._unit):
-                self._skip(at)
-                if len(head) == _HEADER.size:
-                    self._lost = False
-                return not self._lost
+                return at
             at += 1
-        self._skip(max(0, len(self._buffer) - (len(wanted) - 1)))  # its first bytes may have come already
-        return False
+        return -1
 
     def _skip(self, count: int) -> None:
         self.noise_bytes += count
@@ -111,3 +139,20 @@ class MbapFramer(Framer):
     def _drop_rest(self) -> None:
         """What follows the reply is nobody's answer (one request at a time), but its borders still count."""
         self.feed(b"", 0)
+
+
+class UdpFramer(MbapFramer):
+    """MBAP in datagrams: each holds whole ADUs. What a datagram leaves over belongs to no other and is dropped."""
+
+    datagrams = True
+
+    def feed(self, data: bytes, now_ns: int) -> bytes | None:
+        reply = super().feed(data, now_ns)
+        if self._buffer:
+            self._seen = self._seen or f"{len(self._buffer)} bytes of an ADU that was cut off"
+            self._skip(len(self._buffer))
+        self._lost = False
+        return reply
+
+    def _search(self) -> bool:
+        return False  # behind a header that cannot be right, nothing in a datagram can be trusted

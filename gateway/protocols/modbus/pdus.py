@@ -1,23 +1,22 @@
-"""The border to pymodbus: protocol data units in and out by its PDU classes, encode and decode only.
+"""Protocol data units to bytes and back; the border to pymodbus, whose PDU classes encode the requests.
 
-The only file that imports pymodbus. Its decoders accept too much (any byte count, any echo, padding): whoever calls a
-``decode_`` function has checked length and byte count against the request before. What they raise nevertheless is
-translated here.
+The only file that imports pymodbus. Its decoders are not used: they accept too much (any byte count, any echo,
+padding) and take longer than all the rest of an exchange (docs/decisions). What its encoders raise is translated here.
+Requests are polled again and again, so their bytes are kept; the bound is on the number kept.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from itertools import chain
 
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 from pymodbus.pdu.bit_message import (
     ReadCoilsRequest,
-    ReadCoilsResponse,
     ReadDiscreteInputsRequest,
-    ReadDiscreteInputsResponse,
     WriteMultipleCoilsRequest,
     WriteSingleCoilRequest,
 )
@@ -26,16 +25,13 @@ from pymodbus.pdu.other_message import ReadExceptionStatusRequest, ReportDeviceI
 from pymodbus.pdu.register_message import (
     MaskWriteRegisterRequest,
     ReadHoldingRegistersRequest,
-    ReadHoldingRegistersResponse,
     ReadInputRegistersRequest,
-    ReadInputRegistersResponse,
     ReadWriteMultipleRegistersRequest,
-    ReadWriteMultipleRegistersResponse,
     WriteMultipleRegistersRequest,
     WriteSingleRegisterRequest,
 )
 
-from gateway.core.errors import Bug, Desync, FieldtwinError
+from gateway.core.errors import Bug
 
 _FOREIGN = (ModbusException, ValueError, IndexError, TypeError, struct.error)
 
@@ -45,36 +41,24 @@ _READ_REQUESTS: dict[int, type[ModbusPDU]] = {
     0x03: ReadHoldingRegistersRequest,
     0x04: ReadInputRegistersRequest,
 }
-_REGISTER_REPLIES: dict[int, type[ModbusPDU]] = {
-    0x03: ReadHoldingRegistersResponse,
-    0x04: ReadInputRegistersResponse,
-    0x17: ReadWriteMultipleRegistersResponse,
-}
-_BIT_REPLIES: dict[int, type[ModbusPDU]] = {0x01: ReadCoilsResponse, 0x02: ReadDiscreteInputsResponse}
 
+_KEPT = 4096
+"""Encoded reads kept: as many different ones as the poll groups of a few hundred devices have."""
 
-@contextmanager
-def _translated(make: Callable[[str], FieldtwinError]) -> Iterator[None]:
-    try:
-        yield
-    except _FOREIGN as e:
-        raise make(f"{type(e).__name__}: {e}") from e
-
-
-def _unencodable(why: str) -> FieldtwinError:
-    return Bug(f"a checked request cannot be encoded: {why}")
-
-
-def _undecodable(why: str) -> FieldtwinError:
-    return Desync(f"a reply cannot be decoded: {why}")
+_MOST_WORDS = 126
+_WORDS = tuple(struct.Struct(f">{count}H") for count in range(_MOST_WORDS + 1))
+_BITS = tuple(tuple(bool(byte >> bit & 1) for bit in range(8)) for byte in range(256))
 
 
 def _encode(make: Callable[[], ModbusPDU]) -> bytes:
-    with _translated(_unencodable):
+    try:
         pdu = make()
         return bytes([pdu.function_code]) + pdu.encode()
+    except _FOREIGN as e:
+        raise Bug(f"a checked request cannot be encoded: {type(e).__name__}: {e}") from e
 
 
+@lru_cache(maxsize=_KEPT)
 def encode_read(function: int, address: int, count: int) -> bytes:
     """Functions 01h to 04h (AP 6.1 to 6.4)."""
     return _encode(lambda: _READ_REQUESTS[function](address=address, count=count))
@@ -132,17 +116,16 @@ def encode_device_identification(read_code: int, object_id: int) -> bytes:
     return _encode(lambda: ReadDeviceInformationRequest(read_code=read_code, object_id=object_id))
 
 
-def decode_registers(pdu: bytes) -> tuple[int, ...]:
-    """The registers of a reply to 03h, 04h or 17h whose byte count has been checked."""
-    with _translated(_undecodable):
-        reply = _REGISTER_REPLIES[pdu[0]]()
-        reply.decode(pdu[1:])
-        return tuple(reply.registers)
+def words_of(data: bytes) -> tuple[int, ...]:
+    """The unsigned words of at most 252 bytes, an even number of them, high byte first (AP 4.2)."""
+    return _WORDS[len(data) // 2].unpack(data)
 
 
-def decode_bits(pdu: bytes) -> tuple[bool, ...]:
-    """The bits of a reply to 01h or 02h, padding included, whose byte count has been checked."""
-    with _translated(_undecodable):
-        reply = _BIT_REPLIES[pdu[0]]()
-        reply.decode(pdu[1:])
-        return tuple(reply.bits)
+def words_to_bytes(words: Sequence[int]) -> bytes:
+    """`words`, each 0 to 65535, high byte first; at most 126 of them."""
+    return _WORDS[len(words)].pack(*words)
+
+
+def bits_of(data: bytes) -> tuple[bool, ...]:
+    """The bits of `data`, padding included: the lowest bit of the first byte is the first (AP 6.1)."""
+    return tuple(chain.from_iterable(map(_BITS.__getitem__, data)))

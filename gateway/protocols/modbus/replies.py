@@ -85,3 +85,43 @@ class DeviceIdentificationReply(Reply):
     next_object_id: int
     raw: bytes
     t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class CommEventCounterReply(Reply):
+    """Function 0Bh (AP 6.9): whether a program command is being executed, and the requests completed so far."""
+
+    busy: bool
+    event_count: int
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class CommEventLogReply(Reply):
+    """Function 0Ch (AP 6.10): as 0Bh, the messages on the line, and the events as bytes, the latest first."""
+
+    busy: bool
+    event_count: int
+    message_count: int
+    events: bytes
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class FileRecordsReply(Reply):
+    """Function 14h (AP 6.14): the words of each span, in the order in which the spans were asked for."""
+
+    records: tuple[tuple[int, ...], ...]
+    raw: bytes
+    t_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class UserReply(Reply):
+    """The reply to a user-defined function: `raw` is its data. Unacknowledged and empty after a broadcast."""
+
+    raw: bytes
+    t_ns: int
+    acknowledged: bool = True

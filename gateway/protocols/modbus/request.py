@@ -1,4 +1,6 @@
-"""What a Modbus request is to framings, transactions and the client; the concrete ones are in `requests` and `identity`.
+"""What a Modbus request is to framings, transactions and the client.
+
+The concrete ones are in `requests`, `files`, `diagnostics`, `identity` and `user`.
 
 A request knows its own bytes, how long its reply has to be, and whether a reply is its answer. It knows neither unit
 id, framing nor time.
@@ -7,9 +9,10 @@ id, framing nor time.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
-from gateway.core.errors import Desync, ModbusExceptionReply, UsageError
+from gateway.core.errors import Desync, UsageError
+from gateway.protocols.modbus.refusals import refusal
 from gateway.protocols.modbus.replies import Reply
 
 R = TypeVar("R", bound=Reply)
@@ -32,6 +35,9 @@ class Request(ABC, Generic[R_co]):
     """
 
     __slots__ = ()
+
+    expects_reply: ClassVar[bool] = True
+    """Whether a unit that executes it answers; the few that are answered by nobody end with `unanswered`."""
 
     @property
     @abstractmethod
@@ -67,7 +73,8 @@ class Request(ABC, Generic[R_co]):
 def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
     """Judge a whole reply PDU against its request.
 
-    Raises `ModbusExceptionReply` (any code, raw), `Desync` for what is no answer to this request, `VerifyFailed`.
+    Raises `ModbusExceptionReply` (any code, raw; types in `refusals`), `Desync` for what is no answer to this request,
+    `VerifyFailed`.
     """
     function = request.function
     if not pdu:
@@ -75,7 +82,7 @@ def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
     if pdu[0] == function | 0x80:
         if len(pdu) != 2:
             raise Desync("an exception reply of the wrong size", expected="2 bytes", got=pdu.hex(" "))
-        raise ModbusExceptionReply(function, pdu[1])
+        raise refusal(function, pdu[1])
     if pdu[0] != function:
         raise Desync("a reply to another function", expected=f"{function:02X}h", got=f"{pdu[0]:02X}h")
     length = request.reply_length(pdu)

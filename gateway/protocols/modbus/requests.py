@@ -76,7 +76,8 @@ class ReadRegisters(Request[RegistersReply]):
         return _counted(head, 2 * self.count)
 
     def decode(self, pdu: bytes, t_ns: int) -> RegistersReply:
-        return RegistersReply(pdus.decode_registers(pdu), bytes(pdu[2:]), t_ns)
+        raw = pdu[2:]
+        return RegistersReply(pdus.words_of(raw), raw, t_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +106,8 @@ class ReadBits(Request[BitsReply]):
         return _counted(head, (self.count + 7) // 8)
 
     def decode(self, pdu: bytes, t_ns: int) -> BitsReply:
-        return BitsReply(pdus.decode_bits(pdu)[: self.count], bytes(pdu[2:]), t_ns)
+        raw = pdu[2:]
+        return BitsReply(pdus.bits_of(raw)[: self.count], raw, t_ns)
 
 
 class _Write(Request[WriteReply]):
@@ -261,4 +263,5 @@ class ReadWriteRegisters(Request[RegistersReply]):
         return _counted(head, 2 * self.read_count)
 
     def decode(self, pdu: bytes, t_ns: int) -> RegistersReply:
-        return RegistersReply(pdus.decode_registers(pdu), bytes(pdu[2:]), t_ns)
+        raw = pdu[2:]
+        return RegistersReply(pdus.words_of(raw), raw, t_ns)

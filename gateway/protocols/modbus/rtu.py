@@ -47,7 +47,7 @@ class RtuFramer(Framer):
         # SL 2.5.1.1: fixed above 19200 bit/s, where 3.5 characters of 11 bits would be shorter.
         self.t15_ns = max(char_time_ns * 3 // 2, 750_000) if char_time_ns else 0
         self.t35_ns = max(char_time_ns * 7 // 2, 1_750_000) if char_time_ns else 0
-        self.gap_ns = max(self.t35_ns, USB_LATENCY_NS)
+        self.gap_ns = self.rest_ns = max(self.t35_ns, USB_LATENCY_NS)
         self._buffer = bytearray()
         self._request: Request[Any] | None = None
         self._unit = 0
@@ -58,6 +58,9 @@ class RtuFramer(Framer):
         self._garbage = 0
         self._wrong_header = ""
         self._seen = ""
+
+    def wire_length(self, pdu_length: int) -> int:
+        return 1 + pdu_length + 2
 
     def begin(self, unit: int, request: Request[Any]) -> bytes:
         self._skip(len(self._buffer))
@@ -77,6 +80,9 @@ class RtuFramer(Framer):
         if self._after_foreign:
             self.noise_bytes += len(data)
             return None
+        if not self._buffer and self._is_our_reply(data):
+            self._end(0)
+            return data[1:-2]
         self._buffer += data
         return self._scan(settled=False)
 
@@ -102,6 +108,13 @@ class RtuFramer(Framer):
         return ReplyTimeout(f"no reply within {waited_s:g} s", expected=self._expectation(), got=got)
 
     # -- reading from the front ----------------------------------------------------------------------------------
+
+    def _is_our_reply(self, data: bytes) -> bool:
+        """As a rule a chunk is the reply, whole and alone; whatever else it is, `_scan` finds out."""
+        request = self._request
+        if request is None or self._echo_due or len(data) < _EXCEPTION_FRAME or data[0] != self._unit:
+            return False
+        return data[1] == request.function and request.reply_length(data[1:]) + 3 == len(data) and crc16(data) == 0
 
     def _scan(self, settled: bool) -> bytes | None:
         if self._echo_due and not self._strip_echo():

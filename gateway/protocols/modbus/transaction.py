@@ -6,7 +6,6 @@ deadline. Nothing here waits, retries or knows a connection.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Generic, TypeVar
 
 from gateway.core.clock import NS_PER_S
@@ -43,7 +42,10 @@ class Transaction(Generic[R]):
     @property
     def deadline_ns(self) -> int:
         """When the reply has to be complete."""
-        return self.sent_ns + self._timeout_ns + self._request.nominal_length() * self._char_time_ns
+        due_ns = self.sent_ns + self._timeout_ns
+        if self._char_time_ns and (nominal := self._request.nominal_length()):
+            due_ns += self._framer.wire_length(nominal) * self._char_time_ns
+        return due_ns
 
     @property
     def wake_ns(self) -> int:
@@ -72,7 +74,12 @@ class Transaction(Generic[R]):
         self._check_running()
         self._heard_ns = now_ns
         self._settled = False
-        return self._judge(lambda: self._framer.feed(data, now_ns), now_ns)
+        try:
+            pdu = self._framer.feed(data, now_ns)
+            return None if pdu is None else self._completed(pdu, now_ns)
+        except FieldtwinError as e:
+            self._failed(e)
+            raise
 
     def poll(self, now_ns: int) -> R | None:
         """Time passed. As `feed`; at the deadline raises what `Framer.overdue` says, `ReplyTimeout` as a rule."""
@@ -80,26 +87,25 @@ class Transaction(Generic[R]):
         overdue = now_ns >= self.deadline_ns
         if not self._settled and (overdue or now_ns >= self._heard_ns + self._framer.gap_ns):
             self._settled = True
-            reply = self._judge(self._framer.settle, self._heard_ns)
-            if reply is not None:
-                return reply
+            try:
+                pdu = self._framer.settle()
+                if pdu is not None:
+                    return self._completed(pdu, self._heard_ns)
+            except FieldtwinError as e:
+                self._failed(e)
+                raise
         if overdue:
-            self.done = True
-            raise self._framer.overdue(self._timeout_ns / NS_PER_S).at(f"unit {self._unit}")
+            raise self._failed(self._framer.overdue(self._timeout_ns / NS_PER_S))
         return None
 
-    def _judge(self, pdu_from: Callable[[], bytes | None], now_ns: int) -> R | None:
-        try:
-            pdu = pdu_from()
-            if pdu is None:
-                return None
-            reply = parse_reply(self._request, pdu, now_ns)
-        except FieldtwinError as e:
-            self.done = True
-            e.at(f"unit {self._unit}")
-            raise
+    def _completed(self, pdu: bytes, now_ns: int) -> R:
+        reply = parse_reply(self._request, pdu, now_ns)
         self.done = True
         return reply
+
+    def _failed(self, error: FieldtwinError) -> FieldtwinError:
+        self.done = True
+        return error.at(f"unit {self._unit}")
 
     def _check_running(self) -> None:
         if self.done or not self._frame:

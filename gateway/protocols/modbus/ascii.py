@@ -1,0 +1,195 @@
+"""Modbus ASCII (SL 2.5.2): ``:``, the frame in hexadecimal, LRC, CR LF.
+
+A colon begins a frame wherever it stands and LF ends it, so nothing has to be told by length; a pause over a second
+inside a frame ends it too (case MB-070). Like RTU, a reply does not say which request it answers. Nothing here knows
+ports.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gateway.core.clock import NS_PER_MS, NS_PER_S
+from gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError
+from gateway.protocols.modbus.framing import Framer
+from gateway.protocols.modbus.request import MAX_PDU, Request, short_hex
+
+CHARACTER_GAP_NS = NS_PER_S
+"""The longest pause between two characters of a frame (SL 2.5.2.1)."""
+
+MAX_FRAME = 1 + 2 * (1 + MAX_PDU + 1) + 2
+"""Characters of the longest frame: 513 (SL 2.5.2.1)."""
+
+_REST_NS = 20 * NS_PER_MS  # what a USB adapter may still hold back of a damaged frame
+_START, _END = b":", b"\n"
+
+
+def lrc(data: bytes | bytearray) -> int:
+    """The check sum of ASCII frames (SL 6.2.1): with it, the bytes of a frame sum up to 0 modulo 256."""
+    return -sum(data) & 0xFF
+
+
+class AsciiFramer(Framer):
+    """ASCII framing of one line. `echo` as in `RtuFramer`."""
+
+    has_broadcast = True
+    gap_ns = CHARACTER_GAP_NS
+    rest_ns = _REST_NS
+
+    def __init__(self, *, echo: bool = False) -> None:
+        super().__init__()
+        self._expect_echo = echo
+        self._buffer = bytearray()
+        self._request: Request[Any] | None = None
+        self._unit = 0
+        self._sent = b""
+        self._echo_due = False
+        self._last_ns = 0
+        self._damaged = 0
+        self._seen = ""
+
+    def wire_length(self, pdu_length: int) -> int:
+        return 1 + 2 * (1 + pdu_length + 1) + 2
+
+    def begin(self, unit: int, request: Request[Any]) -> bytes:
+        self._skip(len(self._buffer))
+        self._request = request
+        self._unit = unit
+        frame = bytes([unit]) + request.encode()
+        self._sent = _START + (frame + bytes([lrc(frame)])).hex().upper().encode() + b"\r\n"
+        self._echo_due = self._expect_echo
+        self._damaged = 0
+        self._seen = ""
+        return self._sent
+
+    def feed(self, data: bytes, now_ns: int) -> bytes | None:
+        if self._buffer and now_ns - self._last_ns > CHARACTER_GAP_NS:
+            self._give_up_frame()
+        self._last_ns = now_ns
+        self._buffer += data
+        if self._echo_due and not self._strip_echo():
+            return None
+        while (request := self._request) is not None and (text := self._next_frame()) is not None:
+            pdu = self._judge(text, request)
+            if pdu is not None:
+                return pdu
+        return None
+
+    def settle(self) -> bytes | None:
+        self._give_up_frame()
+        return None
+
+    def drained(self, data: bytes) -> None:
+        if self._echo_due and data.startswith(self._sent):  # the echo of a broadcast
+            self._echo_due = False
+            data = data[len(self._sent) :]
+        self.late_bytes += len(data)
+
+    def overdue(self, waited_s: float) -> WireError:
+        if self._damaged:
+            return CrcError(
+                f"{self._damaged} damaged frames arrived and no whole one",
+                expected=self._expectation(),
+                hint="check baud rate, parity and wiring",
+            )
+        got = short_hex(self._buffer) if self._buffer else self._seen
+        return ReplyTimeout(f"no reply within {waited_s:g} s", expected=self._expectation(), got=got)
+
+    # -- reading from the front ----------------------------------------------------------------------------------
+
+    def _next_frame(self) -> bytes | None:
+        """Cut the next frame off the buffer, from its colon to its LF; what is no frame is noise."""
+        buffer = self._buffer
+        while (end := buffer.find(_END)) >= 0:
+            start = buffer.rfind(_START, 0, end)  # the last colon: at a second one the first frame was cut off
+            if start < 0:
+                self._skip(end + 1)
+                continue
+            self._skip(start)
+            text = bytes(buffer[: end - start + 1])
+            del buffer[: end - start + 1]
+            return text
+        start = buffer.rfind(_START)
+        self._skip(start if start >= 0 else len(buffer))
+        if len(buffer) > MAX_FRAME:
+            self._give_up_frame()
+        return None
+
+    def _judge(self, text: bytes, request: Request[Any]) -> bytes | None:
+        """The PDU of a frame of our unit and function; None for a frame that is not ours. Raises as `feed`."""
+        frame = _decoded(text)
+        ours = f":{self._unit:02X}{request.function:02X}".encode()
+        if frame is None:
+            self._damaged += 1
+            self.noise_bytes += len(text)
+            if text.upper().startswith((ours, f":{self._unit:02X}{request.function | 0x80:02X}".encode())):
+                self._end()
+                raise CrcError("a reply is damaged", expected="hexadecimal digits and a right LRC", got=repr(text[:48]))
+            return None
+        if frame[0] != self._unit:
+            self._seen = f"a frame of unit {frame[0]}"
+            self.foreign_frames += 1
+            self.noise_bytes += len(text)
+            return None
+        self._end()
+        pdu = frame[1:]
+        echoed = text == self._sent and request.reply_length(pdu) != len(pdu)
+        if echoed or pdu[0] & 0x7F != request.function:
+            hint = "the line echoes what is sent: say so in its settings" if echoed else ""
+            raise Desync(
+                "a frame that answers another request", expected=self._expectation(), got=short_hex(frame), hint=hint
+            )
+        return pdu
+
+    def _strip_echo(self) -> bool:
+        """Remove our own request from the front; False while it is incomplete."""
+        start = self._buffer.find(_START)
+        self._skip(len(self._buffer) if start < 0 else start)
+        size = min(len(self._buffer), len(self._sent))
+        if self._buffer[:size] != self._sent[:size]:
+            got = repr(bytes(self._buffer[:48]))
+            self._end()
+            expected = repr(self._sent[:48])
+            raise Desync("the echo differs from what was sent", expected=expected, got=got, hint="a collision")
+        if size < len(self._sent):
+            return False
+        del self._buffer[:size]
+        self._echo_due = False
+        return True
+
+    # -- counting ------------------------------------------------------------------------------------------------
+
+    def _give_up_frame(self) -> None:
+        if self._buffer:
+            self._seen = f"{len(self._buffer)} characters of a frame that never ended"
+            self._skip(len(self._buffer))
+
+    def _skip(self, count: int) -> None:
+        self.noise_bytes += count
+        del self._buffer[:count]
+
+    def _end(self) -> None:
+        """The exchange is over; what follows its frame is nobody's."""
+        self.late_bytes += len(self._buffer)
+        self._buffer.clear()
+        self._request = None
+        self._echo_due = False
+
+    def _expectation(self) -> str:
+        function = f"{self._request.function:02X}h" if self._request else "?"
+        return f"unit {self._unit}, function {function}"
+
+
+def _decoded(text: bytes) -> bytes | None:
+    """Unit and PDU of the frame ``:...CR LF``; None where a character is no digit, or the LRC is wrong.
+
+    Small letters are taken, though SL 2.5.2 has capitals only: some devices send them.
+    """
+    digits = text[1:-2]
+    if not text.endswith(b"\r\n") or len(digits) < 6 or len(digits) % 2 or not digits.isalnum():
+        return None
+    try:
+        frame = bytes.fromhex(digits.decode("ascii"))
+    except ValueError:  # UnicodeDecodeError is one
+        return None
+    return frame[:-1] if sum(frame) & 0xFF == 0 else None

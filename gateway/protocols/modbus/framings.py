@@ -1,0 +1,54 @@
+"""Which framing a wire speaks, and the framer for it. Knows endpoints by their text only; opens nothing."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.protocols.modbus.ascii import AsciiFramer
+from gateway.protocols.modbus.framing import Framer
+from gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
+from gateway.protocols.modbus.rtu import RtuFramer
+
+Framing = Literal["rtu", "ascii", "mbap", "udp"]
+
+_OF_SCHEME: dict[str, Framing] = {
+    "rtu": "rtu",
+    "ascii": "ascii",
+    "rtu+tcp": "rtu",
+    "tcp": "mbap",
+    "tls": "mbap",
+    "udp": "udp",
+}
+
+
+def framing_of(endpoint: Endpoint) -> Framing:
+    """The framing that the scheme of `endpoint` stands for. Raises `UsageError` where Modbus is not spoken."""
+    if endpoint.scheme not in _OF_SCHEME:
+        raise UsageError("Modbus is not spoken there", expected=", ".join(_OF_SCHEME), got=str(endpoint))
+    return _OF_SCHEME[endpoint.scheme]
+
+
+def make_framer(framing: str, *, char_time_ns: int, echo: bool, strict: bool, accepts_zero_id: bool) -> Framer:
+    """A framer for one connection. Raises `UsageError` for a setting that the framing does not have."""
+    serial = framing in ("rtu", "ascii")
+    if framing not in _OF_SCHEME.values():
+        raise UsageError(f"unknown Modbus framing {framing!r}", expected="rtu, ascii, mbap or udp")
+    if echo and not serial:
+        raise UsageError("only a serial line echoes", got=f"echo with framing {framing}")
+    if strict and framing != "rtu":
+        raise UsageError("only RTU has silences to be strict about", got=f"strict with framing {framing}")
+    if strict and not char_time_ns:
+        raise UsageError("strict RTU timing needs the baud rate and frame of the line")
+    if accepts_zero_id and serial:
+        raise UsageError("a serial line has no transaction ids", got=f"framing {framing}")
+    match framing:
+        case "rtu":
+            return RtuFramer(echo=echo, strict=strict, char_time_ns=char_time_ns)
+        case "ascii":
+            return AsciiFramer(echo=echo)
+        case "mbap":
+            return MbapFramer(accepts_zero_id=accepts_zero_id)
+        case _:
+            return UdpFramer(accepts_zero_id=accepts_zero_id)

@@ -242,7 +242,7 @@ def resolve(file: YamlFile) -> DeviceProfile:
             tags[tag.name] = tag
     profile = DeviceProfile(
         path=file.path,
-        hash=hashlib.sha256(form.model_dump_json().encode()).hexdigest()[:16],
+        hash=hashlib.sha256(form.model_dump_json(exclude_defaults=True).encode()).hexdigest()[:16],
         form=form,
         tags=tags,
         messages={n: _message(file, form, n, m) for n, m in form.messages.items()},

@@ -85,9 +85,16 @@ class DeviceHost:
         if profile.inbox is not None:
             pair = ModemPair(profile, bytes_per_s=400, latency_s=0.2, loss=0.0, seed=1)
             return ModbusUnit(pair.near, unit_limits(profile), name=profile.name)
+        if profile.sampled is None:
+            return self._recorded(profile, recording)
         identity = {t.name: "0000" for t in profile.tags.values() if t.type == "string"}
         bank = SampledSensor(profile, self._player(profile, recording), identity)
         return ModbusUnit(bank, unit_limits(profile), name=profile.name)
+
+    def _recorded(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
+        """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name."""
+        replay = ExchangeReplay.load(find_recording(str(recording or f"{Path(profile.path).stem}.jsonl")))
+        return ReplayUnit(replay, next(iter(replay.units)), profile.name)
 
     def replayed(self, path: Path, unit_id: int | None) -> dict[int, ModbusUnit]:
         """The units of a recording of exchanges, or the one that is asked for."""

@@ -1,0 +1,54 @@
+"""tshark as an independent pair of eyes: a pcap file in, chosen fields of every packet out."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fieldtwin.formats.pcap import write_pcap
+from gateway.connections.tap import Captured
+from gateway.core.endpoint import Endpoint
+
+needs_tshark = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
+
+OPTIONS = {
+    "tcp": ["-o", "ip.check_checksum:TRUE", "-o", "tcp.check_checksum:TRUE"],
+    "rtu": [
+        *("-o", 'uat:user_dlts:"User 0 (DLT=147)","mbrtu","0","","0",""'),
+        *("-o", "mbrtu.crc_verification:TRUE"),
+    ],
+    "can": ["-d", "can.subdissector,canopen"],
+}
+REMARKS = ("_ws.malformed", "_ws.expert.severity", "_ws.expert.message")
+"""tshark's own remarks: retransmissions, bad check sums, broken frames."""
+CHAT = 0x200000
+"""The severity of what is no trouble, such as "connection establish request"; notes, warnings and errors are above it."""
+
+
+def dissect(path: Path, captured: list[Captured], endpoint: Endpoint, fields: list[str]) -> list[dict[str, str]]:
+    """Write what was captured of `endpoint` and have tshark dissect it; `fields` of every packet, missing ones empty.
+
+    Fails on a packet that tshark has a remark on.
+    """
+    count = write_pcap(path, captured, endpoint)
+    wanted = [*fields, *REMARKS, "_ws.col.Protocol"]
+    command = ["tshark", "-n", "-r", str(path), *OPTIONS[endpoint.scheme], "-T", "fields", "-E", "separator=|"]
+    out = subprocess.run(
+        [*command, *(a for f in wanted for a in ("-e", f))],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+        env={**os.environ, "HOME": str(path.parent)},  # no preferences but those said here
+    )
+    packets = [dict(zip(wanted, line.split("|"), strict=True)) for line in out.stdout.splitlines()]
+    assert len(packets) == count, out.stderr
+    for number, packet in enumerate(packets, 1):
+        severities = [int(s) for s in packet["_ws.expert.severity"].split(",") if s]
+        assert not packet["_ws.malformed"], f"packet {number}: {packet}"
+        assert max(severities, default=CHAT) <= CHAT, f"packet {number}: {packet}"
+    return packets

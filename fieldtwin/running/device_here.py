@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 from emulators.canopen.dictionary import load_eds
@@ -57,6 +58,7 @@ async def run_device(
                 units = host.replayed(path, unit_id)
             else:
                 profile = load_profile(path)
+                wires = [_as_from_the_factory(wire, profile) for wire in wires]
                 if profile.protocol == "canopen":
                     await host.serve_can(nursery, profile, wires, unit_id, recording)
                     units = {}
@@ -172,6 +174,14 @@ class DeviceHost:
     async def aclose(self) -> None:
         for thing in reversed(self._closing):
             await thing.aclose()
+
+
+def _as_from_the_factory(wire: Endpoint, profile: DeviceProfile) -> Endpoint:
+    """A virtual port without settings has those with which the device leaves the factory."""
+    if wire.scheme != "pty" or wire.params:
+        return wire
+    factory = profile.form.factory
+    return replace(wire, params=(("baudrate", str(factory.baudrate)), ("frame", factory.frame)))
 
 
 def _list(units: dict[int, ModbusUnit]) -> str:

@@ -18,8 +18,9 @@ from gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
 from gateway.core.profile import DeviceProfile, Tag
 from gateway.devices.driver import DeviceDriver
 from gateway.runtime.gateway import GatewayConfig
-from plc.binding import InputBinding, image_for
+from plc.binding import BoundProgram, InputBinding, image_for
 from plc.config import PlcConfig, ProgramConfig
+from plc.program import Role
 from twin.system import System
 
 MESSAGE_DEPTH = 16
@@ -75,9 +76,11 @@ def image_layout(system: System) -> ImageLayout:
     bound = []
     for config in programs_of(system):
         try:
-            bound.append(config.bind((folder,)))
+            program = config.bind((folder,))
         except FieldtwinError as e:
             raise system.file.error(("plc", "programs", config.name, "source"), str(e)) from e
+        _check_variables(system, program)
+        bound.append(program)
     watched = [
         f"{d.name}.{t.name}"
         for d in system.devices.values()
@@ -88,6 +91,19 @@ def image_layout(system: System) -> ImageLayout:
         return image_for(bound, plant, watched)
     except FileInvalid as e:
         raise system.file.error(("plc", "programs"), e.message, expected=e.expected, got=e.got) from e
+
+
+def _check_variables(system: System, bound: BoundProgram) -> None:
+    """What the file binds must be variables of the program, of the right kind."""
+    for key, role, names in (("inputs", Role.INPUT, bound.inputs), ("outputs", Role.OUTPUT, bound.outputs)):
+        declared = [v.name for v in bound.variables(role)]
+        for name in names:
+            if name not in declared:
+                raise system.file.error(
+                    ("plc", "programs", bound.name, key, name),
+                    f"program {bound.name!r} has no {role.value} {name!r}",
+                    expected=", ".join(declared) or "none",
+                )
 
 
 def gateway_config(system: System, *, allow_writes: bool) -> GatewayConfig:

@@ -91,6 +91,8 @@ def _device(
     is_can = buses[d.bus].endpoint.is_can
     if is_can != (profile.protocol == "canopen"):
         raise file.error((*loc, "bus"), f"a {profile.protocol} device on {buses[d.bus].endpoint}")
+    if profile.inbox is not None and buses[d.bus].endpoint.is_serial:
+        raise file.error((*loc, "bus"), f"a transmitter on {buses[d.bus].endpoint}", expected="a bus on TCP")
     address, wanted = (d.node, "node") if is_can else (d.unit, "unit")
     if address is None:
         raise file.error(loc, f"the key {wanted!r} is missing", expected=f"the device's {wanted} id")
@@ -115,6 +117,8 @@ def _device(
 def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:
     """Every tag and poll group that the device's entry names must be in its profile, and fit its use."""
     profile = config.profile
+    if profile.protocol == "canopen" and d.poll:
+        raise file.error((*loc, "poll"), "a CANopen node is not polled: it sends", expected="`tpdo1`, a TPDO's tags")
     groups = [*profile.groups, *(["inbox"] if profile.inbox else [])]
     for group in d.poll:
         if group not in groups:

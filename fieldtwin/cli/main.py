@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
+from typing import Any
 
 import click
 
@@ -29,6 +30,16 @@ BUG = 70
 
 class LazyGroup(click.Group):
     """Loads a command's module when the command is asked for."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Click's own answer to a closed pipe is exit code 1. `fieldtwin ... | head`: the reader has what it wanted."""
+        try:
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
+        return result
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -64,7 +75,7 @@ def main() -> None:
     from gateway.core.errors import FieldtwinError
 
     try:
-        code = cli.main(standalone_mode=False)
+        code = cli.main(prog_name="fieldtwin", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
     except click.exceptions.Abort:
         sys.exit(INTERRUPTED)
@@ -75,9 +86,6 @@ def main() -> None:
         sys.exit(e.exit_code)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except BrokenPipeError:  # `fieldtwin ... | head`: the reader has what it wanted
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
     except FieldtwinError as e:
         if os.environ.get("FIELDTWIN_TRACEBACK"):
             raise

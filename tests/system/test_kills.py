@@ -107,6 +107,7 @@ def test_a_field_side_that_dies_and_comes_back_and_a_parent_that_is_killed(tmp_p
         "emulate", "observatory", "--prototype-file", str(prototype), "--control", f"127.0.0.1:{ports['control']}",
         "--listen", f"lan=tcp://127.0.0.1:{ports['lan']}", "--listen", f"can0=can:fieldtwin/127.0.0.1:{ports['can']}",
     )  # fmt: skip
+    watched = ("ctd.pressure", "inclinometer.slope_long", "modem.link_state")
     with fieldtwin(tmp_path, *emulate, name="field1") as first:
         field = first.control("observatory-field", "field")
         field_address = ("--field", f"127.0.0.1:{ports['control']}")
@@ -119,7 +120,7 @@ def test_a_field_side_that_dies_and_comes_back_and_a_parent_that_is_killed(tmp_p
             first.wait(5)
             wait_for(lambda: not any(d["online"] for d in gateway("get")["devices"].values()), 10, "all devices lost")
             tags = gateway("get")["tags"]
-            for name in ("ctd.pressure", "inclinometer.slope_long", "modem.link_state"):
+            for name in watched:
                 assert tags[name]["quality"] == "bad", name
                 assert tags[name]["reason"] in ("timeout", "unreachable", "heartbeat lost"), (name, tags[name])
 
@@ -127,8 +128,12 @@ def test_a_field_side_that_dies_and_comes_back_and_a_parent_that_is_killed(tmp_p
                 field = second.control("observatory-field", "field")
                 wait_for(lambda: all(d["online"] for d in gateway("get")["devices"].values()), 15, "all devices back")
                 wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1:] == ["0001"], 5, "the period again")
-                for name in ("ctd.pressure", "inclinometer.slope_long", "modem.link_state"):
-                    wait_for(lambda n=name: gateway("get")["tags"][n]["quality"] == "good", 8, f"{name} good again")
+
+                def good_again() -> bool:
+                    tags = gateway("get")["tags"]
+                    return all(tags[name]["quality"] == "good" for name in watched)
+
+                wait_for(good_again, 8, "values good again")
                 command_from_far(field("get")["far"]["modem"], 1, 2)
                 wait_for(
                     lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0002", 10, "a new command gets through"

@@ -169,7 +169,9 @@ def _tcp_packets(chunks: list[Chunk]) -> Iterator[Packet]:
     def segment(t_ns: int, source: bytes, flags: int, data: bytes = b"") -> Packet:
         target = _SERVER if source == _CLIENT else _CLIENT
         acknowledged = sequence[target] if flags & _ACK else 0
-        packet = Packet(t_ns, _ethernet(source, target, _tcp(source, target, sequence[source], acknowledged, flags, data)))
+        packet = Packet(
+            t_ns, _ethernet(source, target, _tcp(source, target, sequence[source], acknowledged, flags, data))
+        )
         sequence[source] += len(data) + bool(flags & _SYN)
         return packet
 
@@ -200,7 +202,7 @@ def _ethernet(source: bytes, target: bytes, tcp: bytes) -> bytes:
 def internet_checksum(data: bytes) -> int:
     """The one's complement of the one's complement sum of 16-bit words (RFC 1071)."""
     padded = data + b"\0" * (len(data) % 2)
-    total = sum(struct.unpack(f">{len(padded) // 2}H", padded))
+    total: int = sum(struct.unpack(f">{len(padded) // 2}H", padded))
     while total >> 16:
         total = (total & 0xFFFF) + (total >> 16)
     return ~total & 0xFFFF

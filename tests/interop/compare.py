@@ -118,7 +118,9 @@ class Comparison:
         script = [[e for e in t.exchanges if not e.request.startswith(apart)] for t in (reference, other)]
         self._sequence(*script, (), 0)
         self._heard(reference, other, rules.heard)
-        self._close("all exchanges", "median latency in ms", *map(_latency, (reference, other)), rules.latency_within_ms)
+        self._close(
+            "all exchanges", "median latency in ms", *map(_latency, (reference, other)), rules.latency_within_ms
+        )
 
     def _differ(self, where: str, what: str, expected: str, got: str) -> None:
         found = Difference(self._device, where, what, expected, got)
@@ -179,7 +181,9 @@ class Comparison:
             if rule is None or not a or not b:
                 self._differ(where, "frames", f"{len(a)}", f"{len(b)}{'' if rule else ' (no rule says what they are)'}")
                 continue
-            series = [[d for d, _ in groupby(h.data for h in s)] if rule.collapse else [h.data for h in s] for s in (a, b)]
+            series = [
+                [d for d, _ in groupby(h.data for h in s)] if rule.collapse else [h.data for h in s] for s in (a, b)
+            ]
             if rule.collapse and len(series[0]) != len(series[1]):
                 self._differ(where, "states", *(" ".join(d.hex() for d in s) for s in series))
             for expected_data, got_data in zip(*series, strict=False):

@@ -50,7 +50,7 @@ class Target(Protocol):
 
 @dataclass
 class Run:
-    """What a run left behind. `refused` is what came of each request that a device must refuse; `stuck` a step that never ended."""
+    """What a run left behind. `refused`: what came of each request that a device must refuse; `stuck`: a step without end."""
 
     system: System
     captured: list[Captured] = field(default_factory=list)
@@ -167,7 +167,9 @@ class Script:
         ctd, incl = self.gateway.drivers["ctd"], self.gateway.drivers["inclinometer"]
         assert isinstance(ctd, RegisterDriver)
         assert isinstance(incl, CanopenDriver)
-        await self._job(ctd, "ctd: a register between two groups", lambda: ctd.client.read_registers(1, "holding", 50, 1))
+        await self._job(
+            ctd, "ctd: a register between two groups", lambda: ctd.client.read_registers(1, "holding", 50, 1)
+        )
         await self._job(ctd, "ctd: too many registers", lambda: ctd.client.read_registers(1, "input", 0, 61))
         await self._job(ctd, "ctd: a function", lambda: ctd.client.read_bits(1, "coil", 0, 1))
         await self._job(ctd, "ctd: a read-only register", lambda: ctd.client.write_registers(1, 0, [1]))

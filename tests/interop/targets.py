@@ -15,6 +15,7 @@ import struct
 import sys
 import tomllib
 from collections.abc import AsyncIterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -194,7 +195,7 @@ def recording(name: str) -> list[list[float]]:
 
 def at_time(rows: list[list[float]], t_s: float) -> list[float]:
     """All signals at a time, on the straight line between the rows before and after."""
-    for (t0, *before), (t1, *after) in zip(rows, rows[1:], strict=False):
+    for (t0, *before), (t1, *after) in pairwise(rows):
         if t0 <= t_s < t1:
             share = (t_s - t0) / (t1 - t0)
             return [a + share * (b - a) for a, b in zip(before, after, strict=True)]

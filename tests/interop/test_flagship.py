@@ -84,7 +84,10 @@ def test_no_reply_of_the_device_could_have_been_another(tolerances: Tolerances, 
         talk, rules = with_emulators.talks[device], tolerances[device]
         assert compare(talk, talk, rules) == []
         for i, e in enumerate(talk.exchanges):
-            for request, reply in [*((r, e.reply) for r in flipped(e.request)), *((e.request, r) for r in flipped(e.reply))]:
+            for request, reply in [
+                *((r, e.reply) for r in flipped(e.request)),
+                *((e.request, r) for r in flipped(e.reply)),
+            ]:
                 if tolerated(rules, talk, i, reply):
                     continue
                 exchanges = [*talk.exchanges[:i], replace(e, request=request, reply=reply), *talk.exchanges[i + 1 :]]

@@ -57,13 +57,7 @@ class Modem:
             writer.close()
 
 
-async def main():
-    parser = argparse.ArgumentParser()
-    parser.add_argument("table")
-    parser.add_argument("--plant", choices=["byte"])
-    args = parser.parse_args()
-    with open(args.table, encoding="utf-8") as file:
-        modem = Modem(yaml.safe_load(file), args.plant)
+async def run(modem):
     server = await asyncio.start_server(modem.serve, "127.0.0.1", 0)
     print("ready", server.sockets[0].getsockname()[1], flush=True)
     lines = asyncio.StreamReader()
@@ -73,5 +67,15 @@ async def main():
     server.close()
 
 
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("table")
+    parser.add_argument("--plant", choices=["byte"])
+    args = parser.parse_args()
+    with open(args.table, encoding="utf-8") as file:
+        table = yaml.safe_load(file)
+    asyncio.run(run(Modem(table, args.plant)))
+
+
 if __name__ == "__main__":
-    asyncio.run(main())
+    main()

@@ -71,9 +71,27 @@ class LiveView:
                 await asyncio.sleep(REFRESH_S)
 
     async def _show_lines(self) -> None:
+        told: set[str] = set()
         while True:
             await asyncio.sleep(LINE_S)
+            now = troubles(self._session)
+            for trouble in now:
+                if trouble not in told:  # once, and again only when it had gone
+                    talk.print(f"! {trouble}", soft_wrap=True, markup=False)
+            told = set(now)
             talk.print(line(self._session), soft_wrap=True, markup=False)
+
+
+def troubles(session: RunSession) -> list[str]:
+    """What is wrong now, each with its reason: errors of the run, buses that cannot be opened, devices that do not answer."""
+    gateway = session.gateway_status or {}
+    found = list(session.errors)
+    closed = {name: bus["error"] for name, bus in gateway.get("buses", {}).items() if bus["error"]}
+    found += [f"{name}: {error}" for name, error in closed.items()]
+    for name, device in gateway.get("devices", {}).items():
+        if device["error"] and device["error"] != closed.get(device["bus"]):
+            found.append(f"{name}: {device['error']}")
+    return found
 
 
 def line(session: RunSession) -> str:

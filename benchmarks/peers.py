@@ -1,0 +1,79 @@
+"""What the benchmarks share: building the C peers, starting servers, and CPU time of a process.
+
+Benchmarks compare with a named peer in the same run and print ratios with medians; single absolute figures on a shared
+machine mean little. Nothing here runs in the tests.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from statistics import median
+
+HERE = Path(__file__).resolve().parent
+
+
+class Missing(Exception):
+    """A peer that is not installed; says what to install."""
+
+
+def build(name: str) -> Path:
+    """Compile benchmarks/c/NAME.c against libmodbus; the program's path."""
+    if shutil.which("cc") is None:
+        raise Missing("a C compiler (Debian: gcc)")
+    out = Path(tempfile.mkdtemp(prefix="fieldtwin-bench-")) / name
+    source = HERE / "c" / f"{name}.c"
+    done = subprocess.run(
+        ["cc", "-O2", "-o", str(out), str(source), "-lmodbus"], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise Missing(f"libmodbus's headers (Debian: libmodbus-dev): {done.stderr.strip().splitlines()[0]}")
+    return out
+
+
+def start(command: list[str]) -> subprocess.Popen[str]:
+    """Start a server that prints `ready` when it listens."""
+    environment = {**os.environ, "PYTHONPATH": str(HERE.parent)}
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    assert process.stdout is not None
+    line = process.stdout.readline().strip()
+    if line != "ready":
+        process.kill()
+        raise Missing(f"{command[0]} did not get ready: {line!r}")
+    return process
+
+
+def stop(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
+    if process.stdout is not None:
+        process.stdout.close()
+
+
+def cpu_s(pid: int) -> float:
+    """User and system time that a process has used, in seconds."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def free_port() -> int:
+    import socket
+
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        port: int = s.getsockname()[1]
+        return port
+
+
+def row(name: str, values: list[float], base: list[float]) -> str:
+    """One line of a table: median, and the median of the pairwise ratios to `base`."""
+    ratio = median(v / b for v, b in zip(values, base, strict=True))
+    return f"{name:<22} {median(values):>12.1f}   {ratio:>6.2f}"
+
+
+def python() -> str:
+    return sys.executable

@@ -1,0 +1,34 @@
+"""The emulator as a benchmark's server: 100 holding registers on Modbus TCP.  serve_emulator.py PORT [--uvloop]"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+from emulators.endpoints.socket_end import SocketListener
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.serve import serve_mbap
+from emulators.modbus.unit import ModbusUnit
+from gateway.core.endpoint import Endpoint
+from gateway.wallclock import WallClock
+
+
+async def main(port: int) -> None:
+    units = {1: ModbusUnit(MapBank([Span("holding", 0, 100)]))}
+    clock = WallClock()
+    endpoint = Endpoint.parse(f"tcp://127.0.0.1:{port}")
+    listener = await SocketListener.open(endpoint, lambda c: serve_mbap(c, MbapSlave(units), clock), 256)
+    print("ready", flush=True)
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await listener.aclose()
+
+
+if __name__ == "__main__":
+    if "--uvloop" in sys.argv:
+        import uvloop
+
+        uvloop.install()
+    asyncio.run(main(int(sys.argv[1])))

@@ -20,15 +20,17 @@ from gateway.connections.tap import Captured, CaptureTap, TappedConnector
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from gateway.core.errors import DeviceRefused, FieldtwinError
 from gateway.core.nursery import Nursery
 from gateway.core.values import Quality
 from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.register_device import RegisterDriver
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.audit import AuditLog
+from gateway.runtime.canopen_bus import CanopenBus
 from gateway.runtime.gateway import Gateway
 from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.tags import TagTable
 from gateway.store.exchange_log import ExchangeLog
 from gateway.wallclock import WallClock
 from twin.mapping import MappedConnector
@@ -134,7 +136,7 @@ class Script:
             ("the ctd says standby", lambda: self._until(lambda: self._value("ctd.status") == 0)),
             ("everything is sent", lambda: self._until(lambda: not self.modem.consumer.queue)),
             ("refusals", self.refusals),
-            ("frames heard", lambda: self._until(lambda: self._heard(0x705) >= 4 and self._heard(0x185) >= 25)),
+            ("frames heard", self.frames_heard),
         ]
 
     async def _until(self, condition: Callable[[], bool]) -> None:
@@ -144,11 +146,8 @@ class Script:
         value = self.gateway.tags.current(tag, self.gateway.clock.monotonic_ns())
         return value.value if value.quality is Quality.GOOD else None
 
-    def _heard(self, cob_id: int) -> int:
-        return sum(
-            isinstance(c.item, CanFrame) and c.item.can_id == cob_id and c.direction is Direction.RECEIVED
-            for c in self.tap.captured
-        )
+    async def frames_heard(self) -> None:
+        await self._until(lambda: heard(self.tap, 0x705) >= 4 and heard(self.tap, 0x185) >= 25)
 
     async def all_up(self) -> None:
         """Identified, configured, started, and the output brought to the PLC's first value."""
@@ -199,3 +198,38 @@ class Script:
             self.run.refused[name] = ""
         except FieldtwinError as e:
             self.run.refused[name] = f"{type(e).__name__}: {e.message}"
+
+
+async def converse_on_can(target: Endpoint, run_dir: Path, patience_s: float = 15.0) -> list[Captured]:
+    """The inclinometer's part alone, where a kernel's CAN stands in: brought up, heard, and told to stop."""
+    system = load_system(str(SYSTEM))
+    plant, config = system.buses["can0"], system.devices["inclinometer"]
+    clock, tap = WallClock(), CaptureTap(100_000)
+    connector = TappedConnector(MappedConnector(OsConnector(), {plant.endpoint: target}), [tap], clock)
+    tags = TagTable(clock)
+    driver = CanopenDriver(config, tags, clock)
+    tags.declare(driver.tag_names, config.stale_after_ms)
+    audit = AuditLog(run_dir / "audit.jsonl", clock)
+    try:
+        bus = CanopenBus(plant, [driver], connector, clock, tags, audit, allow_writes=True)
+        async with Nursery() as nursery:
+            nursery.start(bus.run(), "bus can0")
+            await eventually(lambda: heard(tap, 0x705) >= 4 and heard(tap, 0x185) >= 10, within_s=patience_s)
+            for index, subindex in ((0x2000, 0), (0x1018, 9)):
+                try:
+                    await driver.master.sdo_upload(driver.node, index, subindex)
+                except DeviceRefused:
+                    pass  # as it must: the comparison looks at the abort code
+            await bus.stop_nodes(1.0)
+            await _until_quiet(tap, patience_s)
+    finally:
+        audit.close()
+    return tap.captured
+
+
+def heard(tap: CaptureTap, cob_id: int) -> int:
+    """How many frames with this COB-ID were received."""
+    return sum(
+        isinstance(c.item, CanFrame) and c.item.can_id == cob_id and c.direction is Direction.RECEIVED
+        for c in tap.captured
+    )

@@ -52,15 +52,25 @@ class EmulatedTarget:
 
 
 @contextlib.asynccontextmanager
-async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
-    system = load_system(str(SYSTEM))
+async def field_side(run_dir: Path, **listen: str) -> AsyncIterator[dict[str, Any]]:
+    """The observatory's emulators as a process, `listen` saying where a bus's listen elsewhere; their status."""
     config = run_dir / "field.json"
-    config.write_bytes(msgspec.json.encode(FieldConfig(system=str(SYSTEM), run_dir=str(run_dir))))
+    config.write_bytes(msgspec.json.encode(FieldConfig(system=str(SYSTEM), run_dir=str(run_dir), listen=listen)))
     field = Child("field", "twin.field_process", config, run_dir)
     try:
-        client = await field.connect()
+        client = await field.connect(timeout_s=120)
         status = await client.call("get")
         await client.aclose()
+        yield status
+    finally:
+        await field.end()
+
+
+@contextlib.asynccontextmanager
+async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
+    """Every emulator, and the far end."""
+    system = load_system(str(SYSTEM))
+    async with field_side(run_dir) as status:
         mapping = {}
         for bus, url in status["listening"].items():
             plant = system.buses[bus].endpoint
@@ -70,8 +80,6 @@ async def emulated(run_dir: Path) -> AsyncIterator[EmulatedTarget]:
             nursery.start(shore.run([]), "far end")
             yield EmulatedTarget(mapping, shore)
             await shore.halt()
-    finally:
-        await field.end()
 
 
 class IndependentTarget:
@@ -159,7 +167,7 @@ async def device(
     )
     try:
         assert process.stdout is not None
-        line = (await asyncio.wait_for(process.stdout.readline(), 20)).decode().strip()
+        line = (await asyncio.wait_for(process.stdout.readline(), 60)).decode().strip()
         assert line.startswith("ready"), f"{name} ended with {await process.wait()}"
         yield process, line
     finally:

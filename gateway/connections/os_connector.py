@@ -9,15 +9,17 @@ from gateway.core.connection import ByteConnection, CanConnection, Connector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 
+BYTE_SCHEMES = "rtu:, ascii:, tcp:, rtu+tcp:, udp: or tls:"
+
 
 class OsConnector(Connector):
-    """Opens serial ports, TCP streams and CAN buses of this computer.
+    """Opens serial ports, TCP and TLS streams, UDP sockets and CAN buses of this computer.
 
     Each kind of wire is imported when the first one is opened: a plant without CAN does not load python-can.
     """
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
-        """Open ``rtu:``, ``ascii:``, ``tcp:`` or ``rtu+tcp:``. Raises as `Connector` says."""
+        """Open one of `BYTE_SCHEMES`. Raises as `Connector` says."""
         match endpoint.scheme:
             case "rtu" | "ascii":
                 from gateway.connections.serial_line import SerialConnection
@@ -27,17 +29,23 @@ class OsConnector(Connector):
                 from gateway.connections.tcp import TcpConnection
 
                 return await TcpConnection.open(endpoint)
+            case "tls":
+                from gateway.connections.tls import TlsConnection
+
+                return await TlsConnection.open(endpoint)
+            case "udp":
+                from gateway.connections.udp import UdpConnection
+
+                return await UdpConnection.open(endpoint)
             case "can":
-                raise UsageError("a CAN bus carries frames, not bytes", expected="rtu:, ascii:, tcp: or rtu+tcp:")
+                raise UsageError("a CAN bus carries frames, not bytes", expected=BYTE_SCHEMES)
             case "pty":
                 raise UsageError(
                     f"{endpoint} is the listening side of a virtual serial port",
                     expected=f"rtu:{endpoint.path} on the side that opens it",
                 )
             case scheme:
-                raise UsageError(
-                    f"{endpoint}: {scheme}: cannot be opened here", expected="rtu:, ascii:, tcp: or rtu+tcp:"
-                )
+                raise UsageError(f"{endpoint}: {scheme}: cannot be opened here", expected=BYTE_SCHEMES)
 
     async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
         """Open ``can:socketcan/CHANNEL`` or ``can:fieldtwin/HOST:PORT``. Raises as `Connector` says."""

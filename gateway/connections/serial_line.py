@@ -21,6 +21,7 @@ from typing import cast
 import serial
 from serial.tools import list_ports
 
+from gateway.connections.rs485 import let_driver_switch
 from gateway.core.connection import ByteConnection, RS232Connection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable, UsageError
@@ -63,7 +64,7 @@ class SerialConnection(ByteConnection):
         """Lock and configure the port; what the line said before is thrown away.
 
         Raises `Unreachable` when there is no such port or no permission, `EndpointBusy` when another program holds it,
-        `UsageError` when the port cannot do the baud rate or frame.
+        `UsageError` when the port cannot do the baud rate or frame, or has no RS485 mode and is asked for it.
         """
         # In a thread: opening a USB adapter is a conversation with it, and a sick one takes seconds to answer.
         opening = asyncio.get_running_loop().run_in_executor(None, _open_port, endpoint)
@@ -162,7 +163,7 @@ class SerialConnection(ByteConnection):
 def _open_port(endpoint: Endpoint) -> serial.Serial:
     settings = endpoint.serial
     try:
-        return serial.Serial(
+        port = serial.Serial(
             port=endpoint.path,
             baudrate=settings.baudrate,
             bytesize=settings.data_bits,
@@ -174,6 +175,9 @@ def _open_port(endpoint: Endpoint) -> serial.Serial:
             inter_byte_timeout=0.0,
             exclusive=True,
         )
+        if endpoint.rs485:
+            _set_rs485(port, endpoint)
+        return port
     except serial.SerialException as e:
         raise _cannot_open(endpoint, e.errno or 0, str(e)) from e
     except (ValueError, termios.error) as e:
@@ -185,6 +189,20 @@ def _open_port(endpoint: Endpoint) -> serial.Serial:
         ) from e
     except OSError as e:
         raise _cannot_open(endpoint, e.errno or 0, str(e)) from e
+
+
+def _set_rs485(port: serial.Serial, endpoint: Endpoint) -> None:
+    try:
+        let_driver_switch(int(port.fileno()))
+    except OSError as e:
+        port.close()
+        raise UsageError(
+            "the port has no RS485 mode",
+            expected="a driver that switches the direction (ioctl TIOCSRS485)",
+            got=e.strerror or str(e),
+            where=str(endpoint),
+            hint="leave rs485=1 out where the adapter switches by itself",
+        ) from e
 
 
 def _close_unwanted(opening: asyncio.Future[serial.Serial]) -> None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import ssl
+from typing import Self
 
 from gateway.core.connection import ByteConnection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
@@ -42,33 +44,41 @@ class TcpConnection(ByteConnection):
         self._wire = _Wire(self)
 
     @classmethod
-    async def open(
-        cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024
-    ) -> TcpConnection:
+    async def open(cls, endpoint: Endpoint, timeout_s: float = OPEN_TIMEOUT_S, max_pending: int = 1024) -> Self:
         """Connect to the endpoint's host and port, trying each address that the name has.
 
         Raises `Unreachable` that says what failed: the name, the route, nobody listening, or no answer in time.
         """
-        where = str(endpoint)
-        loop = asyncio.get_running_loop()
         connection = cls(endpoint, max_pending)
+        await connection._connect(timeout_s)
+        return connection
+
+    async def _connect(self, timeout_s: float, tls: ssl.SSLContext | None = None, name: str | None = None) -> None:
+        """Connect, with TLS where a context is given; the server then has to be `name`."""
+        where = str(self.endpoint)
+        loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(timeout_s):
-                addresses = await _resolve(endpoint)
+                addresses = await resolve(self.endpoint, socket.SOCK_STREAM)
                 for n, address in enumerate(addresses, start=1):
                     try:
-                        await loop.create_connection(lambda: connection._wire, address, endpoint.port)
-                        return connection
-                    except ConnectionRefusedError as e:
-                        if n == len(addresses):
-                            hint = f"the host answers and has no program on port {endpoint.port}"
-                            raise Unreachable("connection refused", where=where, hint=hint) from e
+                        await loop.create_connection(
+                            lambda: self._wire, address, self.endpoint.port, ssl=tls, server_hostname=name
+                        )
+                        return
                     except OSError as e:
                         if n == len(addresses):
-                            raise Unreachable(f"cannot connect: {e.strerror or e}", where=where) from e
+                            raise self._cannot_open(e) from e
         except TimeoutError as e:
             raise Unreachable(f"no answer within {timeout_s:g} s", where=where) from e
         raise Unreachable("the name has no address", where=where)
+
+    def _cannot_open(self, error: OSError) -> Unreachable:
+        where = str(self.endpoint)
+        if isinstance(error, ConnectionRefusedError):
+            hint = f"the host answers and has no program on port {self.endpoint.port}"
+            return Unreachable("connection refused", where=where, hint=hint)
+        return Unreachable(f"cannot connect: {error.strerror or error}", where=where)
 
     async def write(self, data: bytes) -> None:
         """Hand `data` to the network, waiting while `WRITE_HIGH_WATER` bytes are unsent. Raises `ConnectionLost`."""
@@ -158,11 +168,11 @@ def _ended(endpoint: Endpoint) -> ConnectionLost:
     return ConnectionLost("the far side closed the connection", where=str(endpoint))
 
 
-async def _resolve(endpoint: Endpoint) -> list[str]:
-    """The addresses of the endpoint's host, each once, in the system's order of preference."""
+async def resolve(endpoint: Endpoint, kind: socket.SocketKind) -> list[str]:
+    """The addresses of the endpoint's host, each once, in the system's order of preference. Raises `Unreachable`."""
     loop = asyncio.get_running_loop()
     try:
-        found = await loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
+        found = await loop.getaddrinfo(endpoint.host, endpoint.port, type=kind)
     except (OSError, UnicodeError) as e:  # UnicodeError: a label of no or more than 63 characters
         why = getattr(e, "strerror", None) or str(e)
         raise Unreachable(f"the name {endpoint.host!r} does not resolve: {why}", where=str(endpoint)) from e

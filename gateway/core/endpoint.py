@@ -5,11 +5,15 @@
 ``ascii:/dev/ttyUSB0?baudrate=9600&frame=7E1``      Modbus ASCII on a serial port
 ``tcp://host:502``                                  Modbus TCP; raw bytes where the far end is a serial line
 ``rtu+tcp://host:4001``                             Modbus RTU frames in a TCP stream
-``udp://host:502``, ``tls://host:802``              Modbus UDP, Modbus/TCP Security
+``udp://host:502``                                  Modbus TCP's ADUs in datagrams
+``tls://host:802?ca=FILE&cert=FILE&key=FILE``       Modbus/TCP Security; ``name=HOST`` where the certificate has another
 ``can:socketcan/can0``                              a kernel CAN interface
 ``can:fieldtwin/127.0.0.1:29536``                   the software CAN bus
 ``pty:line1``                                       (listening side only) a virtual serial port with that link name
 ==================================================  =====================================================
+
+A serial port also takes ``rs485=1``: the driver switches the transceiver's direction. Secrets are named by their file,
+never written into an endpoint: endpoints are shown everywhere.
 
 Pure text handling: this module opens nothing and knows no operating system.
 """
@@ -27,7 +31,8 @@ SOCKET_SCHEMES = ("tcp", "rtu+tcp", "udp", "tls")
 SCHEMES = (*SERIAL_SCHEMES, *SOCKET_SCHEMES, "can", "pty")
 DEFAULT_PORTS = {"tcp": 502, "udp": 502, "tls": 802}
 
-SERIAL_PARAMS = ("baudrate", "frame")
+SERIAL_PARAMS = ("baudrate", "frame", "rs485")
+TLS_PARAMS = ("ca", "cert", "key", "name")
 
 _FRAME = re.compile(r"^([78])([NEO])([12])$")
 _NUMBER = re.compile(r"^[0-9]{1,9}$")  # str.isdigit also takes digits that int() refuses
@@ -117,8 +122,9 @@ class Endpoint:
 
     @property
     def serial(self) -> SerialSettings:
-        """Baud rate and frame of a serial endpoint (19200 8E1 where not said: the default of Modbus, SL 2.5.1)."""
-        text, frame = self.param("baudrate", "19200"), self.param("frame", "8E1").upper()
+        """Baud rate and frame of a serial endpoint; where not said, Modbus's: 19200 8E1, ASCII 7E1 (SL 2.5.1, 2.5.2)."""
+        usual = "7E1" if self.scheme == "ascii" else "8E1"
+        text, frame = self.param("baudrate", "19200"), self.param("frame", usual).upper()
         if not _NUMBER.match(text) or not 50 <= int(text) <= 4_000_000:
             raise UsageError(f"endpoint {self}: baud rate", expected="a number from 50 to 4000000", got=repr(text))
         if not _FRAME.match(frame):
@@ -126,6 +132,14 @@ class Endpoint:
                 f"endpoint {self}: frame", expected="data bits, parity, stop bits such as 8E1 or 8N2", got=repr(frame)
             )
         return SerialSettings(int(text), frame)
+
+    @property
+    def rs485(self) -> bool:
+        """Whether the driver of a serial port is to switch the direction of an RS485 transceiver."""
+        text = self.param("rs485", "0")
+        if text not in ("0", "1"):
+            raise UsageError(f"endpoint {self}: rs485", expected="0 or 1", got=repr(text))
+        return text == "1"
 
     @property
     def address(self) -> tuple[str, int]:
@@ -166,12 +180,12 @@ def _check_params(endpoint: Endpoint) -> None:
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"endpoint {endpoint}: {name!r} is said more than once")
-        if endpoint.is_serial and name not in SERIAL_PARAMS:
-            raise UsageError(
-                f"endpoint {endpoint}: unknown setting", expected=" or ".join(SERIAL_PARAMS), got=repr(name)
-            )
+        known = SERIAL_PARAMS if endpoint.is_serial else TLS_PARAMS if endpoint.scheme == "tls" else ()
+        if known and name not in known:
+            raise UsageError(f"endpoint {endpoint}: unknown setting", expected=" or ".join(known), got=repr(name))
     if endpoint.is_serial or endpoint.scheme == "pty":
         endpoint.serial  # noqa: B018  reading it checks it
+        endpoint.rs485  # noqa: B018
 
 
 def _host_port(url: str, scheme: str, rest: str) -> tuple[str, int]:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.endpoint import SOCKET_SCHEMES, Endpoint, SerialSettings
+from gateway.core.endpoint import SOCKET_SCHEMES, TLS_PARAMS, Endpoint, SerialSettings
 from gateway.core.errors import FieldtwinError, UsageError
 
 NAME = st.text(string.ascii_lowercase + string.digits + "-", min_size=1, max_size=12)
@@ -26,7 +26,7 @@ SERIAL_PARAMS = st.tuples(
 ENDPOINT = st.one_of(
     st.builds(
         Endpoint,
-        st.sampled_from(SOCKET_SCHEMES),
+        st.sampled_from([scheme for scheme in SOCKET_SCHEMES if scheme != "tls"]),
         host=HOST,
         port=st.integers(0, 65535),
         path=st.just(""),
@@ -45,6 +45,12 @@ ENDPOINT = st.one_of(
         NAME,
         PATH,
         PARAMS,
+    ),
+    st.builds(
+        lambda host, port, files: Endpoint("tls", host=host, port=port, params=tuple(files.items())),
+        HOST,
+        st.integers(0, 65535),
+        st.dictionaries(st.sampled_from(TLS_PARAMS), st.text(max_size=10)),
     ),
     st.builds(lambda path: Endpoint("pty", path=path), PATH),
 )
@@ -106,6 +112,8 @@ def test_short_forms(url: str, expected: Endpoint) -> None:
         ("rtu:/dev/ttyS0?baudrate=49", "50 to 4000000"),
         ("rtu:/dev/ttyS0?frame=9X1", "8E1"),
         ("rtu:/dev/ttyS0?boudrate=9600", "boudrate"),
+        ("rtu:/dev/ttyS0?rs485=on", "0 or 1"),
+        ("tls://h?certificate=/etc/me.pem", "certificate"),
         ("rtu:/dev/ttyS0?baudrate=9600&baudrate=19200", "more than once"),
         ("pty:line1?frame=9X1", "8E1"),
     ],

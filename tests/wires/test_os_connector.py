@@ -51,8 +51,6 @@ def test_the_scheme_decides_which_end_opens() -> None:
 @pytest.mark.parametrize(
     ("url", "says"),
     [
-        ("udp://h:502", "udp"),
-        ("tls://h:802", "tls"),
         ("can:socketcan/can0", "frames"),
         ("pty:line1", "listening side"),
     ],

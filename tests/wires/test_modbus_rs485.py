@@ -1,0 +1,50 @@
+"""RS485 by the kernel: what is asked of the driver, and ports that have no such mode (a pty is one)."""
+
+from __future__ import annotations
+
+import os
+import pty
+import struct
+import tty
+
+import pytest
+from support import run
+
+from gateway.connections.os_connector import OsConnector
+from gateway.connections.rs485 import ENABLED, RTS_AFTER_SEND, RTS_ON_SEND, let_driver_switch, settings_sent
+from gateway.core.endpoint import Endpoint, SerialSettings
+from gateway.core.errors import UsageError
+
+
+def test_the_setting_keeps_what_the_board_needs() -> None:
+    driver = struct.pack("=8I", RTS_AFTER_SEND | 1 << 5, 3, 4, 5, 0, 0, 0, 9)
+    assert struct.unpack("=8I", settings_sent(driver)) == (ENABLED | RTS_ON_SEND | 1 << 5, 3, 4, 5, 0, 0, 0, 9)
+
+
+def test_a_port_without_the_mode_is_refused_and_free_again() -> None:
+    async def main(path: str) -> None:
+        with pytest.raises(UsageError, match="no RS485 mode") as caught:
+            await OsConnector().open_bytes(Endpoint.parse(f"rtu:{path}?frame=8N1&rs485=1"))
+        assert path in caught.value.where
+        connection = await OsConnector().open_bytes(
+            Endpoint.parse(f"rtu:{path}?frame=8N1&rs485=0")
+        )  # not locked any more
+        await connection.aclose()
+
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    try:
+        with pytest.raises(OSError, match="Inappropriate ioctl"):
+            let_driver_switch(slave)
+        run(main(os.ttyname(slave)))
+    finally:
+        os.close(master)
+        os.close(slave)
+
+
+def test_the_endpoint_says_so_or_not() -> None:
+    assert Endpoint.parse("rtu:/dev/ttyS0?rs485=1").rs485
+    assert not Endpoint.parse("rtu:/dev/ttyS0").rs485
+    with pytest.raises(UsageError, match="0 or 1"):
+        Endpoint.parse("rtu:/dev/ttyS0?rs485=yes")
+    assert Endpoint.parse("ascii:/dev/ttyS0").serial == SerialSettings(19200, "7E1")

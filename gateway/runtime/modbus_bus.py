@@ -221,9 +221,10 @@ class ModbusBus:
             if not device.online:
                 await self._bring_online(device)
             else:
-                period_ns = device.driver.config.poll[group] * NS_PER_MS
                 now_ns = self._clock.monotonic_ns()
-                device.due_ns[group] = max(device.due_ns[group] + period_ns, now_ns)
+                due_ns, every_ms = device.due_ns.pop(group), device.driver.config.poll.get(group)
+                if every_ms is not None:  # else it was read once, after connecting
+                    device.due_ns[group] = max(due_ns + every_ms * NS_PER_MS, now_ns)
                 if await self._trigger(device, group, now_ns):
                     return
                 await self._attempts(lambda: device.driver.receive(group))
@@ -280,7 +281,9 @@ class ModbusBus:
         now_ns = self._clock.monotonic_ns()
         device.online, device.error = True, ""
         device.backoff.reset()
-        device.due_ns = dict.fromkeys(driver.config.poll, now_ns)
+        known = driver.config.expect
+        once = [g for g in driver.plans if any(t.name not in known for t in driver.profile.group(g))]
+        device.due_ns = dict.fromkeys([*driver.config.poll, *once], now_ns)
 
     def _offline(self, device: DeviceState, error: FieldtwinError) -> None:
         was_online = device.online

@@ -22,12 +22,11 @@ from gateway.core.control import ControlServer
 from gateway.core.errors import FieldtwinError, Unreachable
 from gateway.core.nursery import Nursery
 from gateway.runtime.audit import AuditLog
-from gateway.runtime.gateway import Gateway
 from gateway.runtime.status import describe
 from gateway.store.exchange_log import ExchangeLog
 from gateway.wallclock import WallClock
 from twin.mapping import MappedConnector, mapping_from_json
-from twin.physical import attached, gateway_config, image_layout
+from twin.physical import EmbeddedControlSystem, attached
 from twin.system import load_system
 
 FLUSH_EVERY_NS = NS_PER_S // 2
@@ -68,9 +67,11 @@ class GatewayProcess:
         audit = AuditLog(run_dir / "audit.jsonl", self._clock)
         log = ExchangeLog(run_dir / "store.sqlite", system=system.name, prototype=self._config.mapping is not None)
         try:
-            with attached(image_layout(system), run_dir / "image") as image:
-                config = gateway_config(system, allow_writes=self._config.allow_writes)
-                self._gateway = Gateway(config, connector, self._clock, image, audit, log)
+            ecs = EmbeddedControlSystem(system)
+            with attached(ecs.layout, run_dir / "image") as image:
+                self._gateway = ecs.gateway(
+                    connector, self._clock, image, audit, log, allow_writes=self._config.allow_writes
+                )
                 await self._serve(run_dir / "gateway.sock")
         finally:
             log.close()

@@ -6,6 +6,7 @@ that bus behind it. Here the paper's emulators meet the system file; what gatewa
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ from emulators.canopen.dictionary import load_eds
 from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
+from emulators.emulator import EmulatedUnit
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.endpoints.can_end import open_can_end
 from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import OnClient, SocketListener
 from emulators.journal import HeldJournal
+from emulators.modbus.bank import RegisterBank
 from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.serve import serve_mbap, serve_rtu
@@ -28,7 +31,7 @@ from emulators.models.played_objects import PlayedObjects
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.signals import SignalPlayer, SignalTrack
 from gateway.core.clock import Clock
-from gateway.core.connection import ByteConnection, CanConnection
+from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid
 from gateway.core.nursery import Nursery
@@ -41,7 +44,7 @@ from twin.system import System
 class FieldDevice:
     """An emulated device as the field side knows it: its counters and what it held."""
 
-    def __init__(self, emulated: EmulatedDevice, unit: ModbusUnit | None, node: CanopenNode | None) -> None:
+    def __init__(self, emulated: EmulatedDevice, unit: EmulatedUnit | None, node: CanopenNode | None) -> None:
         self.emulated = emulated
         self.unit = unit
         self.node = node
@@ -51,6 +54,10 @@ class FieldDevice:
     def command_list(self) -> frozenset[str]:
         """What this device accepts, by its own profile."""
         return self.emulated.profile.command_list
+
+    def executed(self) -> dict[str, int]:
+        """How often each command of the list was executed; of a CANopen node, nobody counts them by name."""
+        return {} if self.unit is None else {c: self.unit.emulator.executed[c] for c in sorted(self.command_list)}
 
     def counters(self) -> dict[str, int]:
         """Requests taken and replies sent, as the device counts them."""
@@ -176,7 +183,7 @@ class FieldSide:
 
     # -- devices --------------------------------------------------------------------------------------------------------
 
-    def _modbus_unit(self, config: DeviceConfig) -> ModbusUnit:
+    def _modbus_unit(self, config: DeviceConfig) -> EmulatedUnit:
         emulated = self.prototype.devices[config.name]
         if emulated.form.model == "mailbox":
             link = emulated.form.far_link
@@ -188,15 +195,22 @@ class FieldSide:
                 seed=self.prototype.seed,
             )
             self._pairs[config.name] = pair
-            unit = ModbusUnit(pair.near, unit_limits(emulated.profile), name=config.name)
+            unit = self._emulated_unit(config, pair.near, ())
             modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
             modem.journal = pair.near.journal
             return unit
-        bank = SampledSensor(emulated.profile, self._player(emulated), emulated.form.identity)
-        unit = ModbusUnit(bank, unit_limits(emulated.profile), name=config.name)
+        player = self._player(emulated)
+        bank = SampledSensor(emulated.profile, player, emulated.form.identity)
+        unit = self._emulated_unit(config, bank, player.track)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = bank.journal
         return unit
+
+    def _emulated_unit(self, config: DeviceConfig, bank: RegisterBank, context: Sized) -> EmulatedUnit:
+        """The device on a wire of the plant's kind, whatever carries that wire now."""
+        profile = self.prototype.devices[config.name].profile
+        kind = RS232Connection if self.system.buses[config.bus].endpoint.is_serial else TCPConnection
+        return EmulatedUnit(bank, profile, kind, context, unit_limits(profile), config.name)
 
     def _canopen_node(self, config: DeviceConfig) -> CanopenNode:
         emulated = self.prototype.devices[config.name]
@@ -242,6 +256,8 @@ class FieldSide:
                     "profile": d.emulated.profile.name,
                     "recording": str(d.emulated.recording or d.emulated.form.model),
                     "commands": sorted(d.command_list),
+                    "executed": d.executed(),
+                    "unlisted": d.unit.unlisted if d.unit is not None else 0,
                     "counters": d.counters(),
                     "held": d.journal.number,
                     "held_dropped": d.journal.dropped,

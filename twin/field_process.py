@@ -22,9 +22,9 @@ from gateway.core.errors import FieldtwinError, UsageError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 from twin.field import FieldSide
-from twin.physical import check_commands
-from twin.prototype_file import Prototype, load_prototype
-from twin.system import System, load_system
+from twin.prototype import DigitalTwinPrototype
+from twin.prototype_file import load_prototype
+from twin.system import load_system
 
 
 class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,8 +42,8 @@ class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     token: str = ""
 
 
-def resolve(config: FieldConfig) -> tuple[System, Prototype]:
-    """Read system and prototype file and apply what the command line says. Checks the command lists of both sides."""
+def resolve(config: FieldConfig) -> DigitalTwinPrototype:
+    """Read system and prototype file, apply what the command line says, and put both sides together, checked."""
     system = load_system(config.system, [Path(p) for p in config.profiles])
     prototype = load_prototype(system, Path(config.prototype) if config.prototype else None)
     for device, path in config.recordings.items():
@@ -56,20 +56,7 @@ def resolve(config: FieldConfig) -> tuple[System, Prototype]:
         if bus not in prototype.buses:
             raise UsageError(f"no bus {bus!r}", expected=", ".join(prototype.buses))
         prototype = prototype.with_listen(bus, Endpoint.parse(url))
-    check_command_lists(system, prototype)
-    return system, prototype
-
-
-def check_command_lists(system: System, prototype: Prototype) -> None:
-    """SPEC row EmulatedCommunication, ruling 12: driver and emulator accept the same commands, or nothing starts."""
-    from gateway.runtime.gateway import make_driver
-    from gateway.runtime.tags import TagTable
-
-    clock = WallClock()
-    for name, emulated in prototype.devices.items():
-        device = system.devices[name]
-        driver = make_driver(device, system.buses[device.bus], TagTable(clock), clock)
-        check_commands(driver, emulated.profile)
+    return DigitalTwinPrototype(system, prototype, WallClock())
 
 
 class FieldProcess:
@@ -82,9 +69,8 @@ class FieldProcess:
 
     async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
         """Open, call `on_ready`, serve until stopped."""
-        system, prototype = resolve(self._config)
         run_dir = Path(self._config.run_dir)
-        self._field = FieldSide(system, prototype, run_dir, WallClock())
+        self._field = resolve(self._config).field(run_dir)
         await self._field.open()
         server = ControlServer(
             {"ready": self._ready, "get": self._get, "held": self._held, "stop": self._request_stop},

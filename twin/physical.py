@@ -10,14 +10,19 @@ import mmap
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
-from gateway.core.errors import CommandListMismatch, FieldtwinError, FileInvalid, Unreachable
+from gateway.core.clock import Clock
+from gateway.core.connection import Connector
+from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
 from gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
-from gateway.core.profile import DeviceProfile, Tag
-from gateway.devices.driver import DeviceDriver
-from gateway.runtime.gateway import GatewayConfig
+from gateway.core.profile import Tag
+from gateway.devices.canopen_device import CanopenDriver
+from gateway.devices.register_device import RegisterDriver
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
+from gateway.runtime.tags import TagTable
+from gateway.store.exchange_log import ExchangeLog
 from plc.binding import BoundProgram, InputBinding, image_for
 from plc.config import PlcConfig, ProgramConfig
 from plc.program import Role
@@ -161,27 +166,48 @@ def attached(layout: ImageLayout, path: Path) -> Iterator[Image]:
         yield image
 
 
-@dataclass(frozen=True)
-class Communication:
-    """SPEC row Communication: a driver and what it talks to accept the same commands, both inclusions."""
-
-    name: str
-    driver_commands: frozenset[str]
-    device_commands: frozenset[str]
-
-    def check(self) -> None:
-        """Raises `CommandListMismatch` that names what is missing on either side."""
-        if self.driver_commands == self.device_commands:
-            return
-        only_driver = ", ".join(sorted(self.driver_commands - self.device_commands)) or "nothing"
-        only_device = ", ".join(sorted(self.device_commands - self.driver_commands)) or "nothing"
-        raise CommandListMismatch(
-            f"device {self.name!r} and its driver differ in their commands",
-            expected="the same list on both sides",
-            got=f"unknown to the device: {only_driver}; unknown to the driver: {only_device}",
-        )
+def make_drivers(system: System, tags: TagTable, clock: Clock) -> dict[str, RegisterDriver | CanopenDriver]:
+    """The driver of every device, in the file's order, attached to nothing yet."""
+    return {d.name: make_driver(d, system.buses[d.bus], tags, clock) for d in system.devices.values()}
 
 
-def check_commands(driver: DeviceDriver, device_profile: DeviceProfile) -> None:
-    """Refuse a device whose profile accepts other commands than its driver sends."""
-    Communication(driver.config.name, driver.command_list, device_profile.command_list).check()
+class EmbeddedControlSystem:
+    """SPEC row EmbeddedControlSystem: the drivers and the control logic of a system, from its file and nothing else.
+
+    The plant and its prototype run this very class. It is spread over two processes, the gateway with the drivers and the PLC
+    with the control logic, which share the process image; what each is told, and the gateway itself, is made here.
+    """
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self.control_logic: tuple[ProgramConfig, ...] = programs_of(system)
+        self.layout: ImageLayout = image_layout(system)
+
+    def gateway(
+        self, connector: Connector, clock: Clock, image: Image, audit: AuditLog, log: ExchangeLog, *, allow_writes: bool
+    ) -> Gateway:
+        """The gateway with its drivers. Which wires `connector` opens, nobody from here on knows."""
+        config = gateway_config(self.system, allow_writes=allow_writes)
+        return Gateway(config, connector, clock, image, audit, log)
+
+    def command_lists(self, clock: Clock) -> dict[str, frozenset[str]]:
+        """What the driver of each device can ask of it."""
+        return {name: d.command_list for name, d in make_drivers(self.system, TagTable(clock), clock).items()}
+
+    def prepare(self, run_dir: Path) -> PlcConfig:
+        """Make the process image in `run_dir`; what the PLC's process is to be told."""
+        make_image(self.layout, run_dir / "image")
+        return plc_config(self.system, run_dir)
+
+
+class PhysicalTwin:
+    """SPEC row PhysicalTwin: sensors, transmitters and the embedded control system.
+
+    The devices are hardware out there; of them this side has what the system file says. CANopen nodes are sensors here (SPEC
+    ruling 13).
+    """
+
+    def __init__(self, system: System) -> None:
+        self.ecs = EmbeddedControlSystem(system)
+        self.sensors = {n: d for n, d in system.devices.items() if d.profile.inbox is None}
+        self.transmitters = {n: d for n, d in system.devices.items() if d.profile.inbox is not None}

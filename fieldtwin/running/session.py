@@ -11,7 +11,7 @@ import asyncio
 from collections import deque
 from contextlib import AsyncExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -27,11 +27,13 @@ from gateway.core.errors import FieldtwinError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 from twin.controller import ControllerConfig
-from twin.field_process import FieldConfig, resolve
 from twin.instance import Instance
 from twin.mapping import mapping_to_json
-from twin.physical import image_layout, make_image, plc_config
+from twin.physical import PhysicalTwin
 from twin.system import System, load_system
+
+if TYPE_CHECKING:
+    from twin.field_process import FieldConfig
 
 WATCH_S = 0.02
 ORACLE_S = 1.0
@@ -51,10 +53,11 @@ class RunSession:
         self.options = options
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
+        self.twin = PhysicalTwin(self.system)
         if options.prototype and not options.field_host:
-            resolve(
-                self._field_config(Path())
-            )  # everything that can be wrong in the files is wrong before anything starts
+            from twin.field_process import resolve  # here and below: a plant has no emulators installed
+
+            resolve(self._field_config(Path()))  # what can be wrong in the files is wrong before anything starts
         self.instance = Instance(options.instance or self.system.name)
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
@@ -87,12 +90,12 @@ class RunSession:
     async def _start(self) -> None:
         self._stack.enter_context(self.instance)
         run_dir = self.instance.dir
-        layout = image_layout(self.system)
-        make_image(layout, run_dir / "image")
+        ecs = self.twin.ecs
+        plc = ecs.prepare(run_dir)
         if self.options.prototype:
             await self._start_field(run_dir)
         config = run_dir / "plc.json"
-        config.write_bytes(plc_config(self.system, run_dir).to_json())
+        config.write_bytes(plc.to_json())
         await self._start_child("plc", "plc", config)
         gateway = ControllerConfig(
             system=str(self.system.path.resolve()),
@@ -103,11 +106,13 @@ class RunSession:
             capture=str(self.options.capture.resolve()) if self.options.capture else "",
         )
         await self._start_child("gateway", "twin.controller", self._write("gateway.json", gateway))
-        self._stack.enter_context(self.states.attached(layout, run_dir / "image"))
+        self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
         self.started_ns = self.clock.monotonic_ns()
         self._start_watching()
 
     def _field_config(self, run_dir: Path) -> FieldConfig:
+        from twin.field_process import FieldConfig
+
         o = self.options
         listen = dict(o.listen)
         if o.can:

@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from gateway.core.image import OUTPUTS, ImageLayout, RegionReader
-from gateway.core.statemachine import STATES, delta
+from gateway.core.statemachine import STATES, encode_period
+from twin.model import DigitalModel
 from twin.physical import attached
 from twin.system import System
 
@@ -16,10 +17,11 @@ MAX_TRANSITIONS = 10_000
 
 
 def expected_states(periods_s: list[int]) -> list[str]:
-    """The states that these commands ask for, in order, beginning with STANDBY; the same state twice is one."""
-    expected = ["STANDBY"]
+    """The states that a digital model goes through at these commands, from STANDBY; the same state twice is one."""
+    model = DigitalModel()
+    expected = [model.state.name]
     for period_s in periods_s:
-        state = delta(period_s).name
+        state = model.process_event(encode_period(period_s)).name
         if state != expected[-1]:
             expected.append(state)
     return expected

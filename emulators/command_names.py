@@ -1,0 +1,42 @@
+"""Which command of its profile a Modbus request is: told by what it reads or writes.
+
+The names are those of the command list (SPEC ruling 12). Pure; decodes for itself, as everything on this side of the wire.
+"""
+
+from __future__ import annotations
+
+from emulators.replay.requests import CellRequest, parse_request
+from gateway.core.profile import DeviceProfile, RegisterRange
+
+
+class CommandNames:
+    """The commands of one Modbus profile."""
+
+    def __init__(self, profile: DeviceProfile) -> None:
+        self._reads: list[tuple[RegisterRange, str]] = []
+        self._writes: list[tuple[RegisterRange, str]] = []
+        for tag in profile.tags.values():
+            if tag.readable:
+                self._reads.append((tag.registers, f"read_{tag.poll}"))
+            if tag.writable:
+                self._writes.append((tag.registers, profile.command_for(tag.name)))
+        if profile.inbox is not None and profile.outbox is not None:
+            self._reads += [(at, "receive") for at in (profile.inbox.at, profile.inbox.ack)]
+            self._reads += [(at, "send") for at in (profile.outbox.at, profile.outbox.ack)]
+            self._writes += [(profile.inbox.ack, "acknowledge"), (profile.outbox.at, "send")]
+
+    def of(self, pdu: bytes) -> str:
+        """The name of the command, the lowest addressed where a request touches several; empty where it is none."""
+        request = parse_request(pdu)
+        if request is None:
+            return ""
+        touched = [
+            (at.address, name)
+            for at, name in (self._reads if request.values is None else self._writes)
+            if _overlap(request, at)
+        ]
+        return min(touched)[1] if touched else ""
+
+
+def _overlap(request: CellRequest, at: RegisterRange) -> bool:
+    return request.table == at.table and at.address < request.addresses.stop and request.address < at.end

@@ -12,7 +12,7 @@ import struct
 from dataclasses import replace
 
 from gateway.core.errors import NotAllowed
-from gateway.core.profile import Tag
+from gateway.core.profile import REGISTERS_OF, Tag
 from gateway.core.values import Quality, Reason, Scalar, TagValue
 
 _FORMATS = {
@@ -98,13 +98,28 @@ def encode(tag: Tag, value: Scalar) -> bytes:
         return int(bool(value)).to_bytes(2)
     if tag.bits is not None or tag.scale_by is not None:
         raise NotAllowed(f"{tag.name}: part of a register, or scaled by another one, cannot be written")
-    number = (value - tag.offset) / tag.scale
-    if tag.type.startswith("bcd"):
-        width = 4 if tag.type == "bcd16" else 8
-        return reorder(bytes.fromhex(f"{round(number):0{width}d}"), tag.order)
-    if tag.type.startswith("float"):
-        return reorder(struct.pack(_FORMATS[tag.type], number), tag.order)
-    return reorder(struct.pack(_FORMATS[tag.type], round(number)), tag.order)
+    number = value if tag.scale == 1.0 and tag.offset == 0.0 else (value - tag.offset) / tag.scale
+    try:
+        return reorder(_packed(tag.type, number), tag.order)
+    except (struct.error, OverflowError, ValueError) as e:  # a `range` wider than the type, a float too large
+        raise NotAllowed(
+            f"{tag.name}: the value is outside its limits", expected=f"what a {tag.type} can hold", got=f"{value:g}"
+        ) from e
+
+
+def _packed(kind: str, number: float) -> bytes:
+    """Big-endian bytes of a raw number. Raises `struct.error`, `OverflowError` or `ValueError` where it does not fit."""
+    if kind.startswith("bcd"):
+        digits = f"{round(number):0{4 * REGISTERS_OF[kind]}d}"
+        if len(digits) > 4 * REGISTERS_OF[kind]:
+            raise OverflowError(number)
+        return bytes.fromhex(digits)  # a sign is no digit: ValueError
+    if kind.startswith("float"):
+        packed = struct.pack(_FORMATS[kind], number)
+        if not math.isfinite(struct.unpack(_FORMATS[kind], packed)[0]):
+            raise OverflowError(number)
+        return packed
+    return struct.pack(_FORMATS[kind], round(number))
 
 
 def _scaled(tag: Tag, number: float) -> float:

@@ -198,7 +198,7 @@ class RegisterDriver(DeviceDriver):
         await self._write_tag(tag, item.data)
         if tag.readable:
             held = await self._read_tag(tag)
-            if held.raw != item.data:
+            if int.from_bytes(held.raw) != int.from_bytes(item.data):  # a coil comes back as one byte
                 raise VerifyFailed(
                     f"{item.name}: acknowledged, and not held",
                     expected=item.data.hex(),

@@ -98,10 +98,15 @@ class OutputWriter:
                 self._start(output, output.wanted)
 
     def _compare_with_device(self, output: Output, now_ns: int) -> None:
-        """A device that reads back something else lost what it was told (a restart): tell it again."""
+        """A device that reads back something else lost what it was told (a restart): tell it again.
+
+        Compared as sent: a device may hold a rounded value, and that is no other one.
+        """
         current = self._tags.current(output.tag, now_ns)
-        newer = current.t_ns > output.held_since_ns
-        if output.held is not None and newer and current.quality is Quality.GOOD and current.value != output.held:
+        if output.held is None or current.t_ns <= output.held_since_ns or current.quality is Quality.BAD:
+            return
+        sent = output.driver.command(output.local, output.held).data
+        if int.from_bytes(current.raw) != int.from_bytes(sent):
             output.held = None
             self.rewrites += 1
 
@@ -114,7 +119,10 @@ class OutputWriter:
         except NotAllowed as e:
             output.refused = (value, output.by)
             self.refusals += 1
-            self._audit.note("refuse", name, by=output.by, result=str(e), tag=output.tag, old=old, new=value)
+            try:
+                self._audit.note("refuse", name, by=output.by, result=str(e), tag=output.tag, old=old, new=value)
+            except Unreachable:
+                self.failures += 1  # counted; refused all the same
             return
         if not self._on_record(output, name, old, value):
             return

@@ -67,8 +67,11 @@ class TagTable:
                 self._values[name] = replace(before, quality=Quality.BAD, reason=reason)
 
     def current(self, name: str, now_ns: int) -> TagValue:
-        """The value of a tag as of `now_ns`: bad with reason STALE when it was not refreshed in time."""
-        value = self._values[name]
+        """The value of a tag as of `now_ns`: bad with reason STALE when it was not refreshed in time.
+
+        A tag that nobody reads (one that can only be written) was never read.
+        """
+        value = self._values.get(name, NEVER)
         limit = self._stale_ns.get(name)
         if limit is None or value.quality is Quality.BAD or now_ns - self._refreshed_ns.get(name, 0) <= limit:
             return value
@@ -76,4 +79,9 @@ class TagTable:
 
     def journal_since(self, number: int) -> list[Published]:
         """What was published as good after entry `number`, as far as it is still kept."""
-        return [entry for entry in self._journal if entry.number > number]
+        newer: list[Published] = []
+        for entry in reversed(self._journal):
+            if entry.number <= number:
+                break
+            newer.append(entry)
+        return newer[::-1]

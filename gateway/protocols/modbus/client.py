@@ -123,6 +123,7 @@ class ModbusClient:
         echo: bool = False,
         strict: bool = False,
         accepts_zero_id: bool = False,
+        turnaround_s: float = TURNAROUND_S,
     ) -> Self:
         """A client with the framing and the character time that `endpoint`, which `connection` was opened for, says."""
         return cls(
@@ -134,6 +135,7 @@ class ModbusClient:
             echo=echo,
             strict=strict,
             accepts_zero_id=accepts_zero_id,
+            turnaround_s=turnaround_s,
         )
 
     @property

@@ -1,0 +1,118 @@
+"""A request that is passed on: somebody else's PDU as a `Request` of the client, its reply handed back byte for byte.
+
+What a reply has to look like follows from the request, so a late or foreign reply is refused here as it is for requests of
+our own. It must never know who asked, nor a transaction id.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gateway.core.errors import VerifyFailed
+from gateway.protocols.modbus.crc import crc16
+from gateway.protocols.modbus.replies import Reply
+from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request
+from gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked
+
+_COUNTED = frozenset({0x0C, 0x11, 0x14})
+"""Functions whose reply tells its length in its second byte."""
+
+_ECHOED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
+"""Writes: how much of the request their reply repeats. 15h repeats all of it."""
+
+_FIXED_BYTE_COUNT = frozenset({0x01, 0x02, 0x03, 0x04, 0x17})
+
+
+@dataclass(frozen=True, slots=True)
+class ForwardedReply(Reply):
+    """The reply PDU as the unit sent it, in `raw`; empty after a broadcast."""
+
+    raw: bytes
+    t_ns: int
+
+
+class Forwarded(Request[ForwardedReply]):
+    """`pdu`, which `asked` was read from, for `unit`. Made for one exchange.
+
+    `on_line`: the wire is RTU. A function that nobody knows then ends where its check sum says so; elsewhere the framing
+    says where.
+    """
+
+    __slots__ = ("_asked", "_length", "_on_line", "_pdu", "_unit")
+
+    def __init__(self, unit: int, pdu: bytes, asked: Asked, *, on_line: bool) -> None:
+        self._unit = unit
+        self._pdu = pdu
+        self._asked = asked
+        self._on_line = on_line
+        self._length = asked.reply_bytes
+
+    @property
+    def function(self) -> int:
+        return self._asked.function
+
+    def encode(self) -> bytes:
+        return self._pdu
+
+    def nominal_length(self) -> int:
+        return self._asked.reply_bytes
+
+    def reply_length(self, head: bytes) -> int:
+        function = self.function
+        if function in _FIXED_BYTE_COUNT and len(head) > 1 and head[1] != (self._length - 2) & 0xFF:
+            return IMPOSSIBLE  # the byte count has to be what was asked for: MB-017
+        if self._length:
+            return self._length
+        if function in _COUNTED:
+            return NEED_MORE if len(head) < 2 else 2 + head[1] if 2 + head[1] <= MAX_PDU else IMPOSSIBLE
+        if function == 0x18:
+            return _fifo_length(head)
+        if function == 0x2B and self._pdu[1] == 0x0E:
+            return _identification_length(head)
+        return self._open_length(head)
+
+    def decode(self, pdu: bytes, t_ns: int) -> ForwardedReply:
+        repeated = len(self._pdu) if self.function == 0x15 else _ECHOED.get(self.function, 0)
+        if pdu[:repeated] != self._pdu[:repeated]:
+            raise VerifyFailed(
+                f"the acknowledgement of function {self.function:02X}h differs from the request",
+                expected=self._pdu[:repeated].hex(" "),
+                got=pdu[:repeated].hex(" "),
+            )
+        return ForwardedReply(bytes(pdu), t_ns)
+
+    def unanswered(self, t_ns: int) -> ForwardedReply:
+        if self.function not in BROADCAST_FUNCTIONS:
+            return super().unanswered(t_ns)
+        return ForwardedReply(b"", t_ns)
+
+    def _open_length(self, head: bytes) -> int:
+        """A function of the user's: on RTU all that came is the reply as soon as the check sum behind it is right."""
+        if not self._on_line:
+            return len(head)
+        if len(head) < 3 or crc16(bytes([self._unit]) + head) != 0:
+            return NEED_MORE
+        self._length = len(head) - 2
+        return self._length
+
+
+def _fifo_length(head: bytes) -> int:
+    """AP 6.18: a byte count of two bytes."""
+    if len(head) < 3:
+        return NEED_MORE
+    length = 3 + int.from_bytes(head[1:3], "big")
+    return length if 5 <= length <= MAX_PDU else IMPOSSIBLE
+
+
+def _identification_length(head: bytes) -> int:
+    """AP 6.21: seven bytes, then as many objects as the seventh says, each with an id and a length of its own."""
+    if len(head) > 1 and head[1] != 0x0E:
+        return IMPOSSIBLE
+    if len(head) < 7:
+        return NEED_MORE
+    end = 7
+    for _ in range(head[6]):
+        if len(head) < end + 2:
+            return NEED_MORE if end + 2 <= MAX_PDU else IMPOSSIBLE
+        end += 2 + head[end + 1]
+    return end if end <= MAX_PDU else IMPOSSIBLE

@@ -1,0 +1,67 @@
+"""Modbus TCP requests, the server's side of the MBAP header (TG 3.1.3): bytes in, requests out; replies to bytes.
+
+One object a client. An ADU of another protocol is dropped alone; a length that cannot be right leaves no border to go on
+from, so the stream is given up (`desync`) and its owner closes it. Nothing here knows sockets, units or registers.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+from gateway.protocols.modbus.request import MAX_PDU
+
+_HEADER = struct.Struct(">HHHB")
+_BEFORE_LENGTH_COUNTS = 6
+_MIN_LENGTH = 2  # a unit id and a function code
+_MAX_LENGTH = MAX_PDU + 1
+
+
+@dataclass(frozen=True, slots=True)
+class TcpRequest:
+    """One request ADU; a reply carries the same transaction id and unit."""
+
+    transaction: int
+    unit: int
+    pdu: bytes
+
+    def reply(self, pdu: bytes) -> bytes:
+        """The ADU that answers with `pdu`."""
+        return _HEADER.pack(self.transaction, 0, len(pdu) + 1, self.unit) + pdu
+
+
+class MbapRequests:
+    """The requests in a client's stream. Keeps less than one ADU between calls."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.foreign = 0
+        """ADUs dropped because their protocol id is not Modbus's (case MB-054)."""
+        self.desync = ""
+        """Why the stream makes no sense any more; empty while it does."""
+
+    def feed(self, data: bytes) -> list[TcpRequest]:
+        """Take what arrived; the whole requests in it, in order."""
+        if self.desync:
+            return []
+        buffer = self._buffer
+        buffer += data
+        found: list[TcpRequest] = []
+        at = 0
+        while len(buffer) - at >= _BEFORE_LENGTH_COUNTS:
+            length = buffer[at + 4] << 8 | buffer[at + 5]
+            if not _MIN_LENGTH <= length <= _MAX_LENGTH:
+                self.desync = f"an ADU of length {length}"
+                at = len(buffer)
+                break
+            end = at + _BEFORE_LENGTH_COUNTS + length
+            if len(buffer) < end:
+                break
+            transaction, protocol, _, unit = _HEADER.unpack_from(buffer, at)
+            if protocol == 0:
+                found.append(TcpRequest(transaction, unit, bytes(buffer[at + _HEADER.size : end])))
+            else:
+                self.foreign += 1
+            at = end
+        del buffer[:at]
+        return found

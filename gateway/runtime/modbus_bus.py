@@ -1,4 +1,5 @@
-"""One Modbus bus: its connection, its queue, its devices' polls. One transaction at a time, writes first in line.
+"""One Modbus bus: its connection, its queue, its devices' polls. One transaction at a time, writes first in line; then
+polls that are due and the requests of bridge clients, turn by turn.
 
 A device that does not answer costs the others its own timeouts once and is then left alone with growing pauses
 (catalogue case 62). Nothing here opens anything but through the Connector, and a connection that ends is opened again for ever,
@@ -30,7 +31,9 @@ from gateway.devices.config import BusConfig
 from gateway.devices.register_device import RegisterDriver
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.protocols.modbus.client import ModbusClient
+from gateway.protocols.modbus.framings import framing_of
 from gateway.runtime.backoff import Backoff
+from gateway.runtime.bridge_queue import GuestQueue
 from gateway.runtime.tags import TagTable
 
 MAX_JOBS = 256
@@ -90,6 +93,11 @@ class ModbusBus:
         self.connected = False
         self.opens = 0
         self.error = ""
+        self.down: FieldtwinError | None = None
+        """Why the wire could not be opened when that was tried last; None while it is open, or was until just now."""
+        self.guests = GuestQueue()
+        self.guests.on_put = self._wake_up
+        self._guest_was_last = False
         self._connector = connector
         self._clock = clock
         self._tags = tags
@@ -117,6 +125,9 @@ class ModbusBus:
             self._jobs.append(job)
             self._wake.set()
 
+    def _wake_up(self) -> None:
+        self._wake.set()
+
     def totals(self) -> Counter[str]:
         """Counters over all connections so far: requests, replies, timeouts..."""
         return self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
@@ -142,18 +153,14 @@ class ModbusBus:
             try:
                 connection = await self._connector.open_bytes(endpoint)
             except Unreachable as e:
+                self.down = e
                 self._lost(e)
+                self.guests.fail_all(e)
                 await self._pause(backoff.next_s())
                 continue
-            client = ModbusClient(
-                connection,
-                self._clock,
-                framing="rtu" if endpoint.is_serial or endpoint.scheme == "rtu+tcp" else "mbap",
-                serial=endpoint.serial if endpoint.is_serial else None,
-                timeout_s=self.config.timeout_s,
-            )
+            client = ModbusClient.at(endpoint, connection, self._clock, timeout_s=self.config.timeout_s)
             self._client = client
-            self.connected, self.error = True, ""
+            self.connected, self.error, self.down = True, "", None
             self.opens += 1
             try:
                 for device in self.devices:
@@ -190,11 +197,25 @@ class ModbusBus:
                 await self._run_job(self._jobs.popleft())
                 continue
             device, group, due_ns = self._next_poll()
-            if due_ns <= self._clock.monotonic_ns():
+            due = due_ns <= self._clock.monotonic_ns()
+            if not (due and self._guest_was_last) and await self._carry_guest():
+                backoff.reset()
+            elif due and device is not None:
+                self._guest_was_last = False
                 await self._poll(device, group)
                 backoff.reset()
-                continue
-            await self._sleep_or_job(due_ns)
+            else:
+                await self._sleep_or_job(due_ns)
+
+    async def _carry_guest(self) -> bool:
+        """One request of a bridge client, if any waits."""
+        client = self._client
+        guest = self.guests.take(self._clock.monotonic_ns()) if client is not None else None
+        if guest is None or client is None:
+            return False
+        self._guest_was_last = True
+        await self.guests.carry_out(guest, client, framing_of(self.config.endpoint) == "rtu")
+        return True
 
     async def _sleep_or_job(self, until_ns: int) -> None:
         try:
@@ -203,7 +224,7 @@ class ModbusBus:
         except TimeoutError:
             pass  # the next poll is due
 
-    def _next_poll(self) -> tuple[DeviceState, str, int]:
+    def _next_poll(self) -> tuple[DeviceState | None, str, int]:
         """The most overdue poll. A device that is away has only its next try."""
         best: tuple[int, int, DeviceState, str] | None = None
         for order, device in enumerate(self.devices):
@@ -212,7 +233,7 @@ class ModbusBus:
                 if best is None or (due_ns, order) < (best[0], best[1]):
                     best = (due_ns, order, device, group)
         if best is None:  # a bus without polls only carries jobs
-            return self.devices[0], "", self._clock.monotonic_ns() + NS_PER_S
+            return None, "", self._clock.monotonic_ns() + NS_PER_S
         return best[2], best[3], best[0]
 
     async def _poll(self, device: DeviceState, group: str) -> None:

@@ -1,0 +1,201 @@
+"""The gateway's listening side: a TCP port whose clients become `ByteConnection`s.
+
+It must never know a protocol: who may enter is asked of its owner by address, what a client says is its owner's business.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from collections.abc import Awaitable, Callable
+
+from gateway.connections.tcp import TcpConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
+
+MAX_CLIENTS = 32
+BACKLOG = 64
+CLIENT_CHUNKS = 16
+"""Chunks that may wait for us a client (64 KiB); then its socket is not read, and TCP holds it back."""
+
+ACCEPT_PAUSE_S = 0.1
+"""How long to wait when the system has no descriptor left for another client."""
+
+
+class ClientConnection(TcpConnection):
+    """One client. `peer` is its address, `last_used_s` the loop's time when it last said something."""
+
+    def __init__(self, endpoint: Endpoint, peer: str, port: int) -> None:
+        super().__init__(endpoint, CLIENT_CHUNKS)
+        self.peer = peer
+        self.peer_port = port
+        self._loop = asyncio.get_running_loop()
+        self.last_used_s = self._loop.time()
+        self.on_arrival = self._used
+
+    def _used(self, data: bytes) -> None:
+        self.last_used_s = self._loop.time()
+
+    async def take(self, sock: socket.socket) -> None:
+        """Become the connection of an accepted socket."""
+        await self._loop.connect_accepted_socket(lambda: self._wire, sock)
+        if self._lost is not None:  # its place was given away meanwhile
+            self._wire.transport.abort()
+
+    def evict(self) -> None:
+        """End it at once: another client needs the place."""
+        self.feed_lost(ConnectionLost("closed to make room for another client", where=f"{self.endpoint}: {self.peer}"))
+        self.inbound.data_stream.clear()
+        if hasattr(self._wire, "transport"):
+            self._wire.transport.abort()
+
+
+OnClient = Callable[[ClientConnection], Awaitable[None]]
+
+
+class TcpListener:
+    """Runs `on_client(connection)` for each client that `admits` lets in; when that returns, the client is closed.
+
+    When `max_clients` are connected, the next one takes the place of the one that has been silent for longest
+    (TG 4.2.1, case MB-065). `refused` counts who was not admitted.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        sock: socket.socket,
+        on_client: OnClient,
+        max_clients: int,
+        admits: Callable[[str], bool],
+    ) -> None:
+        """Take over a listening socket; use `open`."""
+        self.accepted = self.evicted = self.refused = 0
+        self._endpoint = endpoint
+        self._sock = sock
+        self._on_client = on_client
+        self._max_clients = max_clients
+        self._admits = admits
+        self._clients: list[ClientConnection] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._accepting = asyncio.get_running_loop().create_task(self._accept(), name=f"clients of {self.bound}")
+
+    @classmethod
+    async def open(
+        cls,
+        endpoint: Endpoint,
+        on_client: OnClient,
+        max_clients: int = MAX_CLIENTS,
+        admits: Callable[[str], bool] = lambda address: True,
+    ) -> TcpListener:
+        """Listen on a ``tcp://`` endpoint; port 0 takes a free one (`bound` says which).
+
+        Raises `EndpointBusy`, or `Unreachable` that says what to do about it.
+        """
+        if endpoint.scheme != "tcp":
+            raise UsageError("cannot listen there", expected="tcp://HOST:PORT", got=str(endpoint))
+        loop = asyncio.get_running_loop()
+        sock: socket.socket | None = None
+        try:
+            # The first address only: a name with an IPv4 and an IPv6 address would get two different free ports.
+            family, kind, proto, _, address = (
+                await loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+            )[0]
+            sock = socket.socket(family, kind, proto)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.setblocking(False)
+            sock.bind(address)
+            sock.listen(BACKLOG)
+        except OSError as e:
+            if sock is not None:
+                sock.close()
+            raise _cannot_listen(endpoint, e) from e
+        return cls(endpoint, sock, on_client, max_clients, admits)
+
+    @property
+    def bound(self) -> Endpoint:
+        """The endpoint with the port that is really listened on."""
+        if self._sock.fileno() < 0:
+            return self._endpoint
+        return self._endpoint.with_address(self._endpoint.host, self._sock.getsockname()[1])
+
+    @property
+    def clients(self) -> tuple[ClientConnection, ...]:
+        """Who is connected, oldest first."""
+        return tuple(self._clients)
+
+    async def aclose(self) -> None:
+        """Stop listening and close every client. Closing twice does nothing."""
+        self._accepting.cancel()
+        tasks = [self._accepting, *self._tasks]
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        self._sock.close()
+
+    async def _accept(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                sock, address = await loop.sock_accept(self._sock)
+            except OSError:  # no descriptors left, or the client went before it was accepted
+                await asyncio.sleep(ACCEPT_PAUSE_S)
+                continue
+            if not self._admits(address[0]):
+                self.refused += 1
+                sock.close()
+                continue
+            self.accepted += 1
+            self._make_room()
+            client = ClientConnection(self._endpoint, address[0], address[1])
+            self._clients.append(client)
+            task = loop.create_task(self._serve(client, sock), name=f"client {address[0]}:{address[1]}")
+            self._tasks.add(task)
+            task.add_done_callback(self._ended)
+
+    def _make_room(self) -> None:
+        while len(self._clients) >= self._max_clients:
+            idlest = min(self._clients, key=lambda c: c.last_used_s)
+            self._clients.remove(idlest)
+            self.evicted += 1
+            idlest.evict()
+
+    async def _serve(self, client: ClientConnection, sock: socket.socket) -> None:
+        try:
+            await client.take(sock)
+        except BaseException as e:
+            sock.close()
+            self._forget(client)
+            if isinstance(e, OSError):
+                return  # it went while it was being accepted
+            raise
+        try:
+            await self._on_client(client)
+        except ConnectionLost:
+            pass  # the ordinary end of a client
+        finally:
+            self._forget(client)
+            await client.aclose()
+
+    def _forget(self, client: ClientConnection) -> None:
+        if client in self._clients:
+            self._clients.remove(client)
+
+    def _ended(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if error is not None:  # one client's failure ends that client; it is reported, not swallowed
+            report = {"message": f"serving a client of {self._endpoint} failed", "exception": error, "task": task}
+            task.get_loop().call_exception_handler(report)
+
+
+def _cannot_listen(endpoint: Endpoint, error: OSError) -> Unreachable:
+    where = str(endpoint)
+    if error.errno == errno.EADDRINUSE:
+        return EndpointBusy("the port is in use", where=where, hint="another instance?")
+    if error.errno == errno.EACCES:
+        hint = (
+            "ports below 1024 are for root: setcap cap_net_bind_service, or sysctl net.ipv4.ip_unprivileged_port_start"
+        )
+        return Unreachable("no permission to listen on this port", where=where, hint=hint)
+    return Unreachable(f"cannot listen: {error.strerror or error}", where=where)

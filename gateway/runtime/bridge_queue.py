@@ -1,0 +1,130 @@
+"""Requests of bridge clients that wait for a bus: bounded, fair between clients, and gone when nobody waits any more.
+
+The bus takes one at a time, behind the PLC's writes and never two between two polls that are due. It must never know
+where a request came from or what answers it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, WireError
+from gateway.protocols.modbus.client import ModbusClient
+from gateway.protocols.modbus.server import Asked
+from gateway.protocols.modbus.server_forward import Forwarded, ForwardedReply
+
+MAX_WAIT_NS = 10_000_000_000
+"""Whoever waited for longer has given up: what asked for it then is not worth the wire."""
+
+
+@dataclass(eq=False)
+class Guest:
+    """A request for `unit`. `attempts` are left, each a turn of its own.
+
+    `done` is called once, with the reply or the error, unless `wanted` has turned False: then nobody waits any more.
+    """
+
+    client: str
+    unit: int
+    pdu: bytes
+    asked: Asked
+    attempts: int
+    queued_ns: int
+    done: Callable[[ForwardedReply | FieldtwinError], None]
+    wanted: Callable[[], bool]
+
+
+@dataclass
+class GuestCounters:
+    """What became of the requests on one bus. `full`: no room; `gone`: nobody waited any more; `stale`: waited too long."""
+
+    carried: int = 0
+    full: int = 0
+    gone: int = 0
+    stale: int = 0
+
+
+@dataclass
+class GuestQueue:
+    """At most `limit` requests of all clients together; clients take turns. `on_put` wakes the bus."""
+
+    limit: int = 64
+    on_put: Callable[[], None] = lambda: None
+    counters: GuestCounters = field(default_factory=GuestCounters)
+    _waiting: dict[str, deque[Guest]] = field(default_factory=dict)
+    _size: int = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def put(self, guest: Guest) -> None:
+        """Put it in line. On a full queue it fails at once, with `EndpointBusy`."""
+        if self._size >= self.limit:
+            self._drop_gone()
+        if self._size >= self.limit:
+            self.counters.full += 1
+            guest.done(EndpointBusy("the bus has no room for another request", got=f"{self._size} waiting"))
+            return
+        self._waiting.setdefault(guest.client, deque()).append(guest)
+        self._size += 1
+        self.on_put()
+
+    def take(self, now_ns: int) -> Guest | None:
+        """The next one to carry out, of the client whose turn it is."""
+        while self._waiting:
+            client, line = next(iter(self._waiting.items()))
+            guest = line.popleft()
+            self._size -= 1
+            del self._waiting[client]
+            if line:
+                self._waiting[client] = line  # to the end: the others first
+            if not guest.wanted():
+                self.counters.gone += 1
+            elif now_ns - guest.queued_ns > MAX_WAIT_NS:
+                self.counters.stale += 1
+                guest.done(EndpointBusy("waited too long for the bus"))
+            else:
+                return guest
+        return None
+
+    async def carry_out(self, guest: Guest, client: ModbusClient, on_line: bool) -> None:
+        """One attempt. What the wire lost goes back in line while attempts are left. Raises `ConnectionLost` only."""
+        guest.attempts -= 1
+        request = Forwarded(guest.unit, guest.pdu, guest.asked, on_line=on_line)
+        try:
+            reply = await client.execute(guest.unit, request)
+        except (WireError, ConnectionLost) as e:
+            if guest.attempts > 0 and guest.wanted():
+                self._waiting.setdefault(guest.client, deque()).appendleft(guest)
+                self._size += 1
+            else:
+                guest.done(e)
+            if isinstance(e, ConnectionLost):
+                raise
+        except FieldtwinError as e:
+            self.counters.carried += 1
+            guest.done(e)
+        else:
+            self.counters.carried += 1
+            guest.done(reply)
+
+    def fail_all(self, error: FieldtwinError) -> None:
+        """The wire is gone and does not come back soon."""
+        while self._waiting:
+            _, line = self._waiting.popitem()
+            for guest in line:
+                guest.done(error)
+        self._size = 0
+
+    def _drop_gone(self) -> None:
+        """Make room of those whose client went."""
+        for client, line in list(self._waiting.items()):
+            kept = deque(guest for guest in line if guest.wanted())
+            self.counters.gone += len(line) - len(kept)
+            self._size -= len(line) - len(kept)
+            if kept:
+                self._waiting[client] = kept
+            else:
+                del self._waiting[client]

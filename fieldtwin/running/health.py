@@ -104,9 +104,9 @@ def _pty() -> Check:
 
 
 def _serial() -> Check:
-    from serial.tools.list_ports import comports
+    from gateway.connections.serial_line import ports_here
 
-    ports = [p.device for p in comports()]
+    ports = ports_here()
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]
     if closed:
         return Check(

@@ -216,11 +216,11 @@ def _cannot_open(endpoint: Endpoint, number: int, text: str) -> Unreachable:
     if number in _BUSY:
         return EndpointBusy("the port is held by another program", where=where, hint=f"fuser {endpoint.path} names it")
     if number in _ABSENT:
-        return Unreachable("there is no such serial port", where=where, hint=_ports_here())
+        return Unreachable("there is no such serial port", where=where, hint=_ports_hint())
     if number in (errno.EACCES, errno.EPERM):
         return Unreachable("no permission for the port", where=where, hint=_group_hint(endpoint.path))
     if number == errno.ENOTTY or "Could not configure port" in text:  # pyserial gives this one no number
-        return Unreachable("this is no serial port", where=where, hint=_ports_here())
+        return Unreachable("this is no serial port", where=where, hint=_ports_hint())
     return Unreachable(f"cannot open the port: {os.strerror(number) if number else text}", where=where)
 
 
@@ -228,8 +228,13 @@ def _lost(endpoint: Endpoint, why: str) -> ConnectionLost:
     return ConnectionLost(f"the serial port is gone: {why}", where=str(endpoint))
 
 
-def _ports_here() -> str:
-    names = sorted(port.device for port in list_ports.comports())
+def ports_here() -> list[str]:
+    """The serial ports that this computer has now, by name."""
+    return sorted(port.device for port in list_ports.comports())
+
+
+def _ports_hint() -> str:
+    names = ports_here()
     return f"ports here: {', '.join(names[:8])}" if names else "this computer has no serial port now"
 
 

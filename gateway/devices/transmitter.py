@@ -42,8 +42,11 @@ class TransmitterDriver(RegisterDriver):
         self._inbox: Box = self.profile.inbox
         self._outbox: Box = self.profile.outbox
         self._incoming = incoming
-        self._synchronised = False
         self._seen = 0
+        self._emitted = b""
+        """The whole inbox as it was when its message was emitted."""
+        self._unconfirmed: tuple[int, DATA] | None = None
+        """What was written under which sequence, until the device confirms it."""
         self._sent = 0
         self.to_acknowledge = 0
         """Sequence of the message that was emitted and not acknowledged yet; 0 when there is none."""
@@ -60,20 +63,28 @@ class TransmitterDriver(RegisterDriver):
         return f"{self.config.name}.outbox"
 
     async def synchronise(self) -> None:
-        """After (re)connecting: learn from the device what was taken on either side, so that nothing is done twice."""
-        _, inbox_ack = await self._words(self._inbox)
-        self._sent, outbox_ack = await self._words(self._outbox)
-        self._seen = inbox_ack
-        self.to_acknowledge = 0
-        self.outbox_free = self._sent == outbox_ack
-        self._synchronised = True
+        """After (re)connecting: learn from the device what was taken on either side, so that nothing is done twice.
 
-    async def _words(self, box: Box) -> tuple[int, int]:
-        """Sequence and acknowledged sequence of a mailbox."""
-        unit = self.config.address
-        head = await self.client.read_registers(unit, "holding", box.at.address, 1)
-        ack = await self.client.read_registers(unit, "holding", box.ack.address, 1)
-        return head.registers[0], ack.registers[0]
+        What was emitted here and is not acknowledged stays so; what was written and whose reply was lost was sent.
+        """
+        unit, inbox = self.config.address, self._inbox.at
+        held = await self.client.read_registers(unit, "holding", inbox.address, inbox.count)
+        inbox_ack = await self._word(self._inbox.ack.address)
+        self._sent = await self._word(self._outbox.at.address)
+        outbox_ack = await self._word(self._outbox.ack.address)
+        emitted = bool(self.to_acknowledge) and held.raw == self._emitted
+        self._seen = held.registers[0] if emitted else inbox_ack
+        self.to_acknowledge = self._seen if self._seen != inbox_ack else 0
+        self.outbox_free = self._sent == outbox_ack
+        if self._unconfirmed is not None and self._sent == self._unconfirmed[0]:
+            if self.consumer.queue and self.consumer.queue[0] == self._unconfirmed[1]:
+                self.consumer.consume()
+            self.sent += 1
+        self._unconfirmed = None
+
+    async def _word(self, address: int) -> int:
+        reply = await self.client.read_registers(self.config.address, "holding", address, 1)
+        return reply.registers[0]
 
     async def _read(self, what: str) -> list[DATA]:
         if what != "inbox":
@@ -91,6 +102,7 @@ class TransmitterDriver(RegisterDriver):
                 where=f"{self.config.where} {box.at}",
             )
         self._seen = self.to_acknowledge = sequence
+        self._emitted = reply.raw
         self.received += 1
         return [self._incoming(reply.raw[4 : 4 + length])]
 
@@ -122,7 +134,9 @@ class TransmitterDriver(RegisterDriver):
         padded = item.data + b"\0" * (len(item.data) % 2)
         words = [sequence, len(item.data)]
         words += [int.from_bytes(padded[i : i + 2]) for i in range(0, len(padded), 2)]
+        self._unconfirmed = (sequence, item)
         await self.client.write_registers(self.config.address, box.at.address, words)
+        self._unconfirmed = None
         self._sent = sequence
         self.outbox_free = False
         self.sent += 1

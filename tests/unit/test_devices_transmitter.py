@@ -1,0 +1,295 @@
+"""The transmitter's driver against emulated modems and the link between them: nothing lost, nothing twice (SPEC ruling 17)."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from random import Random
+
+import pytest
+from gateway_rig import LAN, LINE, PROFILES, FieldBus, running_bus, wire
+from hypothesis import given
+from hypothesis import strategies as st
+from support import eventually, run
+
+from emulators.modbus.unit import ModbusUnit
+from emulators.models.mailbox_modem import ModemPair
+from emulators.models.packet_link import PacketLink
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import ConnectionLost, FieldtwinError, FileInvalid, NotAllowed
+from gateway.core.events import Consumer
+from gateway.core.profile import load_profile
+from gateway.core.values import COMMAND, DATA, RESPONSE
+from gateway.devices.config import BusConfig, DeviceConfig
+from gateway.devices.transmitter import TransmitterDriver, next_sequence
+from gateway.protocols.modbus.client import ModbusClient
+from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.tags import TagTable
+from gateway.wallclock import WallClock
+
+PROFILE = load_profile(PROFILES / "modem-mailbox.yaml")
+
+
+def pair(loss: float = 0.0) -> ModemPair:
+    return ModemPair(PROFILE, bytes_per_s=1e6, latency_s=0.0, loss=loss, seed=1)
+
+
+class Station:
+    """One end: a driver whose messages are taken and acknowledged, over a connection that can be pulled."""
+
+    def __init__(self, bus: ModbusBus, driver: TransmitterDriver, field: FieldBus) -> None:
+        self.bus, self.driver, self.field = bus, driver, field
+        self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=1000)
+        driver.emitter.subscribe(self.inbox)
+        self.errors: list[FieldtwinError | None] = []
+
+    async def do(self, what: str) -> FieldtwinError | None:
+        """Run one of the driver's exchanges on the bus and wait for its end."""
+        count = len(self.errors)
+        driver = self.driver
+        actions = {"send": driver.send, "acknowledge": driver.acknowledge, "ask": self._ask, "read": self._read}
+        self.bus.submit(Job(driver, actions[what], self.errors.append))
+        await eventually(lambda: len(self.errors) > count)
+        return self.errors[-1]
+
+    async def _ask(self) -> None:
+        await self.driver.check_outbox()
+
+    async def _read(self) -> None:
+        await self.driver.receive("inbox")
+
+    async def reconnect(self) -> None:
+        self.field.unplug()
+        assert isinstance(await self.do("ask"), ConnectionLost)
+        await eventually(lambda: not self.bus.connected)
+        self.field.plugged = True
+        await eventually(lambda: self.bus.online(self.driver))
+
+
+@asynccontextmanager
+async def station(modems: ModemPair, side: str = "near") -> AsyncIterator[Station]:
+    bank = modems.near if side == "near" else modems.far
+    incoming = COMMAND if side == "near" else RESPONSE
+    config = DeviceConfig("modem", PROFILE, "bus", 1)
+    drivers: list[TransmitterDriver] = []
+
+    def make(tags: TagTable) -> list[TransmitterDriver]:
+        drivers.append(TransmitterDriver(config, tags, incoming=incoming))
+        return drivers
+
+    async with running_bus(make, FieldBus({1: ModbusUnit(bank)}), LAN) as r:  # type: ignore[arg-type]
+        await eventually(lambda: r.bus.online(drivers[0]))
+        yield Station(r.bus, drivers[0], r.field)
+
+
+def test_the_same_command_sent_twice_is_two_commands_and_read_twice_is_one() -> None:
+    async def main() -> None:
+        modems = pair()
+        async with station(modems, "far") as far, station(modems) as near:
+            for number in (1, 2):
+                far.driver.consumer.observe(COMMAND(b"\0\1"))
+                assert await far.do("send") is None
+                assert await near.do("read") is None
+                assert await near.do("read") is None  # a duplicate: discarded
+                assert list(near.inbox.queue) == [COMMAND(b"\0\1")] * number
+                await near.do("acknowledge")
+                await near.do("read")
+                assert len(near.inbox.queue) == number
+            assert near.driver.received == 2
+
+    run(main())
+
+
+def test_messages_wait_for_a_free_mailbox_and_arrive_in_order() -> None:
+    async def main() -> None:
+        modems = pair()
+        async with station(modems, "far") as far, station(modems) as near:
+            sent = [COMMAND(bytes([0, n])) for n in range(1, 6)]
+            for command in sent:
+                far.driver.consumer.observe(command)
+            while far.driver.consumer.queue:
+                await far.do("ask")
+                if far.driver.outbox_free:
+                    await far.do("send")
+                await near.do("read")
+                if near.driver.to_acknowledge:
+                    await near.do("acknowledge")
+            for _ in range(6):
+                await near.do("read")
+                await near.do("acknowledge")
+            assert list(near.inbox.queue) == sent
+            assert far.driver.sent == 5
+
+    run(main())
+
+
+def test_what_was_emitted_and_not_acknowledged_is_not_emitted_again_after_a_reconnection() -> None:
+    async def main() -> None:
+        modems = pair()
+        async with station(modems, "far") as far, station(modems) as near:
+            far.driver.consumer.observe(COMMAND(b"\0\5"))
+            await far.do("send")
+            await near.do("read")
+            assert near.driver.to_acknowledge == 1
+            await near.reconnect()
+            await near.do("read")
+            assert list(near.inbox.queue) == [COMMAND(b"\0\5")]  # the control logic has it: once is enough
+            assert near.driver.to_acknowledge == 1
+            await near.do("acknowledge")
+            far.driver.consumer.observe(COMMAND(b"\0\5"))
+            await far.do("ask")
+            await far.do("send")
+            await near.do("read")
+            assert len(near.inbox.queue) == 2  # the same bytes under a new sequence are another command
+
+    run(main())
+
+
+def test_a_new_driver_reads_again_what_nobody_acknowledged() -> None:
+    """A gateway that died between reading and acknowledging: the command survives it."""
+
+    async def main() -> None:
+        modems = pair()
+        async with station(modems, "far") as far:
+            far.driver.consumer.observe(COMMAND(b"\0\5"))
+            await far.do("send")
+        for expected in ([COMMAND(b"\0\5")], [COMMAND(b"\0\5")]):
+            async with station(modems) as near:
+                await near.do("read")
+                assert list(near.inbox.queue) == expected
+                last = near
+                if expected and last.driver.to_acknowledge == 0:
+                    raise AssertionError
+        async with station(modems) as near:
+            await near.do("read")
+            await near.do("acknowledge")
+        async with station(modems) as near:
+            await near.do("read")
+            assert not near.inbox.queue
+
+    run(main())
+
+
+def test_a_write_whose_reply_was_lost_with_the_connection_is_not_sent_a_second_time() -> None:
+    async def main() -> None:
+        modems = pair()
+        clock = WallClock()
+        async with station(modems) as near, station(modems, "far") as far:
+            driver = near.driver
+            driver.consumer.observe(RESPONSE(b"once"))
+            here, there = wire(LAN)
+            client = ModbusClient(here, clock, framing="mbap", timeout_s=0.05)
+            kept = driver.client, driver.connection
+            driver.attach_client(here, client)
+            with pytest.raises(FieldtwinError):
+                await driver.send()  # nobody answers; what was written is in `there`
+            request = there.read_pending()
+            await client.aclose()
+            with pytest.raises(ConnectionLost):
+                await there.read()
+            modems.near.write("holding", 100, [int.from_bytes(request[13 + i : 15 + i]) for i in range(0, 8, 2)], 1)
+            driver.attach_client(kept[1], kept[0])  # type: ignore[arg-type]
+            await near.reconnect()
+            assert not driver.consumer.queue  # the modem has it already
+            assert driver.sent == 1
+            await far.do("read")
+            assert list(far.inbox.queue) == [RESPONSE(b"once")]
+            await far.do("acknowledge")
+            driver.consumer.observe(RESPONSE(b"once"))  # the next one, of the same bytes
+            await near.do("ask")
+            assert await near.do("send") is None
+            await far.do("read")
+            assert list(far.inbox.queue) == [RESPONSE(b"once"), RESPONSE(b"once")]
+
+    run(main())
+
+
+def test_sequences_wrap_to_one() -> None:
+    async def main() -> None:
+        modems = pair()
+        async with station(modems, "far") as far, station(modems) as near:
+            for bank, driver in ((modems.near, near.driver), (modems.far, far.driver)):
+                bank._sequence = bank._accepted = 0xFFFE
+                for at, value in ((PROFILE.inbox, 0xFFFE), (PROFILE.outbox, 0xFFFE)):
+                    assert at is not None
+                    bank._poke(at.at, value)
+                    bank._poke(at.ack, value)
+                await driver.synchronise()
+            for n in range(4):
+                far.driver.consumer.observe(COMMAND(bytes([0, n])))
+                await far.do("ask")
+                assert await far.do("send") is None
+                await near.do("read")
+                await near.do("acknowledge")
+            assert [c.data[1] for c in near.inbox.queue] == [0, 1, 2, 3]
+
+    run(main())
+
+
+@pytest.mark.parametrize("payload", [b"", b"x" * 65], ids=["empty", "too long"])
+def test_what_does_not_fit_the_outbox_is_refused_and_gone(payload: bytes) -> None:
+    async def main() -> None:
+        async with station(pair()) as near:
+            near.driver.consumer.observe(RESPONSE(payload))
+            assert isinstance(await near.do("send"), NotAllowed)
+            assert not near.driver.consumer.queue
+
+    run(main())
+
+
+def test_next_sequence_never_is_zero() -> None:
+    assert [next_sequence(n) for n in (0, 1, 0xFFFE, 0xFFFF)] == [1, 2, 0xFFFF, 1]
+
+
+def test_a_transmitter_needs_a_mailbox_and_a_socket() -> None:
+    tags = TagTable(WallClock())
+    ctd = load_profile(PROFILES / "ctd-reference.yaml")
+    with pytest.raises(FileInvalid, match="mailbox"):
+        TransmitterDriver(DeviceConfig("x", ctd, "b", 1), tags)
+    driver = TransmitterDriver(DeviceConfig("x", PROFILE, "b", 1), tags)
+    near, _ = wire(LINE)
+    with pytest.raises(FileInvalid, match="cannot stand on this bus"):
+        driver.attach(near)
+    assert BusConfig("b", LAN).retries == 1
+
+
+# -- the link between the modems ------------------------------------------------------------------------------------------
+
+payloads = st.lists(st.binary(min_size=1, max_size=64), max_size=30)
+
+
+@given(payloads=payloads, loss=st.floats(0, 0.9), latency_s=st.floats(0, 3), rate=st.floats(1, 1e5), seed=st.integers())
+def test_the_link_delivers_everything_once_in_order_and_no_faster_than_it_can(
+    payloads: list[bytes], loss: float, latency_s: float, rate: float, seed: int
+) -> None:
+    link = PacketLink(rate, latency_s, loss, Random(seed), capacity=4)
+    now_ns, waiting, got, arrived_ns = 0, list(payloads), [], []
+    for _ in range(100_000):
+        while waiting and link.submit(waiting[0], now_ns):
+            waiting.pop(0)
+        packet = link.arrived(now_ns)
+        if packet is None:
+            if not waiting and not link.waiting:
+                break
+            now_ns += max(1, link._under_way[0][0] - now_ns)
+            continue
+        got.append(packet)
+        arrived_ns.append(now_ns)
+    assert got == payloads
+    assert arrived_ns == sorted(arrived_ns)
+    assert (link.sent, link.delivered) == (len(payloads), len(payloads))
+    if payloads:
+        airtime_s = sum(len(p) + 8 for p in payloads) / rate
+        assert arrived_ns[-1] >= (airtime_s + latency_s) * NS_PER_S * (1 - 1e-9) - len(payloads)
+        if loss == 0:
+            assert link.resent == 0
+            assert arrived_ns[-1] <= (airtime_s + latency_s * (1 + len(payloads))) * NS_PER_S + 2 * len(payloads)
+
+
+def test_a_full_link_takes_nothing_more() -> None:
+    link = PacketLink(10, 1.0, 0.0, Random(1), capacity=2)
+    assert link.submit(b"a", 0)
+    assert link.submit(b"b", 0)
+    assert not link.submit(b"c", 0)
+    assert link.full
+    assert link.sent == 2

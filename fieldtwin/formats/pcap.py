@@ -39,23 +39,34 @@ _MACS = {_CLIENT: bytes((2, 0, 0, 0, 0, 1)), _SERVER: bytes((2, 0, 0, 0, 0, 2))}
 _SYN, _ACK, _PSH = 0x02, 0x10, 0x08
 
 
-def read_capture(path: Path) -> list[Captured]:
-    """What a `TapFile` wrote, in order. A last line that was cut off is left out; raises `FileInvalid` for any other flaw."""
+MAX_LINE_BYTES = 1 << 20
+"""Longer lines are refused; the longest chunk that a tap sees is a fraction of it."""
+
+
+def read_capture(path: Path) -> Iterator[Captured]:
+    """What a `TapFile` wrote, in order, a line at a time. A last line that was cut off is left out.
+
+    Raises `FileInvalid` when the file cannot be read, and at any other flaw with its line.
+    """
     try:
-        lines = path.read_text(encoding="ascii").splitlines(keepends=True)
-    except (OSError, UnicodeDecodeError) as e:
-        raise FileInvalid(f"cannot read the capture: {e}", path=str(path)) from e
-    captured = []
-    for number, line in enumerate(lines, 1):
-        try:
-            captured.append(_captured(json.loads(line)))
-        except (ValueError, KeyError, TypeError, FieldtwinError) as e:
-            if not line.endswith("\n"):
-                break
-            raise FileInvalid(
-                f"not a line of a capture: {e}", path=str(path), line=number, expected="t_ns, endpoint, direction, hex"
-            ) from e
-    return captured
+        with path.open("rb") as file:
+            number = 0
+            while line := file.readline(MAX_LINE_BYTES):
+                number += 1
+                try:
+                    captured = _captured(json.loads(line))
+                except (ValueError, KeyError, TypeError, FieldtwinError) as e:
+                    if not line.endswith(b"\n") and not file.read(1):
+                        return
+                    raise FileInvalid(
+                        f"not a line of a capture: {e}",
+                        path=str(path),
+                        line=number,
+                        expected="t_ns, endpoint, direction, hex",
+                    ) from e
+                yield captured
+    except OSError as e:
+        raise FileInvalid(f"cannot read the capture: {e.strerror or e}", path=str(path)) from e
 
 
 def _captured(line: dict[str, object]) -> Captured:
@@ -100,10 +111,10 @@ def packets(captured: Iterable[Captured], endpoint: Endpoint) -> Iterator[Packet
     are those of one. ``rtu``, ``rtu+tcp``: a packet for each request, and for all that came until the next one.
     ``can``: a packet for each frame.
     """
-    seen = [c for c in captured if c.endpoint == endpoint]
+    seen = (c for c in captured if c.endpoint == endpoint)
     if endpoint.is_can:
         return (Packet(c.t_ns, socketcan(c.item)) for c in seen if isinstance(c.item, CanFrame))
-    chunks = [(c.t_ns, c.direction, c.item) for c in seen if isinstance(c.item, bytes)]
+    chunks = ((c.t_ns, c.direction, c.item) for c in seen if isinstance(c.item, bytes))
     return _tcp_packets(chunks) if endpoint.scheme == "tcp" else _turns(chunks)
 
 
@@ -141,7 +152,7 @@ def socketcan(frame: CanFrame) -> bytes:
 Chunk = tuple[int, Direction, bytes]
 
 
-def _turns(chunks: list[Chunk]) -> Iterator[Packet]:
+def _turns(chunks: Iterable[Chunk]) -> Iterator[Packet]:
     """On a line with one master every chunk sent is a frame, and so is all that was received before the next one."""
     reply, reply_ns = b"", 0
     for t_ns, direction, data in chunks:
@@ -160,10 +171,8 @@ def _turns(chunks: list[Chunk]) -> Iterator[Packet]:
 # -- TCP ----------------------------------------------------------------------------------------------------------------
 
 
-def _tcp_packets(chunks: list[Chunk]) -> Iterator[Packet]:
+def _tcp_packets(chunks: Iterable[Chunk]) -> Iterator[Packet]:
     """The chunks as the segments of one connection that the gateway opened just before the first of them."""
-    if not chunks:
-        return
     sequence = {_CLIENT: 1000, _SERVER: 2000}
 
     def segment(t_ns: int, source: bytes, flags: int, data: bytes = b"") -> Packet:
@@ -175,11 +184,13 @@ def _tcp_packets(chunks: list[Chunk]) -> Iterator[Packet]:
         sequence[source] += len(data) + bool(flags & _SYN)
         return packet
 
-    first_ns = chunks[0][0]
-    yield segment(first_ns - 3, _CLIENT, _SYN)
-    yield segment(first_ns - 2, _SERVER, _SYN | _ACK)
-    yield segment(first_ns - 1, _CLIENT, _ACK)
+    opened = False
     for t_ns, direction, data in chunks:
+        if not opened:
+            yield segment(t_ns - 3, _CLIENT, _SYN)
+            yield segment(t_ns - 2, _SERVER, _SYN | _ACK)
+            yield segment(t_ns - 1, _CLIENT, _ACK)
+            opened = True
         source = _CLIENT if direction is Direction.SENT else _SERVER
         for at in range(0, len(data), MAX_SEGMENT):
             yield segment(t_ns, source, _PSH | _ACK, data[at : at + MAX_SEGMENT])

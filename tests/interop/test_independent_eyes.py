@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from conftest import Held
 from tshark import dissect, needs_tshark
 
+from fieldtwin.formats.pcap import read_capture
 from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
 from gateway.core.endpoint import Endpoint
@@ -96,3 +101,25 @@ def changed(captured: list[Captured], endpoint: Endpoint, spot: int) -> list[Cap
     assert isinstance(reply.item, bytes)
     item = reply.item[:spot] + bytes([reply.item[spot] ^ 1]) + reply.item[spot + 1 :]
     return [captured[0], Captured(reply.t_ns, endpoint, reply.direction, item), *captured[2:]]
+
+
+def test_what_a_run_captures(short_dir: Callable[[], Path], tmp_path: Path) -> None:
+    """``fieldtwin run --capture FILE``, as a user starts it: every wire in the file is readable for tshark."""
+    capture = tmp_path / "capture.jsonl"
+    command = [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--for", "3s"]
+    ran = subprocess.run(
+        [*command, "--script", "1", "--capture", str(capture)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "FIELDTWIN_RUN": str(short_dir())},
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    captured = list(read_capture(capture))
+    endpoints = list(dict.fromkeys(c.endpoint for c in captured))
+    assert sorted(e.scheme for e in endpoints) == ["can", "rtu", "tcp"]
+    names = {"can": "CANopen", "rtu": "Modbus RTU", "tcp": "Modbus/TCP"}
+    for endpoint in endpoints:
+        packets = dissect(tmp_path / f"{endpoint.scheme}.pcap", captured, endpoint, ["mbrtu.crc16.status"])
+        assert {p["_ws.col.Protocol"] for p in packets} - {"TCP"} == {names[endpoint.scheme]}
+        assert {p["mbrtu.crc16.status"] for p in packets} <= {"", "1"}

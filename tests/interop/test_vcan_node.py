@@ -57,10 +57,12 @@ async def candump() -> AsyncIterator[Candump]:
     dump = Candump(process)
     reading = asyncio.create_task(dump.read())
     try:
-        while not dump.frames:  # it is listening once it shows what we send
-            await cansend("7E5#00")
-            await asyncio.sleep(0.05)
-        await dump.sees("7E5#")
+
+        async def listens() -> bool:
+            await cansend("7E5#00")  # nobody's: it is listening once it shows it
+            return bool(dump.frames)
+
+        await eventually(listens, within_s=60)
         yield dump
     finally:
         process.terminate()

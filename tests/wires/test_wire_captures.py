@@ -55,6 +55,7 @@ def test_what_a_tap_wrote_comes_back(tmp_path: Path) -> None:
         "{}",
         "[1]",
         "nonsense",
+        "\xff",
         '{"t_ns":1,"endpoint":"rtu:x","direction":"sent","hex":"0"}',
         '{"t_ns":1,"endpoint":"nowhere","direction":"sent","hex":"00"}',
         '{"t_ns":1,"endpoint":"rtu:x","direction":"up","hex":"00"}',
@@ -67,15 +68,15 @@ def test_a_flaw_is_refused_with_its_line_and_a_cut_off_line_is_not(line: str, tm
     path = tmp_path / "capture.jsonl"
     path.write_text(good + line + "\n" + good)
     with pytest.raises(FileInvalid, match="not a line of a capture") as e:
-        read_capture(path)
+        list(read_capture(path))
     assert e.value.line == 2
     path.write_text(good + line)
-    assert len(read_capture(path)) == 1
+    assert len(list(read_capture(path))) == 1
 
 
 def test_a_capture_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="cannot read the capture"):
-        read_capture(tmp_path / "nothing.jsonl")
+        list(read_capture(tmp_path / "nothing.jsonl"))
     with pytest.raises(FileInvalid, match="cannot write the pcap file"):
         write_pcap(tmp_path / "no" / "such.pcap", [], RTU)
 

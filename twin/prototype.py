@@ -1,38 +1,43 @@
-"""The digital twin prototype: the physical twin's own software and configuration, with its devices emulated.
+"""The digital twin prototype: the physical twin's own software and configuration, with every device emulated.
 
-(SPEC rows DigitalTwinPrototype, EmulatedCommunication.) The embedded control system is the very one that runs the plant; only
-the far ends of its wires differ.
+Here the two sides of the wire are put together and nowhere else: which emulator answers which driver is checked, and the field
+side is made. What runs left of the wire is `twin.physical`, unchanged and unaware.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from pathlib import Path
 
+from emulators.emulator import EmulatedCommunication
 from gateway.core.clock import Clock
-from twin.embedded import EmbeddedControlSystem
-from twin.physical import check_commands
-from twin.prototype_file import EmulatedDevice, Prototype
+from twin.field import FieldSide
+from twin.model import DigitalModel
+from twin.physical import EmbeddedControlSystem
+from twin.prototype_file import Prototype
+from twin.system import System
 
 
-@dataclass(frozen=True)
 class DigitalTwinPrototype:
-    """An embedded control system and what stands in for each of its devices."""
+    """SPEC row DigitalTwinPrototype. Raises `CommandListMismatch` where an emulator and its driver differ (ruling 12).
 
-    ecs: EmbeddedControlSystem
-    prototype: Prototype
+    `ecs` is the physical twin's class, made from the same system file; `model` is an instance of its own. `real` names the
+    devices that are not emulated, on buses that the prototype file calls `plant`; a whole prototype has none.
+    """
 
-    @property
-    def emulated(self) -> dict[str, EmulatedDevice]:
-        """The devices that are emulated, by name."""
-        return self.prototype.devices
+    def __init__(self, system: System, prototype: Prototype, clock: Clock) -> None:
+        self.ecs = EmbeddedControlSystem(system)
+        self.model = DigitalModel()
+        self.prototype = prototype
+        self.real = tuple(name for name in system.devices if name not in prototype.devices)
+        self._clock = clock
+        driver_commands = self.ecs.command_lists(clock)
+        self.communications = {
+            name: EmulatedCommunication(name, driver_commands[name], emulated.profile.command_list)
+            for name, emulated in prototype.devices.items()
+        }
+        for communication in self.communications.values():
+            communication.check()
 
-    @property
-    def real(self) -> list[str]:
-        """The devices that stand on a bus that the prototype file leaves to the plant. Empty for a prototype proper."""
-        return [name for name in self.ecs.system.devices if name not in self.emulated]
-
-    def check(self, clock: Clock) -> None:
-        """Driver and emulator of every device accept the same commands, or nothing starts (SPEC ruling 12)."""
-        drivers = self.ecs.drivers(clock)
-        for name, emulated in self.emulated.items():
-            check_commands(drivers[name], emulated.profile)
+    def field(self, run_dir: Path) -> FieldSide:
+        """The emulators on their wires, not opened yet. Virtual serial ports get their links in `run_dir`."""
+        return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock)

@@ -53,6 +53,18 @@ class Busy(Refusal):
     code = 6
 
 
+class NegativeAcknowledge(Refusal):
+    """A program function that cannot be performed (PI-MBUS-300; counted as NAK, SL appendix A)."""
+
+    code = 7
+
+
+class MemoryParityError(Refusal):
+    """A file record failed its consistency check (AP 7)."""
+
+    code = 8
+
+
 class RegisterBank(ABC):
     """What a unit reads and writes. Addresses are as sent (0 to 65535), bits are 0 or 1, registers 0 to 65535.
 
@@ -94,6 +106,23 @@ class Span:
 OnWrite = Callable[[Table, int, tuple[int, ...], int], None]
 
 
+@dataclass(frozen=True, slots=True)
+class CellHooks:
+    """What one cell does when a master touches it; each is called with ``(value, now_ns)``.
+
+    `reading` is told what the cell holds and says what the master gets: a live value, or the old one of a cell that clears
+    itself. `checking` may raise a `Refusal` before anything of the request has changed. `written` has the effect: it comes
+    when all cells of the request hold their values, in the order of their addresses, and may set others (`MapBank.poke`).
+    """
+
+    reading: Callable[[int, int], int] | None = None
+    checking: Callable[[int, int], None] | None = None
+    written: Callable[[int, int], None] | None = None
+
+
+_NO_HOOKS = CellHooks()
+
+
 class MapBank(RegisterBank):
     """Plain cells in declared spans, all zero at first. Gaps between spans do not exist: exception 02.
 
@@ -106,6 +135,7 @@ class MapBank(RegisterBank):
         self._readable: set[tuple[Table, int]] = set()
         self._writable: set[tuple[Table, int]] = set()
         self._on_write = on_write
+        self._hooks: dict[tuple[Table, int], CellHooks] = {}
         for span in spans:
             self._declare(span)
 
@@ -120,16 +150,41 @@ class MapBank(RegisterBank):
             if span.access != "ro" and span.table in WRITABLE_TABLES:
                 self._writable.add(cell)
 
+    def hook(self, table: Table, address: int, hooks: CellHooks) -> None:
+        """Give a cell side effects, in place of those that it had. Raises `IllegalAddress` where there is none."""
+        self._require([(table, address)], self._cells, "hooked")
+        self._hooks[table, address] = hooks
+
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
         cells = [(table, a) for a in range(address, address + count)]
         self._require(cells, self._readable, "read")
-        return [self._cells[cell] for cell in cells]
+        values = [self._cells[cell] for cell in cells]
+        if self._hooks:
+            for i, cell in enumerate(cells):
+                reading = self._hooks.get(cell, _NO_HOOKS).reading
+                if reading is not None:
+                    values[i] = reading(values[i], now_ns)
+        return values
+
+    def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
+        self._require([(table, a) for a in range(address, address + count)], self._readable, "read")
 
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
         self._require([(table, a) for a in range(address, address + len(values))], self._writable, "written")
+        touched = [
+            (self._hooks[table, a], v)
+            for a, v in enumerate(values, address)
+            if self._hooks and (table, a) in self._hooks
+        ]
+        for hooks, value in touched:
+            if hooks.checking is not None:
+                hooks.checking(value, now_ns)
         if self._on_write is not None:
             self._on_write(table, address, tuple(values), now_ns)
         self.poke(table, address, *values)
+        for hooks, value in touched:
+            if hooks.written is not None:
+                hooks.written(value, now_ns)
 
     def peek(self, table: Table, address: int) -> int:
         """The device's own view of a cell, whatever its access. Raises `IllegalAddress` where there is none."""

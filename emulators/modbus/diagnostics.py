@@ -1,4 +1,4 @@
-"""What a unit counts, and function 08h that reads and clears it (AP 6.8; SL appendix A, CPT1 to CPT8).
+"""What a unit counts, and the functions that read and clear it: 07, 08, 0B and 0Ch (AP 6.7 to 6.10; SL appendix A).
 
 Two views of one set of numbers: `UnitCounters` only grow (they are evidence), a master's view starts at its last clear.
 """
@@ -8,10 +8,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from emulators.modbus.bank import IllegalFunction, IllegalValue
+from emulators.modbus.event_log import ENTERED_LISTEN_ONLY, RESTARTED, EventLog
 
 RETURN_QUERY_DATA = 0x00
 RESTART = 0x01
 DIAGNOSTIC_REGISTER = 0x02
+CHANGE_DELIMITER = 0x03
 LISTEN_ONLY = 0x04
 CLEAR_COUNTERS = 0x0A
 CLEAR_OVERRUN = 0x14
@@ -37,6 +39,12 @@ class UnitCounters:
     """Exception responses with code 06 (CPT7)."""
     unanswered: int = 0
     """Heard and not answered: broadcasts, listen-only (CPT5)."""
+    completed: int = 0
+    """Carried out without an exception, broadcasts included; not those that fetch events (AP 6.9)."""
+    naks: int = 0
+    """Exception responses with code 07 (CPT6)."""
+    overruns: int = 0
+    """Messages that came faster than they could be taken (CPT8). Only a fault makes one: nothing here can overrun."""
 
     @property
     def messages(self) -> int:
@@ -54,16 +62,27 @@ _READABLE = {
     0x11: "busy",
     0x12: "overruns",
 }
-_ALWAYS_ZERO = frozenset({"naks", "overruns"})
-"""No emulated unit answers NAK (it never programs itself), and nothing between us and the buffer can overrun."""
+_RESTARTS = (b"\x08\x00\x01\x00\x00", b"\x08\x00\x01\xff\x00")
+_UNCOUNTED = (0x0B, 0x0C)
+_LINE_FEED = 0x0A
+_FRAME_CHARACTERS = frozenset(b":0123456789ABCDEFabcdef\r")
+"""What can stand inside an ASCII frame, and so cannot end one."""
 
 
 class Diagnostics:
-    """Function 08h of one unit."""
+    """Functions 07, 08, 0B and 0C of one unit.
+
+    `status` are the eight outputs of function 07, `register` is what 08/02 reads; both are the device's to set.
+    `delimiter` is the character that ends ASCII frames in place of LF once 08/03 said so.
+    """
 
     def __init__(self, counters: UnitCounters) -> None:
         self.counters = counters
+        self.log = EventLog()
         self.listen_only = False
+        self.status = 0
+        self.register = 0
+        self.delimiter = _LINE_FEED
         self._cleared = UnitCounters()
 
     def clear(self) -> None:
@@ -72,11 +91,15 @@ class Diagnostics:
 
     def wakes(self, pdu: bytes) -> bool:
         """Whether `pdu` is the one request that ends listen-only mode: 08/01. It does so, and is not answered."""
-        if pdu not in (b"\x08\x00\x01\x00\x00", b"\x08\x00\x01\xff\x00"):
+        if pdu not in _RESTARTS:
             return False
-        self.listen_only = False
-        self.clear()
+        self._restart(pdu)
         return True
+
+    def completed(self, pdu: bytes) -> None:
+        """A request was carried out."""
+        if pdu[0] not in _UNCOUNTED and pdu[:3] not in (b"\x08\x00\x01", b"\x08\x00\x0a"):
+            self.counters.completed += 1
 
     def respond(self, pdu: bytes) -> bytes | None:
         """The answer to an 08h request, None where the standard wants none. Raises `Refusal`."""
@@ -88,28 +111,75 @@ class Diagnostics:
         if sub not in _READABLE and sub not in (
             RESTART,
             DIAGNOSTIC_REGISTER,
+            CHANGE_DELIMITER,
             LISTEN_ONLY,
             CLEAR_COUNTERS,
             CLEAR_OVERRUN,
         ):
             raise IllegalFunction(f"diagnostic sub-function {sub:04X}h")
-        if pdu[3:] != b"\x00\x00" and not (sub == RESTART and pdu[3:] == b"\xff\x00"):
+        if sub == CHANGE_DELIMITER:
+            return self._change_delimiter(pdu)
+        if pdu[3:] != b"\x00\x00" and pdu not in _RESTARTS:
             raise IllegalValue("diagnostic data field", expected="0000h", got=pdu[3:].hex())
         return self._execute(sub, pdu)
 
+    def exception_status(self, pdu: bytes) -> bytes:
+        """Function 07."""
+        _require_bare(pdu)
+        return bytes((pdu[0], self.status & 0xFF))
+
+    def event_counter(self, pdu: bytes, processing: bool) -> bytes:
+        """Function 0B. `processing`: a program command of before is still under way."""
+        _require_bare(pdu)
+        return pdu[:1] + self._status_and_count(processing)
+
+    def event_log(self, pdu: bytes, processing: bool) -> bytes:
+        """Function 0C."""
+        _require_bare(pdu)
+        data = self._status_and_count(processing) + _word(self._since_clear("bus_messages")) + self.log.content
+        return bytes((pdu[0], len(data))) + data
+
     def _execute(self, sub: int, pdu: bytes) -> bytes | None:
-        if sub in (RESTART, CLEAR_COUNTERS):
+        if sub == RESTART:
+            self._restart(pdu)
+            return pdu
+        if sub == CLEAR_COUNTERS:
             self.clear()
+            self.register = 0
             return pdu
         if sub == LISTEN_ONLY:
             self.listen_only = True
+            self.log.note(ENTERED_LISTEN_ONLY)
             return None
         if sub == CLEAR_OVERRUN:
+            self._cleared.overruns = self.counters.overruns
             return pdu
-        value = 0 if sub == DIAGNOSTIC_REGISTER else self._since_clear(_READABLE[sub])
-        return pdu[:3] + (value & 0xFFFF).to_bytes(2, "big")
+        return pdu[:3] + _word(self.register if sub == DIAGNOSTIC_REGISTER else self._since_clear(_READABLE[sub]))
+
+    def _restart(self, pdu: bytes) -> None:
+        self.listen_only = False
+        self.clear()
+        if pdu[3] == 0xFF:
+            self.log.clear()
+        self.log.note(RESTARTED)
+
+    def _change_delimiter(self, pdu: bytes) -> bytes:
+        if len(pdu) != 5 or pdu[4] or pdu[3] > 0x7F or pdu[3] in _FRAME_CHARACTERS:
+            raise IllegalValue("delimiter", expected="a character and 00h", got=pdu[3:].hex())
+        self.delimiter = pdu[3]
+        return pdu
+
+    def _status_and_count(self, processing: bool) -> bytes:
+        return (b"\xff\xff" if processing else b"\x00\x00") + _word(self._since_clear("completed"))
 
     def _since_clear(self, name: str) -> int:
-        if name in _ALWAYS_ZERO:
-            return 0
         return int(getattr(self.counters, name)) - int(getattr(self._cleared, name))
+
+
+def _require_bare(pdu: bytes) -> None:
+    if len(pdu) != 1:
+        raise IllegalValue("length of the request", expected="1 byte", got=str(len(pdu)))
+
+
+def _word(value: int) -> bytes:
+    return (value & 0xFFFF).to_bytes(2, "big")

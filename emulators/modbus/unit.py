@@ -1,72 +1,58 @@
 """One Modbus unit: request PDU in, response PDU out (MODBUS Application Protocol V1.1b3, AP below).
 
 Pure. It never knows unit ids, check sums, transaction ids or what carries it; what the registers mean is the bank's
-business. Checks go in the order of the flow charts of AP 6: function (01), quantities and lengths (03), addresses
-(02), then execution. A refused request has changed nothing.
+business. Each function is in a module of its own; here they are chosen, refused, counted and logged.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
-from emulators.modbus.bank import (
-    ADDRESSES,
-    Busy,
-    IllegalAddress,
-    IllegalFunction,
-    IllegalValue,
-    Refusal,
-    RegisterBank,
-    Table,
-)
+from emulators.modbus.bank import Busy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
 from emulators.modbus.diagnostics import Diagnostics, UnitCounters
+from emulators.modbus.fifo import FifoQueues
+from emulators.modbus.file_records import FileRecords
+from emulators.modbus.identification import Identification
+from emulators.modbus.register_functions import (
+    STANDARD_FUNCTIONS,
+    TABLES,
+    RegisterFunctions,
+    UnitLimits,
+    require_length,
+)
 from gateway.core.errors import UsageError
 
-ALL_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F, 0x10, 0x11, 0x16, 0x17})
-BROADCAST_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x16})
+__all__ = ["ALL_FUNCTIONS", "Handler", "ModbusUnit", "UnitLimits"]
+
+ALL_FUNCTIONS = STANDARD_FUNCTIONS
+BROADCAST_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16})
 """What may come as a broadcast: writes that ask for no data back (SL 2.4.1)."""
+_WHILE_BUSY = frozenset({0x08, 0x0B, 0x0C})
+"""What a busy unit still answers: how a master finds out that it is busy (AP 6.9)."""
 
-_TABLES: dict[int, Table] = {0x01: "coil", 0x02: "discrete", 0x03: "holding", 0x04: "input"}
-
-
-@dataclass(frozen=True, slots=True)
-class UnitLimits:
-    """What a device of this kind supports; the defaults are the protocol's own limits (AP 6).
-
-    `even_only`: values take two registers and half a value is refused: an odd count with 03, an odd address with 02.
-    """
-
-    functions: frozenset[int] = ALL_FUNCTIONS
-    read_registers: int = 125
-    write_registers: int = 123
-    read_bits: int = 2000
-    write_bits: int = 1968
-    even_only: bool = False
-
-    def __post_init__(self) -> None:
-        for name, most in (
-            ("read_registers", 125),
-            ("write_registers", 123),
-            ("read_bits", 2000),
-            ("write_bits", 1968),
-        ):
-            if not 1 <= getattr(self, name) <= most:
-                raise UsageError(f"limit {name}", expected=f"1 to {most}", got=str(getattr(self, name)))
-        if not self.functions <= ALL_FUNCTIONS:
-            unknown = sorted(self.functions - ALL_FUNCTIONS)
-            raise UsageError("a function that emulated units do not have", got=", ".join(f"{f:02X}h" for f in unknown))
+Handler = Callable[[bytes, int], bytes | None]
+"""``(pdu, now_ns)`` -> the response PDU, None for silence. May raise a `Refusal`, then it has changed nothing."""
 
 
 class ModbusUnit:
-    """A unit's functions over a bank. `server_id` is the data of function 11h; None: the unit has no such function.
+    """A unit's functions over a bank. Without `server_id` (the data of 11h), `identification` (2Bh), `files` (14h, 15h) or
+    `fifos` (18h) it has no such function; without `limits` it has all others.
 
     Use `respond` for a request to the unit, `execute_broadcast` for one to unit 0 of a serial line. `counters` grow
-    with both; a line tells by `heard` what else went over it.
+    with both; a line tells by `heard` what else went over it. `latency_s` is how long the unit thinks about what it
+    answered last. `running` is the run indicator of 11h.
     """
 
     def __init__(
-        self, bank: RegisterBank, limits: UnitLimits | None = None, server_id: bytes | None = None, name: str = ""
+        self,
+        bank: RegisterBank,
+        limits: UnitLimits | None = None,
+        server_id: bytes | None = None,
+        name: str = "",
+        *,
+        identification: Identification | None = None,
+        files: FileRecords | None = None,
+        fifos: FifoQueues | None = None,
     ) -> None:
         if server_id is not None and len(server_id) > 249:
             raise UsageError("server id", expected="at most 249 bytes", got=str(len(server_id)))
@@ -75,20 +61,55 @@ class ModbusUnit:
         self.name = name
         self.counters = UnitCounters()
         self.diagnostics = Diagnostics(self.counters)
+        self.files = files
+        self.fifos = fifos
+        self.latency_s = 0.0
+        self.running = True
         self._server_id = server_id
-        self._functions = self.limits.functions - (frozenset() if server_id is not None else {0x11})
-        read: Callable[[bytes, int], bytes | None] = self._read
-        self._handlers: dict[int, Callable[[bytes, int], bytes | None]] = {
-            **dict.fromkeys(_TABLES, read),
-            0x05: self._write_coil,
-            0x06: self._write_register,
+        self._busy_until_ns = 0
+        self._broadcasts = set(BROADCAST_FUNCTIONS)
+        self._handlers = {f: h for f, h in self._standard(identification).items() if f in self.limits.functions}
+
+    def _standard(self, identification: Identification | None) -> dict[int, Handler]:
+        cells = RegisterFunctions(self.bank, self.limits)
+        read: Handler = cells.read
+        handlers: dict[int, Handler] = {
+            **dict.fromkeys(TABLES, read),
+            0x05: cells.write_coil,
+            0x06: cells.write_register,
+            0x07: lambda pdu, now_ns: self.diagnostics.exception_status(pdu),
             0x08: lambda pdu, now_ns: self.diagnostics.respond(pdu),
-            0x0F: self._write_coils,
-            0x10: self._write_registers,
-            0x11: self._report_server_id,
-            0x16: self._mask_write,
-            0x17: self._read_write,
+            0x0B: lambda pdu, now_ns: self.diagnostics.event_counter(pdu, now_ns < self._busy_until_ns),
+            0x0C: lambda pdu, now_ns: self.diagnostics.event_log(pdu, now_ns < self._busy_until_ns),
+            0x0F: cells.write_coils,
+            0x10: cells.write_registers,
+            0x16: cells.mask_write,
+            0x17: cells.read_write,
         }
+        if self._server_id is not None:
+            handlers[0x11] = self._report_server_id
+        if self.files is not None:
+            handlers |= {0x14: self.files.respond_read, 0x15: self.files.respond_write}
+        if self.fifos is not None:
+            handlers[0x18] = self.fifos.respond
+        if identification is not None:
+            handlers[0x2B] = identification.respond
+        return handlers
+
+    def register(self, function: int, handler: Handler, *, broadcast: bool = False) -> None:
+        """Answer `function` (1 to 127) with `handler` from now on, a standard one too: devices have their own ways.
+
+        `broadcast`: it is also executed when it comes to unit 0 of a serial line.
+        """
+        if not 1 <= function <= 0x7F:
+            raise UsageError("function code", expected="1 to 127", got=str(function))
+        self._handlers[function] = handler
+        if broadcast:
+            self._broadcasts.add(function)
+
+    def be_busy(self, until_ns: int) -> None:
+        """Answer with exception 06 until `until_ns` of the emulator's time; functions 08, 0B and 0C still work."""
+        self._busy_until_ns = until_ns
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
         """Execute a request to this unit and return its response, exception responses included.
@@ -102,29 +123,49 @@ class ModbusUnit:
         """Like `respond`, for a request that comes while too many are under way: exception 06, nothing executed."""
         return self._counted(pdu, 0, busy=True)
 
+    def refuse_function(self, pdu: bytes) -> bytes | None:
+        """Like `respond`, for a request that the sender may not make: exception 01, nothing executed."""
+        self.counters.requests += 1
+        if not pdu or pdu[0] >= 0x80 or self.diagnostics.listen_only:
+            self.counters.unanswered += 1
+            return None
+        self.counters.exceptions += 1
+        self.counters.replies += 1
+        return bytes((pdu[0] | 0x80, IllegalFunction.code))
+
     def execute_broadcast(self, pdu: bytes, now_ns: int) -> None:
         """Execute a request to unit 0 and say nothing; reads and refused writes have no effect."""
         self.counters.broadcasts += 1
         self.counters.unanswered += 1
-        if self.diagnostics.listen_only or not pdu or pdu[0] not in BROADCAST_FUNCTIONS & self._functions:
+        listening = self.diagnostics.listen_only
+        self.diagnostics.log.note_received(listening=listening, broadcast=True)
+        if listening or not pdu or pdu[0] not in self._broadcasts or now_ns < self._busy_until_ns:
+            return
+        handler = self._handlers.get(pdu[0])
+        if handler is None:
             return
         try:
-            self._handlers[pdu[0]](pdu, now_ns)
+            handler(pdu, now_ns)
         except Refusal:
-            pass  # nobody is answered, nothing was changed: SL 2.4.1
+            return  # nobody is answered, nothing was changed: SL 2.4.1
+        self.diagnostics.completed(pdu)
 
     def heard(self, messages: int = 0, errors: int = 0) -> None:
         """The line carried so many whole and damaged frames, for whomever."""
         self.counters.bus_messages += messages
         self.counters.bus_errors += errors
+        for _ in range(errors):
+            self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, damaged=True)
 
     def _counted(self, pdu: bytes, now_ns: int, busy: bool) -> bytes | None:
-        self.counters.requests += 1  # first: a request for the counters counts itself
+        self.counters.requests += 1  # first: a request for the counters or the log finds itself there
+        self.diagnostics.log.note_received(listening=self.diagnostics.listen_only)
         response = self._answer(pdu, now_ns, busy)
         if response is None:
             self.counters.unanswered += 1
         else:
             self.counters.replies += 1
+            self.diagnostics.log.note_sent(response)
         return response
 
     def _answer(self, pdu: bytes, now_ns: int, busy: bool) -> bytes | None:
@@ -134,141 +175,21 @@ class ModbusUnit:
             self.diagnostics.wakes(pdu)
             return None
         try:
-            if busy:
+            if busy or (now_ns < self._busy_until_ns and pdu[0] not in _WHILE_BUSY):
                 raise Busy("too many requests under way")
-            if pdu[0] not in self._functions:
+            handler = self._handlers.get(pdu[0])
+            if handler is None:
                 raise IllegalFunction(f"function {pdu[0]:02X}h")
-            return self._handlers[pdu[0]](pdu, now_ns)
+            response = handler(pdu, now_ns)
         except Refusal as refusal:
             self.counters.exceptions += 1
             self.counters.busy += isinstance(refusal, Busy)
+            self.counters.naks += isinstance(refusal, NegativeAcknowledge)
             return bytes((pdu[0] | 0x80, refusal.code))
-
-    # -- functions, AP 6.1 to 6.17 --------------------------------------------------------------------------------
-
-    def _read(self, pdu: bytes, now_ns: int) -> bytes:
-        table = _TABLES[pdu[0]]
-        _require_length(pdu, 5)
-        address, count = _words(pdu[1:5])
-        if pdu[0] <= 0x02:
-            _require_count(count, self.limits.read_bits)
-            _require_range(address, count)
-            data = _pack_bits(self.bank.read(table, address, count, now_ns))
-        else:
-            self._require_registers(address, count, self.limits.read_registers)
-            data = _pack_words(self.bank.read(table, address, count, now_ns))
-        return bytes((pdu[0], len(data))) + data
-
-    def _write_coil(self, pdu: bytes, now_ns: int) -> bytes:
-        _require_length(pdu, 5)
-        address, value = _words(pdu[1:5])
-        if value not in (0x0000, 0xFF00):
-            raise IllegalValue("coil value", expected="0000h or FF00h", got=f"{value:04X}h")
-        self.bank.write("coil", address, [value >> 15], now_ns)
-        return pdu
-
-    def _write_register(self, pdu: bytes, now_ns: int) -> bytes:
-        _require_length(pdu, 5)
-        address, value = _words(pdu[1:5])
-        self._require_registers(address, 1, 1)
-        self.bank.write("holding", address, [value], now_ns)
-        return pdu
-
-    def _write_coils(self, pdu: bytes, now_ns: int) -> bytes:
-        address, count, data = _block(pdu, 1)
-        _require_count(count, self.limits.write_bits)
-        if len(data) != (count + 7) // 8:
-            raise IllegalValue("byte count", expected=str((count + 7) // 8), got=str(len(data)))
-        _require_range(address, count)
-        self.bank.write("coil", address, [data[i // 8] >> i % 8 & 1 for i in range(count)], now_ns)
-        return pdu[:5]
-
-    def _write_registers(self, pdu: bytes, now_ns: int) -> bytes:
-        address, count, data = _block(pdu, 1)
-        _require_words(data, count)
-        self._require_registers(address, count, self.limits.write_registers)
-        self.bank.write("holding", address, _words(data), now_ns)
-        return pdu[:5]
+        self.diagnostics.completed(pdu)
+        return response
 
     def _report_server_id(self, pdu: bytes, now_ns: int) -> bytes:
-        _require_length(pdu, 1)
-        data = (self._server_id or b"") + b"\xff"  # run indicator: on (AP 6.13)
+        require_length(pdu, 1)
+        data = (self._server_id or b"") + (b"\xff" if self.running else b"\x00")  # run indicator (AP 6.13)
         return bytes((pdu[0], len(data))) + data
-
-    def _mask_write(self, pdu: bytes, now_ns: int) -> bytes:
-        _require_length(pdu, 7)
-        address, keep, put = _words(pdu[1:7])
-        self._require_registers(address, 1, 1)
-        (current,) = self.bank.read("holding", address, 1, now_ns)
-        self.bank.write("holding", address, [(current & keep) | (put & ~keep & 0xFFFF)], now_ns)
-        return pdu
-
-    def _read_write(self, pdu: bytes, now_ns: int) -> bytes:
-        if len(pdu) < 10:
-            raise IllegalValue("request is too short", got=f"{len(pdu)} bytes")
-        read_address, read_count = _words(pdu[1:5])
-        write_address, write_count, data = _block(pdu, 5)
-        _require_count(read_count, self.limits.read_registers)
-        # AP 6.17 allows 121 registers to be written here, two fewer than function 10h
-        _require_count(write_count, min(self.limits.write_registers, 121))
-        _require_words(data, write_count)
-        self._require_registers(read_address, read_count, self.limits.read_registers)
-        self._require_registers(write_address, write_count, self.limits.write_registers)
-        self.bank.check_read("holding", read_address, read_count, now_ns)  # refused as a whole, before the write
-        self.bank.write("holding", write_address, _words(data), now_ns)
-        values = _pack_words(self.bank.read("holding", read_address, read_count, now_ns))
-        return bytes((pdu[0], len(values))) + values
-
-    def _require_registers(self, address: int, count: int, most: int) -> None:
-        """03 before 02. A single write (most == 1) of half a value is the device's own affair."""
-        _require_count(count, most)
-        pairs = self.limits.even_only and most > 1
-        if pairs and count % 2:
-            raise IllegalValue("half a value", expected="an even count", got=str(count))
-        _require_range(address, count)
-        if pairs and address % 2:
-            raise IllegalAddress("half a value", expected="an even address", got=str(address))
-
-
-def _words(data: bytes) -> list[int]:
-    return [data[i] << 8 | data[i + 1] for i in range(0, len(data), 2)]
-
-
-def _pack_words(values: Sequence[int]) -> bytes:
-    return b"".join(value.to_bytes(2, "big") for value in values)
-
-
-def _pack_bits(values: Sequence[int]) -> bytes:
-    """First bit in the lowest place of the first byte, the last byte filled up with zeros (AP 6.1)."""
-    data = bytearray((len(values) + 7) // 8)
-    for i, value in enumerate(values):
-        data[i // 8] |= bool(value) << i % 8
-    return bytes(data)
-
-
-def _block(pdu: bytes, at: int) -> tuple[int, int, bytes]:
-    """Address, count and data of a write of several cells; the byte count must be that of the data (row MB-040)."""
-    if len(pdu) < at + 5 or pdu[at + 4] != len(pdu) - at - 5:
-        raise IllegalValue("byte count and length differ", got=f"{len(pdu)} bytes")
-    address, count = _words(pdu[at : at + 4])
-    return address, count, pdu[at + 5 :]
-
-
-def _require_length(pdu: bytes, length: int) -> None:
-    if len(pdu) != length:
-        raise IllegalValue("length of the request", expected=f"{length} bytes", got=str(len(pdu)))
-
-
-def _require_count(count: int, most: int) -> None:
-    if not 1 <= count <= most:
-        raise IllegalValue("quantity", expected=f"1 to {most}", got=str(count))
-
-
-def _require_words(data: bytes, count: int) -> None:
-    if len(data) != 2 * count:
-        raise IllegalValue("byte count", expected=str(2 * count), got=str(len(data)))
-
-
-def _require_range(address: int, count: int) -> None:
-    if address + count > ADDRESSES:
-        raise IllegalAddress("beyond the end of the table", got=f"{count} from {address}")

@@ -50,7 +50,9 @@ ROWS = [
     pytest.param("08 00 00" + " 11" * 20, "08 00 00" + " 11" * 20, id="echo of more than two bytes"),
     pytest.param("08 00 00", "08 00 00", id="echo of nothing"),
     pytest.param("08 00 02 00 00", "08 00 02 00 00", id="diagnostic register"),
-    pytest.param("08 00 03 00 00", "88 01", id="sub-function that is not there"),
+    pytest.param("08 00 05 00 00", "88 01", id="sub-function that is not there"),
+    pytest.param("08 00 03 3B 00", "08 00 03 3B 00", id="AP-6.8 delimiter"),
+    pytest.param("08 00 03 41 00", "88 03", id="a delimiter that is a digit"),
     pytest.param("08 00 0B 00 01", "88 03", id="diagnostic data field not 0"),
     pytest.param("08 00", "88 03", id="no sub-function"),
     pytest.param("0F 00 13 00 0A 02 CD 01", "0F 00 13 00 0A", id="AP-6.11 coils"),
@@ -161,8 +163,8 @@ def test_limits_of_the_profile(request_hex: str, expected: str) -> None:
 def test_limits_beyond_the_protocol_are_refused() -> None:
     with pytest.raises(UsageError, match="1 to 125"):
         UnitLimits(read_registers=126)
-    with pytest.raises(UsageError, match="2Bh"):
-        UnitLimits(functions=frozenset({0x2B}))
+    with pytest.raises(UsageError, match="80h"):
+        UnitLimits(functions=frozenset({0x80}))
 
 
 def test_mb_041_a_veto_of_the_device_changes_nothing() -> None:

@@ -1,0 +1,46 @@
+"""The communication event log of a unit, which function 0Ch hands out (AP 6.10).
+
+Pure bookkeeping: one byte an event, the youngest first, at most 64. What is older is forgotten, as the standard has it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+MAX_EVENTS = 64
+
+RESTARTED = 0x00
+ENTERED_LISTEN_ONLY = 0x04
+RECEIVED, DAMAGED, WHILE_LISTENING, BROADCAST = 0x80, 0x02, 0x20, 0x40
+"""A message came in; the others are flags of such an event."""
+SENT = 0x40
+_SENT_FLAGS = {1: 0x01, 2: 0x01, 3: 0x01, 4: 0x02, 5: 0x04, 6: 0x04, 7: 0x08}
+"""Exception code -> flag of a send event: read exception, abort, busy, program NAK."""
+
+
+class EventLog:
+    """Events as bytes. `content` is what function 0Ch returns."""
+
+    def __init__(self) -> None:
+        self._events: deque[int] = deque(maxlen=MAX_EVENTS)
+
+    @property
+    def content(self) -> bytes:
+        """Event bytes, the youngest first."""
+        return bytes(self._events)
+
+    def note(self, event: int) -> None:
+        """Put an event in front; the 65th pushes the oldest out."""
+        self._events.appendleft(event)
+
+    def note_received(self, *, listening: bool = False, broadcast: bool = False, damaged: bool = False) -> None:
+        """A message arrived; to be called before it is executed."""
+        self.note(RECEIVED | listening * WHILE_LISTENING | broadcast * BROADCAST | damaged * DAMAGED)
+
+    def note_sent(self, response: bytes) -> None:
+        """A response went out; an exception response says which kind."""
+        self.note(SENT | (_SENT_FLAGS.get(response[1], 0) if response[0] & 0x80 else 0))
+
+    def clear(self) -> None:
+        """Forget all events."""
+        self._events.clear()

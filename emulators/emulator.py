@@ -1,50 +1,116 @@
-"""The paper's Emulator: a Device whose answers come from a virtual context (SPEC rows Emulator, SensorEmulator).
+"""The paper's emulators: devices that answer from their virtual context instead of the world.
 
-In its pure form, request bits in and recorded response bits out, each recording returned once. What an emulator is on a real
-protocol, with registers and time, is built on the same context: emulators.replay for recorded exchanges, emulators.models for
-devices that follow recorded signals.
+An emulator is a Device and no Sensor: the real one is a black box, of which only the conversation is known. Between the frames
+of a line (emulators.modbus.rtu, mbap) and what a unit does with a request (emulators.modbus.unit, emulators.replay), here is
+the device that the paper speaks of: it reads a command from its own end of a wire, requires it to be in its list,
+answers from its context and sends the response. It never knows its driver.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+from abc import ABC
+from collections import Counter
+from collections.abc import Callable, Sized
+from dataclasses import dataclass
 
-from emulators.context import Recorded, VirtualContext, WhenUsedUp
-from gateway.core.connection import RS232Connection
-from gateway.core.device import Device, WireEnd
-from gateway.core.recording import RecordingReader
-from gateway.core.values import COMMAND, RECORDING, RESPONSE
+from emulators.command_names import CommandNames
+from emulators.modbus.bank import RegisterBank
+from emulators.modbus.unit import ModbusUnit, UnitLimits
+from gateway.core.connection import PROTOCOL, Connection
+from gateway.core.device import Communication, Device, End, wire
+from gateway.core.errors import UnknownCommand
+from gateway.core.profile import DeviceProfile
+from gateway.core.values import COMMAND, RECORDING
+
+Answer = Callable[[bytes, int], bytes | None]
+"""``(request, now_ns) -> response``, None for silence: what a unit does with a request PDU."""
 
 
-class Emulator(Device):
-    """A Device, and not a Sensor: the real one is a black box. `virtual_context` is a collection of RECORDINGs.
+class Emulator(Device, ABC):
+    """SPEC row Emulator. `virtual_context` is a collection of recordings, empty where a simulation stands for it.
 
-    ExecuteCommand requires the command to be in the list, returns one recording of the context and removes it.
+    Recorded responses are returned in order and removed (`emulators.context.VirtualContext`); recorded signals are read at the
+    emulator's clock and stay (SPEC ruling 3).
     """
 
-    def __init__(self, connection: WireEnd, context: VirtualContext) -> None:
-        super().__init__(connection, context.command_list)
-        self.virtual_context = context
-
-    def _execute(self, command: COMMAND) -> RESPONSE:
-        return self.virtual_context.take(command)
-
-
-class SensorEmulator(Emulator):
-    """An Emulator on RS232."""
-
-    wire_types = frozenset({RS232Connection.type})
+    def __init__(self, connection: End[bytes], profile: DeviceProfile, virtual_context: Sized) -> None:
+        super().__init__(connection, profile.command_list)
+        self.virtual_context = virtual_context
+        self.executed: Counter[str] = Counter()
+        """How often each command of the list was executed."""
 
 
-def context_of(recording: Path, unit: int, when_used_up: WhenUsedUp = WhenUsedUp.HOLD) -> VirtualContext:
-    """The virtual context that a recording of exchanges holds for one unit: request bits to response bits, in order.
+class UnitEmulator(Emulator):
+    """The emulator of a Modbus device: messages are request and response PDUs. An empty response is silence."""
 
-    Exchanges without a reply are left out. Raises `FileInvalid`.
+    wire_types = frozenset({PROTOCOL.RS232, PROTOCOL.TCP})
+
+    def __init__(self, connection: End[bytes], profile: DeviceProfile, virtual_context: Sized, answer: Answer) -> None:
+        super().__init__(connection, profile, virtual_context)
+        self._names = CommandNames(profile)
+        self._answer = answer
+
+    def recognise(self, data: bytes) -> COMMAND:
+        return COMMAND(data, self._names.of(data))
+
+    def _execute(self, command: COMMAND, now_ns: int) -> RECORDING:
+        self.executed[command.name] += 1
+        return RECORDING(self._answer(command.data, now_ns) or b"")
+
+
+class SensorEmulator(UnitEmulator):
+    """SPEC row SensorEmulator: on RS232, as the sensor that it stands for."""
+
+    wire_types = frozenset({PROTOCOL.RS232})
+
+
+class TransmitterEmulator(UnitEmulator):
+    """What stands for a transmitter: on TCP."""
+
+    wire_types = frozenset({PROTOCOL.TCP})
+
+
+def emulator_kind(kind: PROTOCOL, profile: DeviceProfile) -> type[UnitEmulator]:
+    """The emulator that a profile on a kind of wire asks for; the counterpart of the gateway's choice of drivers."""
+    if profile.inbox is not None:
+        return TransmitterEmulator
+    return SensorEmulator if kind is PROTOCOL.RS232 else UnitEmulator
+
+
+class EmulatedUnit(ModbusUnit):
+    """A unit of an emulated line whose requests go through the device's own connection.
+
+    `kind` is the wire of the device that it stands for, whatever carries it now. A request that is no command of the list
+    gets the protocol's own answer (SPEC ruling 11), and is counted in `unlisted`.
     """
-    context = VirtualContext(when_used_up=when_used_up)
-    with RecordingReader(recording) as reader:
-        for exchange in reader.exchanges():
-            if exchange.unit == unit and exchange.reply:
-                recorded = Recorded(exchange.t_s, RECORDING(exchange.reply), exchange.latency_s)
-                context.add(COMMAND(exchange.request), recorded)
-    return context
+
+    def __init__(
+        self,
+        bank: RegisterBank,
+        profile: DeviceProfile,
+        kind: type[Connection[bytes]],
+        virtual_context: Sized,
+        limits: UnitLimits | None = None,
+        name: str = "",
+    ) -> None:
+        super().__init__(bank, limits, name=name)
+        end, self._line = wire(kind)
+        self.emulator = emulator_kind(end.type, profile)(end, profile, virtual_context, super().respond)
+        self.unlisted = 0
+
+    def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
+        self._line.write(pdu)
+        try:
+            self.emulator.receive(now_ns)
+        except UnknownCommand:
+            self.unlisted += 1
+            return super().respond(pdu, now_ns)
+        return self._line.read() or None
+
+
+@dataclass(frozen=True)
+class EmulatedCommunication(Communication):
+    """SPEC row EmulatedCommunication: the same agreement, with an emulator in the device's place.
+
+    What lies between the two is an EmulatedConnection (`emulators.link`), which belongs to neither and is asked for nothing here.
+    """

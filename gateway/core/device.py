@@ -1,97 +1,128 @@
-"""The paper's Device, and the wire between it and its driver (SPEC rows Device, Sensor, Transmitter; ruling 4).
+"""The paper's Device: what stands at the far end of a connection, and the agreement between it and its driver.
 
-A wire is a duplex medium with two ends: what one end writes, the other reads, first in first out. A device holds one end,
-its driver the other. Pure: no bytes are waited for, nothing is opened. The asynchronous ends of gateway.core.connection wrap the
-same `Connection` streams.
+Pure. A device holds one end of a wire of a concrete kind, has a command list, and answers each command that it reads with one
+response. It knows no driver, no clock (it is passed `now_ns`) and no framing: an item of its connection is a whole message.
+A driver is a stranger to this module (gateway.devices.driver).
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, Generic
 
-from gateway.core.connection import PROTOCOL, Connection, RS232Connection, TCPConnection
-from gateway.core.errors import Bug, UnknownCommand
+from gateway.core.connection import PROTOCOL, Connection, T
+from gateway.core.errors import Bug, CommandListMismatch, UnknownCommand
 from gateway.core.values import COMMAND, RESPONSE
 
 
-class WireEnd:
-    """One end of a wire: reads from one stream, writes to the other."""
+@dataclass(frozen=True, slots=True)
+class End(Generic[T]):
+    """One end of a duplex medium: what the other end wrote is read here, in order (SPEC ruling 4)."""
 
-    def __init__(self, inbound: Connection[bytes], outbound: Connection[bytes]) -> None:
-        if type(inbound) is not type(outbound):
-            raise Bug("a wire of two kinds", expected=inbound.type.value, got=outbound.type.value)
-        self._inbound = inbound
-        self._outbound = outbound
+    inbound: Connection[T]
+    outbound: Connection[T]
 
     @property
     def type(self) -> PROTOCOL:
-        return self._inbound.type
+        return self.inbound.type
 
-    @property
-    def pending(self) -> int:
-        """How many items wait to be read here."""
-        return len(self._inbound.data_stream)
+    def write(self, value: T) -> None:
+        """Send `value` to the other end."""
+        self.outbound.write(value)
 
-    def read(self) -> bytes:
-        """The oldest item that the other end wrote. There must be one."""
-        return self._inbound.read()
-
-    def write(self, data: bytes) -> None:
-        """Append to what the other end reads."""
-        self._outbound.write(data)
+    def read(self) -> T:
+        """Take the oldest item that the other end sent. There must be one."""
+        return self.inbound.read()
 
 
-def wire(kind: type[Connection[bytes]]) -> tuple[WireEnd, WireEnd]:
-    """A new, empty wire of one kind: (the device's end, the driver's end)."""
-    to_device, to_driver = kind(), kind()
-    return WireEnd(to_device, to_driver), WireEnd(to_driver, to_device)
+def wire(kind: type[Connection[T]]) -> tuple[End[T], End[T]]:
+    """Both ends of a new duplex wire: two streams of a concrete kind, each end reading what the other writes."""
+    there, back = kind(), kind()
+    return End(there, back), End(back, there)
 
 
 class Device(ABC):
-    """SPEC row Device: owns one concrete connection; accepts the commands in its list, and there is at least one.
+    """SPEC row Device. Concrete ones name the kinds of wire they may hang on in `wire_types`.
 
-    A concrete device says in `wire_types` what it can be connected by. A command is known by its bits.
+    `command_list` holds names and is never empty. A message is recognised as one command of the list, or as none.
     """
 
-    wire_types: ClassVar[frozenset[PROTOCOL]] = frozenset(PROTOCOL)
+    wire_types: ClassVar[frozenset[PROTOCOL]]
 
-    def __init__(self, connection: WireEnd, command_list: Iterable[COMMAND]) -> None:
-        self.connection = connection
-        self.command_list = tuple(command_list)
-        if not self.command_list:
-            raise Bug("a device without commands", where=type(self).__name__)
+    def __init__(self, connection: End[bytes], command_list: Iterable[str]) -> None:
+        commands = frozenset(command_list)
+        kind = type(self).__name__
         if connection.type not in self.wire_types:
             expected = " or ".join(sorted(t.value for t in self.wire_types))
-            raise Bug("a device on a wire of another kind", expected=expected, got=connection.type.value)
-
-    def execute_command(self, command: COMMAND) -> RESPONSE:
-        """Execute a command of the list; raises `UnknownCommand` for any other."""
-        if all(command.data != known.data for known in self.command_list):
-            raise UnknownCommand("not in the command list", got=command.data.hex(" ") or "no bytes")
-        return self._execute(command)
+            raise Bug(f"a {kind} on another kind of wire", expected=expected, got=connection.type.value)
+        if not commands:
+            raise Bug(f"a {kind} that accepts no command", expected="a command list that is not empty")
+        self.connection = connection
+        self.command_list = commands
 
     @abstractmethod
-    def _execute(self, command: COMMAND) -> RESPONSE:
-        """What the device does with a command that is in its list."""
+    def recognise(self, data: bytes) -> COMMAND:
+        """The command that a message is; its name is empty where it is none that this device knows."""
+
+    @abstractmethod
+    def _execute(self, command: COMMAND, now_ns: int) -> RESPONSE:
+        """Carry out a command of the list."""
+
+    def execute_command(self, command: COMMAND, now_ns: int) -> RESPONSE:
+        """ExecuteCommand. Raises `UnknownCommand`, having done nothing, unless `command` is in the command list."""
+        if command.name not in self.command_list:
+            raise UnknownCommand(
+                f"no command {command.name!r}" if command.name else "a message that is no command",
+                expected=", ".join(sorted(self.command_list)),
+                got=command.data.hex(" ") or "no bytes",
+            )
+        return self._execute(command, now_ns)
 
     def send(self, response: RESPONSE) -> None:
-        """Send: connection.Write."""
+        """Send: write."""
         self.connection.write(response.data)
 
-    def receive(self) -> None:
-        """Receive: connection.Read ; ExecuteCommand ; Send. One response for each command."""
-        self.send(self.execute_command(COMMAND(self.connection.read())))
+    def receive(self, now_ns: int) -> RESPONSE:
+        """Receive: read ; execute ; send. One response per command; what is no command is read and not answered.
+
+        The connection must not be empty. Raises `UnknownCommand`: what follows then is the protocol's (SPEC ruling 11).
+        """
+        command = self.recognise(self.connection.read())
+        response = self.execute_command(command, now_ns)
+        self.send(response)
+        return response
 
 
-class Sensor(Device, ABC):
-    """A device on RS232 (SPEC row Sensor)."""
+class Sensor(Device):
+    """SPEC row Sensor: a device on RS232."""
 
-    wire_types = frozenset({RS232Connection.type})
+    wire_types = frozenset({PROTOCOL.RS232})
 
 
-class Transmitter(Device, ABC):
-    """A device on TCP (SPEC row Transmitter)."""
+class Transmitter(Device):
+    """SPEC row Transmitter: a device on TCP."""
 
-    wire_types = frozenset({TCPConnection.type})
+    wire_types = frozenset({PROTOCOL.TCP})
+
+
+@dataclass(frozen=True)
+class Communication:
+    """SPEC row Communication: a driver and what it talks to accept the same commands, both inclusions (ruling 12)."""
+
+    name: str
+    driver_commands: frozenset[str]
+    device_commands: frozenset[str]
+
+    def check(self) -> None:
+        """Raises `CommandListMismatch` that names what is missing on either side."""
+        if self.driver_commands == self.device_commands:
+            return
+        only_driver = ", ".join(sorted(self.driver_commands - self.device_commands)) or "nothing"
+        only_device = ", ".join(sorted(self.device_commands - self.driver_commands)) or "nothing"
+        raise CommandListMismatch(
+            f"device {self.name!r} and its driver differ in their commands",
+            expected="the same list on both sides",
+            got=f"unknown to the device: {only_driver}; unknown to the driver: {only_device}",
+        )

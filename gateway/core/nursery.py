@@ -51,14 +51,19 @@ class Nursery:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
     ) -> None:
+        me = asyncio.current_task()
+        asked_before = me.cancelling() if me is not None else 0
         failed: BaseException | None = None
         for child in self._children:
             child.cancel()
-            try:
-                await child
-            except asyncio.CancelledError:
-                pass  # that is what was asked for
-            except BaseException as e:  # kept, and raised below unless something else is on its way already
-                failed = failed or e
+            while not child.done():
+                try:
+                    await asyncio.wait([child])
+                except asyncio.CancelledError:
+                    child.cancel()  # somebody cancelled us meanwhile: passed on, and raised below
+            if not child.cancelled():  # kept, and raised below unless something else is on its way already
+                failed = failed or child.exception()
+        if me is not None and me.cancelling() > asked_before:
+            raise asyncio.CancelledError
         if failed is not None and error is None:
             raise failed

@@ -268,7 +268,7 @@ def test_mb_045_identification_in_several_frames(more: dict[int, bytes], vendor:
 
 
 def test_mb_045_more_follows() -> None:
-    objects = {**BASIC, 3: b"u" * 200, 4: b"n" * 240, 0x80: b"x"}
+    objects = {**BASIC, 3: b"u" * 200, 4: b"n" * 240, 0x80: b"x" * 9}
     _, frames = read_stream(make_unit(identification=Identification(objects)), 3)
     assert frames == 3
 

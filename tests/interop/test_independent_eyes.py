@@ -108,7 +108,7 @@ def test_what_a_run_captures(short_dir: Callable[[], Path], tmp_path: Path) -> N
     capture = tmp_path / "capture.jsonl"
     command = [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--for", "3s"]
     ran = subprocess.run(
-        [*command, "--script", "1", "--capture", str(capture)],
+        [*command, "--commands", "1", "--capture", str(capture)],
         capture_output=True,
         text=True,
         timeout=60,

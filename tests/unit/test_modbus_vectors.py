@@ -13,7 +13,6 @@ from gateway.protocols.modbus import diagnostics, files, identity, requests, use
 from gateway.protocols.modbus.framing import Framer
 from gateway.protocols.modbus.mbap import MbapFramer
 from gateway.protocols.modbus.replies import Reply
-from gateway.protocols.modbus.request import Request
 from gateway.protocols.modbus.rtu import RtuFramer
 from gateway.protocols.modbus.transaction import Transaction
 
@@ -26,11 +25,21 @@ def ids(vector: dict[str, Any]) -> str:
     return str(vector["id"])
 
 
-def make_request(spec: list[Any]) -> Request[Any]:
+def make_request(spec: list[Any]) -> Any:
+    """The class that `spec` names, with its arguments; bytes stand as hexadecimal."""
     name, *args = spec
     module = next(m for m in (requests, diagnostics, files, identity, user) if hasattr(m, name))
-    request: Request[Any] = getattr(module, name)(*[tuple(a) if isinstance(a, list) else a for a in args])
-    return request
+    return getattr(module, name)(*[make_argument(name, a) for a in args])
+
+
+def make_argument(name: str, value: Any) -> Any:
+    if isinstance(value, str) and name in ("Loopback", "UserFunction"):
+        return bytes.fromhex(value)
+    if isinstance(value, list):
+        if value and isinstance(value[0], str):
+            return make_request(value)
+        return tuple(make_argument("", v) for v in value)
+    return value
 
 
 def play(vector: dict[str, Any], chunks: list[bytes]) -> tuple[Reply | errors.FieldtwinError, bool]:
@@ -76,6 +85,11 @@ def check(vector: dict[str, Any], chunks: list[bytes]) -> None:
         "acknowledged": getattr(outcome, "acknowledged", None),
         "status": getattr(outcome, "status", None),
         "value": getattr(outcome, "value", None),
+        "event_count": getattr(outcome, "event_count", None),
+        "message_count": getattr(outcome, "message_count", None),
+        "events": getattr(outcome, "events", b"").hex(" "),
+        "records": [list(words) for words in getattr(outcome, "records", ())],
+        "raw": outcome.raw.hex(" "),
         "id_bytes": outcome.raw.hex(" "),
         "objects": [[number, value.hex(" ")] for number, value in getattr(outcome, "objects", ())],
     }

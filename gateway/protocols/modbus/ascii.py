@@ -20,6 +20,9 @@ CHARACTER_GAP_NS = NS_PER_S
 MAX_FRAME = 1 + 2 * (1 + MAX_PDU + 1) + 2
 """Characters of the longest frame: 513 (SL 2.5.2.1)."""
 
+MOST_DAMAGED = 256
+"""Damaged frames that an exchange is searched through for its reply; more is a line that babbles, or no line."""
+
 _REST_NS = 20 * NS_PER_MS  # what a USB adapter may still hold back of a damaged frame
 _START, _END = b":", b"\n"
 
@@ -70,6 +73,9 @@ class AsciiFramer(Framer):
         if self._echo_due and not self._strip_echo():
             return None
         while (request := self._request) is not None and (text := self._next_frame()) is not None:
+            if self._damaged >= MOST_DAMAGED:
+                self._skip(len(self._buffer))
+                return None
             pdu = self._judge(text, request)
             if pdu is not None:
                 return pdu
@@ -100,20 +106,19 @@ class AsciiFramer(Framer):
     def _next_frame(self) -> bytes | None:
         """Cut the next frame off the buffer, from its colon to its LF; what is no frame is noise."""
         buffer = self._buffer
-        while (end := buffer.find(_END)) >= 0:
-            start = buffer.rfind(_START, 0, end)  # the last colon: at a second one the first frame was cut off
-            if start < 0:
-                self._skip(end + 1)
-                continue
-            self._skip(start)
-            text = bytes(buffer[: end - start + 1])
-            del buffer[: end - start + 1]
-            return text
-        start = buffer.rfind(_START)
+        start = buffer.find(_START)
         self._skip(start if start >= 0 else len(buffer))
-        if len(buffer) > MAX_FRAME:
-            self._give_up_frame()
-        return None
+        end = buffer.find(_END)
+        # The last colon counts: at a second one the first frame was cut off.
+        self._skip(max(0, buffer.rfind(_START, 0, end if end >= 0 else len(buffer))))
+        if end < 0:
+            if len(buffer) > MAX_FRAME:
+                self._give_up_frame()
+            return None
+        end = buffer.find(_END) + 1
+        text = bytes(buffer[:end])
+        del buffer[:end]
+        return text
 
     def _judge(self, text: bytes, request: Request[Any]) -> bytes | None:
         """The PDU of a frame of our unit and function; None for a frame that is not ours. Raises as `feed`."""

@@ -25,6 +25,7 @@ from gateway.core.errors import (
     VerifyFailed,
 )
 from gateway.protocols.modbus.framings import Framing, framing_of, make_framer
+from gateway.protocols.modbus.identity import ReadDeviceIdentification
 from gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
 from gateway.protocols.modbus.replies import BitsReply, RegistersReply, Reply, WriteReply
 from gateway.protocols.modbus.request import Request
@@ -200,6 +201,20 @@ class ModbusClient:
         """Write, then read holding registers in one request (17h). Errors as `execute`."""
         request = ReadWriteRegisters(read_address, read_count, write_address, tuple(values))
         return await self.execute(unit, request, timeout_s)
+
+    async def read_identification(
+        self, unit: int, read_code: int = 1, timeout_s: float | None = None
+    ) -> dict[int, bytes]:
+        """All objects of a category (1 basic, 2 regular, 3 extended) by their id, over as many exchanges of 2Bh/0Eh as
+        that takes; the ids go up, so it ends. Errors as `execute`."""
+        objects: dict[int, bytes] = {}
+        request = ReadDeviceIdentification(read_code)
+        while True:
+            reply = await self.execute(unit, request, timeout_s)
+            objects.update(reply.objects)
+            if not reply.more_follows:
+                return objects
+            request = ReadDeviceIdentification(read_code, reply.next_object_id)
 
     async def execute(self, unit: int, request: Request[R], timeout_s: float | None = None) -> R:
         """Send `request` once and return its reply. Waits for its turn and for the line to be silent before.

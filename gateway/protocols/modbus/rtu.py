@@ -25,6 +25,9 @@ USB_LATENCY_NS = 20 * NS_PER_MS
 _IDLE_NOISE = (0x00, 0xFF)
 """What a line that is switched on, idle or not biased is read as (case MB-008)."""
 
+MOST_HUNTED = 8192
+"""Bytes of noise an exchange is searched through for its reply, one by one; more is a line that babbles, or no line."""
+
 _EXCEPTION_FRAME = 5
 _LAST_UNIT = 247
 
@@ -56,6 +59,7 @@ class RtuFramer(Framer):
         self._last_ns = 0
         self._after_foreign = False
         self._garbage = 0
+        self._hunted = 0
         self._wrong_header = ""
         self._seen = ""
 
@@ -69,7 +73,7 @@ class RtuFramer(Framer):
         self._sent = with_crc(bytes([unit]) + request.encode())
         self._echo_due = self._expect_echo
         self._after_foreign = False
-        self._garbage = 0
+        self._garbage = self._hunted = 0
         self._wrong_header = self._seen = ""
         return self._sent
 
@@ -120,6 +124,9 @@ class RtuFramer(Framer):
         if self._echo_due and not self._strip_echo():
             return None
         while self._buffer and (request := self._request) is not None:
+            if self._hunted >= MOST_HUNTED:
+                self._skip(len(self._buffer))
+                return None
             if self._starts_our_reply(request):
                 return self._take_reply(request)
             if not self._step_over(request, settled):
@@ -183,6 +190,7 @@ class RtuFramer(Framer):
             self._wrong_header = short_hex(buffer)
         if buffer[0] not in _IDLE_NOISE:
             self._garbage += 1
+        self._hunted += 1
         self._skip(1)
         return True
 

@@ -67,21 +67,24 @@ class MbapSlave:
         return exchanges
 
     def _next_adu(self) -> bytes | None:
-        while len(self._buffer) >= HEADER:
-            length = int.from_bytes(self._buffer[4:6], "big")
+        buffer, at, size = self._buffer, 0, len(self._buffer)
+        adu = None
+        while size - at >= HEADER:
+            length = buffer[at + 4] << 8 | buffer[at + 5]
             if length > MAX_LENGTH:
                 self.desync = Desync("MBAP length field", expected=f"{MIN_LENGTH} to {MAX_LENGTH}", got=str(length))
                 self.discarded += 1
-                self._buffer.clear()
-                return None
-            if len(self._buffer) < HEADER + length:
-                return None
-            adu = bytes(self._buffer[: HEADER + length])
-            del self._buffer[: HEADER + length]
-            if adu[2:4] == b"\x00\x00" and length >= MIN_LENGTH:
-                return adu
+                at = size
+                break
+            if size - at < HEADER + length:
+                break
+            begin, at = at, at + HEADER + length
+            if length >= MIN_LENGTH and not buffer[begin + 2] and not buffer[begin + 3]:
+                adu = bytes(buffer[begin:at])
+                break
             self.discarded += 1
-        return None
+        del buffer[:at]  # once: a flood of ADUs that are none is cut through in one go
+        return adu
 
     def _execute(self, adu: bytes, busy: bool, now_ns: int) -> bytes:
         unit_id, pdu = adu[6], adu[7:]

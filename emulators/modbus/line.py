@@ -1,0 +1,124 @@
+"""Several units on one serial line (MODBUS over Serial Line V1.02, SL below), whatever frames they speak.
+
+Pure. A unit answers what is addressed to it, executes what is addressed to 0, and keeps silent about all else: other
+units' traffic, damaged frames, noise. Pacing and waiting happen elsewhere; frames are cut and made by a subclass.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from emulators.modbus.unit import ModbusUnit
+from gateway.core.errors import UsageError
+
+BROADCAST = 0
+LOWEST_UNIT, HIGHEST_UNIT = 1, 247
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """A whole frame that was heard, and the whole frame to send for it; empty when there is nothing to say.
+
+    `latency_s`: how long the unit says that it thinks about this answer (`ModbusUnit.latency_s`).
+    """
+
+    heard: bytes
+    reply: bytes = b""
+    latency_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class LineCounters:
+    """What went over the line so far. `frames` are whole, for whomever; `crc_errors` are damaged ones, LRC and strict
+    timing included; `noise_bytes` are all bytes that belong to no frame."""
+
+    frames: int
+    crc_errors: int
+    noise_bytes: int
+
+
+class Receiver(Protocol):
+    """Cuts frames out of what a line delivers; `feed` returns them without delimiters, with their check sum."""
+
+    gap_ns: int
+    frames: int
+    crc_errors: int
+    noise_bytes: int
+
+    @property
+    def pending(self) -> int: ...
+
+    def feed(self, data: bytes, now_ns: int) -> list[bytes]: ...
+
+
+class LineSlave(ABC):
+    """The units of one line. `units`: unit id (1 to 247) -> unit."""
+
+    check_bytes: int
+    """How many bytes of check sum a received frame ends in."""
+
+    def __init__(self, units: Mapping[int, ModbusUnit], receiver: Receiver) -> None:
+        for unit_id in units:
+            if not LOWEST_UNIT <= unit_id <= HIGHEST_UNIT:
+                raise UsageError("unit id on a serial line", expected="1 to 247", got=str(unit_id))
+        self.units = dict(units)
+        self._receiver = receiver
+
+    @property
+    def counters(self) -> LineCounters:
+        return LineCounters(self._receiver.frames, self._receiver.crc_errors, self._receiver.noise_bytes)
+
+    @property
+    def gap_ns(self) -> int:
+        """After which pause no frame goes on."""
+        return self._receiver.gap_ns
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a frame that is not whole; feed ``b""`` after `gap_ns` of silence to be rid of them."""
+        return self._receiver.pending
+
+    def feed(self, data: bytes, now_ns: int) -> list[bytes]:
+        """Replies to what is whole now, in order. `now_ns`: when `data` came; it never goes back."""
+        return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
+
+    def receive(self, data: bytes, now_ns: int) -> list[Exchange]:
+        """Like `feed`, with every frame that was heard, for taps and journals."""
+        errors_before = self._receiver.crc_errors
+        frames = self._receiver.feed(data, now_ns)
+        errors = self._receiver.crc_errors - errors_before
+        if errors:
+            for unit in self.units.values():
+                unit.heard(errors=errors)
+        return [self._exchange(frame, now_ns) for frame in frames]
+
+    @abstractmethod
+    def encode(self, frame: bytes) -> bytes:
+        """`frame` (unit id and PDU) as it goes on the line."""
+
+    def as_heard(self, frame: bytes) -> bytes:
+        """A received frame as it was on the line."""
+        return frame
+
+    def _exchange(self, frame: bytes, now_ns: int) -> Exchange:
+        for unit in self.units.values():
+            unit.heard(messages=1)
+        heard = self.as_heard(frame)
+        unit_id, pdu = frame[0], frame[1 : -self.check_bytes]
+        if unit_id == BROADCAST:
+            for unit in self.units.values():
+                unit.execute_broadcast(pdu, now_ns)
+            return Exchange(heard)
+        addressed = self.units.get(unit_id)
+        if addressed is None:
+            return Exchange(heard)
+        response = addressed.respond(pdu, now_ns)
+        if response is None:
+            return Exchange(heard)
+        for unit in self.units.values():
+            if unit is not addressed:  # a reply is a message to its neighbours; the sender's receiver is off meanwhile
+                unit.heard(messages=1)
+        return Exchange(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)

@@ -1,0 +1,101 @@
+"""How long RTU frames are, by what they begin with (AP 6, SL 2.5.1), and their check sum. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+MIN_FRAME = 4
+MAX_FRAME = 256
+"""Bytes of a frame with unit and check sum: function only, and the limit of SL 2.5.1."""
+LAST_UNIT = 247
+"""Ids above are reserved (SL 2.2)."""
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        for _ in range(8):
+            byte = byte >> 1 ^ (0xA001 if byte & 1 else 0)
+        table.append(byte)
+    return tuple(table)
+
+
+CRC_TABLE = _crc_table()
+
+
+def crc16(data: bytes | bytearray | memoryview, crc: int = 0xFFFF) -> int:
+    """CRC of SL 2.5.1.2 (polynomial A001h reflected, start FFFFh). Over a whole frame with its CRC it is zero."""
+    table = CRC_TABLE
+    for byte in data:
+        crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
+    return crc
+
+
+def with_crc(frame: bytes) -> bytes:
+    """`frame` (unit and PDU) with its check sum, low byte first."""
+    return frame + crc16(frame).to_bytes(2, "little")
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """How long a frame is by its head. `plausible`: the head makes sense, so that waiting for the rest does too.
+
+    While the head itself is short, `length` is the least it can be, which is more than what is there.
+    """
+
+    length: int
+    plausible: bool = True
+
+
+FIXED_REQUESTS = {
+    **dict.fromkeys((0x01, 0x02, 0x03, 0x04, 0x05, 0x06), 8),
+    **dict.fromkeys((0x07, 0x0B, 0x0C, 0x11), 4),
+    0x16: 10,
+    0x18: 6,
+}
+"""Function code -> length of the request frame, where it has only one."""
+KNOWN_REQUESTS = frozenset({*FIXED_REQUESTS, 0x0F, 0x10, 0x14, 0x15, 0x17, 0x2B})
+"""Functions whose request frames have a length that can be told."""
+_COUNTED_RESPONSES = frozenset({0x01, 0x02, 0x03, 0x04, 0x0C, 0x11, 0x14, 0x15, 0x17})
+_WORD_RESPONSES = frozenset({0x03, 0x04, 0x17})
+_FIXED_RESPONSES = {0x05: 8, 0x06: 8, 0x07: 5, 0x0B: 8, 0x0F: 8, 0x10: 8, 0x16: 10}
+_IDENTIFICATION = 0x0E
+
+
+def request_shape(head: bytes | bytearray) -> Shape | None:
+    """Shape of a request that begins with `head` (at least unit and function); None: only its CRC can tell."""
+    function = head[1]
+    if function in FIXED_REQUESTS:
+        return Shape(FIXED_REQUESTS[function])
+    if function in (0x0F, 0x10):
+        if len(head) < 7:
+            return Shape(9)
+        count, size = head[4] << 8 | head[5], head[6]
+        return Shape(9 + size, size == ((count + 7) // 8 if function == 0x0F else 2 * count) and size > 0)
+    if function == 0x17:
+        if len(head) < 11:
+            return Shape(13)
+        return Shape(13 + head[10], head[10] == 2 * (head[8] << 8 | head[9]) and head[10] > 0)
+    if function in (0x14, 0x15):
+        return Shape(5 + head[2], head[2] >= 7) if len(head) > 2 else Shape(12)
+    if function == 0x2B:
+        if len(head) < 3:
+            return Shape(7)
+        return Shape(7) if head[2] == _IDENTIFICATION else None
+    return None
+
+
+def response_shape(head: bytes | bytearray) -> Shape | None:
+    """Shape of a response that begins with `head`; None: only its CRC can tell."""
+    function = head[1]
+    if function >= 0x80:
+        return Shape(5)
+    if function in _FIXED_RESPONSES:
+        return Shape(_FIXED_RESPONSES[function])
+    if function in _COUNTED_RESPONSES:
+        if len(head) < 3:
+            return Shape(6)
+        return Shape(5 + head[2], head[2] > 0 and not (function in _WORD_RESPONSES and head[2] % 2))
+    if function == 0x18:
+        return Shape(6 + (head[2] << 8 | head[3])) if len(head) > 3 else Shape(8)
+    return None

@@ -1,0 +1,62 @@
+"""RTU frames told by the pauses of the line alone, as a UART with nothing in between hears them (SL 2.5.1.1).
+
+Pure. A pause of t3.5 ends a frame; one over t1.5 inside a frame spoils it; nothing is told by length. For wires that
+deliver every byte in time: behind a pty, a socket or a USB adapter the pauses are gone, and `RtuReceiver` is right.
+"""
+
+from __future__ import annotations
+
+from emulators.modbus.rtu_receiver import MAX_FRAME, MIN_FRAME, crc16
+from emulators.wires.serial_line import SerialPacer
+from gateway.core.endpoint import SerialSettings
+
+
+class StrictReceiver:
+    """Cuts frames at pauses. `gap_ns` is t3.5; counters as in `RtuReceiver`.
+
+    A chunk is taken as characters back to back, the last of which was whole at its `now_ns`. The frame comes out once the
+    pause behind it is told: by the next byte, or by ``b""``.
+    """
+
+    def __init__(self, settings: SerialSettings) -> None:
+        self._pacer = SerialPacer(settings)
+        self.gap_ns = self._pacer.t3_5_ns
+        self.frames = 0
+        self.crc_errors = 0
+        self.noise_bytes = 0
+        self._frame = bytearray()
+        self._spoilt = False
+        self._length = 0
+        self._last_ns = 0
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a frame that no pause has ended; more than a frame can have are counted and not kept."""
+        return self._length
+
+    def feed(self, data: bytes, now_ns: int) -> list[bytes]:
+        """The frame that a pause ended, if any. Never raises, whatever comes."""
+        frames: list[bytes] = []
+        if self._length:
+            pause_ns = now_ns - self._pacer.duration_ns(len(data)) - self._last_ns
+            if pause_ns >= self.gap_ns:
+                frames = self._end_frame()
+            elif data and pause_ns > self._pacer.t1_5_ns:
+                self._spoilt = True
+        if data:
+            self._last_ns = now_ns
+            self._length += len(data)
+            self._frame += data[: max(0, MAX_FRAME - len(self._frame))]
+        return frames
+
+    def _end_frame(self) -> list[bytes]:
+        frame, length = bytes(self._frame), self._length
+        good = not self._spoilt and MIN_FRAME <= length <= MAX_FRAME and crc16(frame) == 0
+        self._frame.clear()
+        self._length, self._spoilt = 0, False
+        if good:
+            self.frames += 1
+            return [frame]
+        self.noise_bytes += length
+        self.crc_errors += length >= MIN_FRAME
+        return []

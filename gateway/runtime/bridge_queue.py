@@ -34,6 +34,9 @@ class Guest:
     queued_ns: int
     done: Callable[[ForwardedReply | FieldtwinError], None]
     wanted: Callable[[], bool]
+    before: Callable[[], None] = lambda: None
+    """Called before each attempt, just before it goes on the wire. What it raises is the request's end."""
+    deferred: bool = False
 
 
 @dataclass
@@ -93,9 +96,14 @@ class GuestQueue:
         """One attempt. What the wire lost goes back in line while attempts are left. Raises `ConnectionLost` only."""
         guest.attempts -= 1
         request = Forwarded(guest.unit, guest.pdu, guest.asked, on_line=on_line)
+        sent_before = client.counters.requests
         try:
+            guest.before()
             reply = await client.execute(guest.unit, request)
         except (WireError, ConnectionLost) as e:
+            if client.counters.requests == sent_before and not guest.deferred:
+                guest.deferred = True  # the connection had ended while it was idle: nothing was sent
+                guest.attempts += 1
             if guest.attempts > 0 and guest.wanted():
                 self._waiting.setdefault(guest.client, deque()).appendleft(guest)
                 self._size += 1

@@ -19,11 +19,13 @@ from gateway.devices.config import BusConfig, DeviceConfig
 from gateway.devices.register_device import RegisterDriver, SensorDriver
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.audit import AuditLog
+from gateway.runtime.bridge import Bridge, BridgeConfig
 from gateway.runtime.canopen_bus import CanopenBus
 from gateway.runtime.image_io import ImageExchange
 from gateway.runtime.mailbox_pump import MailboxPump
 from gateway.runtime.modbus_bus import ModbusBus
 from gateway.runtime.outputs import Output, OutputWriter
+from gateway.runtime.serve import ServeConfig, TagServer
 from gateway.runtime.tags import TagTable
 from gateway.store.exchange_log import ExchangeLog
 
@@ -43,6 +45,8 @@ class GatewayConfig:
     log_tags: frozenset[str] = field(default_factory=frozenset)
     allow_writes: bool = False
     remote: bool = False
+    serve: tuple[ServeConfig, ...] = ()
+    bridges: tuple[BridgeConfig, ...] = ()
 
 
 def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clock) -> RegisterDriver | CanopenDriver:
@@ -77,12 +81,15 @@ class Gateway:
             self._declare(driver)
         for bus in config.buses.values():
             self._make_bus(bus, connector)
+        modbus = {name: bus for name, bus in self.buses.items() if isinstance(bus, ModbusBus)}
+        self.bridges = [Bridge(b, modbus, connector, clock, audit, self._blocked) for b in config.bridges]
         self.outputs = OutputWriter(self._make_outputs(), self.tags, audit, config.allow_writes)
         self.pumps = [
             MailboxPump(d, self._modbus(d), audit, allow_writes=config.allow_writes, remote=config.remote)
             for d in self.drivers.values()
             if isinstance(d, TransmitterDriver)
         ]
+        self.servers = [TagServer(s, self.tags, self.outputs, clock) for s in config.serve]
         sources = self._message_sources()
         self.exchange = ImageExchange(image, self.tags, sources)
         self.plc_alive = False
@@ -107,7 +114,7 @@ class Gateway:
             self.buses[bus.name] = CanopenBus(
                 bus, nodes, connector, self.clock, self.tags, self._audit, self.config.allow_writes
             )
-        elif on_it:
+        elif on_it or any(bus.name in b.buses for b in self.config.bridges):
             units = [d for d in on_it if isinstance(d, RegisterDriver)]
             self.buses[bus.name] = ModbusBus(bus, units, connector, self.clock, self.tags, self._on_offline)
 
@@ -118,7 +125,8 @@ class Gateway:
 
     def _make_outputs(self) -> list[Output]:
         made = []
-        for tag in sorted(self.config.outputs):
+        served = {t.tag for s in self.config.serve for t in s.tags if t.write}
+        for tag in sorted(self.config.outputs | served):
             device, _, local = tag.partition(".")
             driver = self.drivers[device]
             if isinstance(driver, RegisterDriver) and not isinstance(driver, TransmitterDriver):
@@ -134,6 +142,11 @@ class Gateway:
                 sources[driver.message_tag] = consumer
         return sources
 
+    def _blocked(self, bus: str, unit: int) -> str:
+        """Why a bridge's client may not write to a unit; unit 0 is every unit of the bus."""
+        on_it = [d for d in self.drivers.values() if d.config.bus == bus and unit in (d.config.address, 0)]
+        return next((f"{d.config.where}: {d.identity_error}" for d in on_it if d.identity_error), "")
+
     def _on_offline(self, driver: RegisterDriver) -> None:
         self.outputs.forget(driver)
 
@@ -145,6 +158,10 @@ class Gateway:
             for name, bus in self.buses.items():
                 nursery.start(bus.run(), f"bus {name}")
             nursery.start(self._cycle(), "exchange with the PLC")
+            for server in self.servers:
+                nursery.start(server.run(), f"server {server.config.name}")
+            for bridge in self.bridges:
+                nursery.start(bridge.run(), f"bridge {bridge.config.name}")
             await nursery.wait()
 
     async def _cycle(self) -> None:

@@ -8,11 +8,12 @@ and every write and refusal is on record before it is on the wire.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import FieldtwinError, NotAllowed, Unreachable
+from gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
 from gateway.core.values import Quality
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
@@ -22,6 +23,7 @@ from gateway.runtime.tags import TagTable
 MIN_SPACING_NS = 100 * NS_PER_MS
 """At most ten writes a second to one tag; what changes faster is written with its newest value."""
 RETRY_NS = NS_PER_S
+SAFE = "safe: "
 
 
 @dataclass
@@ -40,6 +42,16 @@ class Output:
     pending: bool = False
     refused: tuple[float, str] | None = None
     next_try_ns: int = 0
+    asked: Callable[[FieldtwinError | None], None] | None = None
+    """Who asked for one write and waits for its end; None for what the PLC or the safe state commands."""
+
+    def answer(self, error: FieldtwinError | None) -> None:
+        """Tell who asked how it ended. It was for once: nothing is written again behind a person's back."""
+        asked, self.asked = self.asked, None
+        if asked is not None:
+            if not self.by.startswith(SAFE):
+                self.wanted = None
+            asked(error)
 
 
 class OutputWriter:
@@ -60,12 +72,31 @@ class OutputWriter:
             if output.tag == tag:
                 output.wanted, output.by = value, "plc"
 
+    def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
+        """Somebody (`by`) asks for one write of a tag that the PLC does not command. `done` is told how it ended.
+
+        While the outputs are in their safe state, those that have a safe value keep it.
+        """
+        output = next((o for o in self.outputs if o.tag == tag), None)
+        where = output.driver.config.where if output is not None else tag
+        if output is None or output.by == "plc":
+            done(NotAllowed(f"{tag} cannot be commanded from here", where=where))
+        elif self.safe_active and output.safe is not None:
+            done(EndpointBusy("the outputs are in their safe state", where=where))
+        elif output.pending or self._now_ns < output.next_try_ns:
+            done(EndpointBusy("another write has just been made, or is under way", where=where))
+        elif not output.bus.online(output.driver):
+            done(Unreachable("the device does not answer", where=where))
+        else:
+            output.wanted, output.by, output.asked = value, by, done
+            self._start(output, value)
+
     def make_safe(self, why: str) -> None:
         """Command every output's safe value; outputs without one keep what they have."""
         self.safe_active = True
         for output in self.outputs:
             if output.safe is not None:
-                output.wanted, output.by = output.safe, f"safe: {why}"
+                output.wanted, output.by = output.safe, f"{SAFE}{why}"
 
     def release(self) -> None:
         """The PLC is back: its commands count again."""
@@ -123,8 +154,10 @@ class OutputWriter:
                 self._audit.note("refuse", name, by=output.by, result=str(e), tag=output.tag, old=old, new=value)
             except Unreachable:
                 self.failures += 1  # counted; refused all the same
+            output.answer(e)
             return
         if not self._on_record(output, name, old, value):
+            output.answer(Unreachable("the write could not be put on record", where=name))
             return
         output.pending = True
         output.driver.consumer.observe(command)
@@ -137,7 +170,7 @@ class OutputWriter:
         except Unreachable:
             self.failures += 1
             output.next_try_ns = self._now_ns + RETRY_NS
-            return self.safe_active
+            return self.safe_active and output.asked is None
         return True
 
     def _check(self, output: Output) -> None:
@@ -163,3 +196,4 @@ class OutputWriter:
             self._audit.note("write", output.driver.config.name, by=output.by, result=result, tag=output.tag, new=value)
         except Unreachable:
             self.failures += 1  # counted; the next write will not start without a record
+        output.answer(error)

@@ -45,6 +45,8 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
             "losses": gateway.plc_losses,
             "stopped": gateway.exchange.plc_stopped,
         },
+        "serve": {server.config.name: server.describe() for server in gateway.servers},
+        "bridge": {bridge.config.name: bridge.describe() for bridge in gateway.bridges},
         "published": gateway.tags.published,
         "logged": gateway.log.stored,
         "log_dropped": gateway.log.dropped,

@@ -1,0 +1,63 @@
+"""Bridged writes and refusals on record: who, where, what, and how it ended.
+
+A write is noted before it is on the wire and does not happen when it cannot be noted. A client that is refused again and again
+would fill the disk: at most one refusal a second and client is noted, with how many there were since.
+"""
+
+from __future__ import annotations
+
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.errors import FieldtwinError, ModbusExceptionReply, Unreachable
+from gateway.protocols.modbus.refusals import refusal
+from gateway.protocols.modbus.server import SERVER_FAILURE
+from gateway.protocols.modbus.server_forward import ForwardedReply
+from gateway.runtime.audit import AuditLog
+
+MOST_CLIENTS = 256
+"""Clients whose last refusal is remembered."""
+
+
+class WriteRecord:
+    """The audit entries of one bridge. `lost` counts what could not be written down."""
+
+    def __init__(self, audit: AuditLog, clock: Clock) -> None:
+        self.lost = 0
+        self._audit = audit
+        self._clock = clock
+        self._refusals: dict[str, tuple[int, int]] = {}
+
+    def asked(self, by: str, device: str, unit: int, pdu: bytes) -> None:
+        """A write is about to go out. Raises exception 04 for the client where that cannot be noted."""
+        try:
+            self._audit.note("write", device, by=by, result="asked", unit=unit, pdu=pdu.hex())
+        except Unreachable as e:
+            self.lost += 1
+            raise refusal(pdu[0], SERVER_FAILURE) from e
+
+    def ended(self, by: str, device: str, unit: int, pdu: bytes, result: ForwardedReply | FieldtwinError) -> None:
+        """How a write ended."""
+        text = "done" if isinstance(result, ForwardedReply) else f"failed: {result}"
+        if isinstance(result, ModbusExceptionReply):
+            text = f"refused: exception {result.code:02X}h"
+        self._note("write", device, by=by, result=text, unit=unit, pdu=pdu.hex())
+
+    def refused(self, by: str, device: str, unit: int, pdu: bytes, code: int, why: str = "") -> None:
+        """A write that was not passed on."""
+        client = by.rpartition(":")[0] or by
+        now_ns = self._clock.monotonic_ns()
+        last_ns, held_back = self._refusals.pop(client, (0, 0))
+        if last_ns and now_ns - last_ns < NS_PER_S:
+            self._refusals[client] = (last_ns, held_back + 1)
+            return
+        self._refusals[client] = (now_ns, 0)
+        if len(self._refusals) > MOST_CLIENTS:
+            del self._refusals[next(iter(self._refusals))]
+        text = why or f"exception {code:02X}h"
+        self._note("refuse", device, by=by, result=text, unit=unit, pdu=pdu.hex(), more=held_back)
+
+    def _note(self, action: str, device: str, *, by: str, result: str, unit: int, pdu: str, more: int = 0) -> None:
+        details = {"more_refused_since": more} if more else {}
+        try:
+            self._audit.note(action, device, by=by, result=result, unit=unit, pdu=pdu, **details)
+        except Unreachable:
+            self.lost += 1  # counted; the next write will not start without a record

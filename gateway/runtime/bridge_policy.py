@@ -1,0 +1,101 @@
+"""Who may ask what through a bridge: client networks to units, functions and address ranges. What is not allowed is refused.
+
+Pure: addresses of clients as text, requests as `Asked`. Nothing here knows connections, buses or time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
+
+from gateway.core.errors import UsageError
+from gateway.protocols.modbus.server import ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, NO_PATH, READ_FUNCTIONS, Asked
+
+Network = IPv4Network | IPv6Network
+
+LINE = "line"
+"""The client that a serial line is: it has no address."""
+
+ALLOWED = 0
+
+
+def network(text: str) -> Network:
+    """``10.0.0.0/24``, ``10.0.0.7`` or ``fd00::/8``. Raises `UsageError`."""
+    try:
+        return ip_network(text)
+    except ValueError as e:
+        raise UsageError("a network of clients", expected="an address, or one such as 10.0.0.0/24", got=text) from e
+
+
+LOOPBACK = (network("127.0.0.0/8"), network("::1/128"))
+EVERYONE = (network("0.0.0.0/0"), network("::/0"))
+
+
+@lru_cache(maxsize=1024)
+def within(peer: str, networks: tuple[Network, ...]) -> bool:
+    """Whether a client's address is in one of `networks`; an IPv4 address in IPv6 form counts as itself."""
+    try:
+        address = ip_address(peer.partition("%")[0])
+    except ValueError:
+        return False
+    mapped = address.ipv4_mapped if isinstance(address, IPv6Address) else None
+    return any((mapped or address) in net for net in networks)
+
+
+@dataclass(frozen=True)
+class AllowRule:
+    """What the clients of `networks` may ask. `units` as the client says them; None: every unit.
+
+    `addresses` holds first and last address by table; None: every address. A table that it does not name is not allowed,
+    nor then is a function without register addresses.
+    """
+
+    networks: tuple[Network, ...] = LOOPBACK
+    units: frozenset[int] | None = None
+    functions: frozenset[int] = READ_FUNCTIONS
+    addresses: Mapping[str, tuple[tuple[int, int], ...]] | None = None
+
+    def admits(self, peer: str) -> bool:
+        return peer == LINE or within(peer, self.networks)
+
+    def judge(self, unit: int, asked: Asked) -> int:
+        """`ALLOWED`, or the exception code that says how far the request got: unit, function, address."""
+        if self.units is not None and unit not in self.units:
+            return NO_PATH
+        if asked.function not in self.functions or (asked.changes and not self.functions - READ_FUNCTIONS):
+            return ILLEGAL_FUNCTION
+        if self.addresses is None:
+            return ALLOWED
+        if not asked.accesses:
+            return ILLEGAL_FUNCTION
+        for access in asked.accesses:
+            last = access.address + access.count - 1
+            ranges = self.addresses.get(access.table, ())
+            if not any(low <= access.address and last <= high for low, high in ranges):
+                return ILLEGAL_ADDRESS
+        return ALLOWED
+
+
+_FARTHEST = (ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, NO_PATH)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """An allow-list: a request passes when one rule allows all of it. Without `allow_writes` nothing that may change a
+    unit passes, whatever the rules say."""
+
+    rules: tuple[AllowRule, ...] = (AllowRule(),)
+    allow_writes: bool = False
+
+    def admits(self, peer: str) -> bool:
+        """Whether a client from `peer` may connect at all."""
+        return any(rule.admits(peer) for rule in self.rules)
+
+    def judge(self, peer: str, unit: int, asked: Asked) -> int:
+        """`ALLOWED`, or the exception code to answer with: 0A for a unit, 01 for a function, 02 for an address."""
+        verdicts = {rule.judge(unit, asked) for rule in self.rules if rule.admits(peer)}
+        if ALLOWED in verdicts:
+            return ALLOWED if self.allow_writes or not asked.changes else ILLEGAL_FUNCTION
+        return next((code for code in _FARTHEST if code in verdicts), NO_PATH)

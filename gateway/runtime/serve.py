@@ -1,0 +1,259 @@
+"""The process image as Modbus TCP registers, for HMIs and other controllers (`serve` section of a system file).
+
+A bad value must never look good: a read that touches a bad tag is refused with exception 04, or, where the file says so, a
+bad float is not a number and its quality register says why. What is uncertain is given out only where a quality register
+can say so. Half a value is never given out, nor taken: two reads could be of two samples. Writes go through the output
+writer's checks and the audit log; nothing else is writable.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Protocol
+
+from gateway.core.clock import Clock
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import EndpointBusy, FieldtwinError, ModbusExceptionReply, NotAllowed
+from gateway.core.values import Quality, Reason, TagValue
+from gateway.protocols.modbus.refusals import refusal
+from gateway.protocols.modbus.server import (
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    ILLEGAL_VALUE,
+    NO_PATH,
+    SERVER_BUSY,
+    SERVER_FAILURE,
+    Access,
+    ServedTable,
+    examine,
+    exception_pdu,
+)
+from gateway.runtime.bridge_policy import EVERYONE, Network, within
+from gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
+from gateway.runtime.serve_codec import REGISTERS, not_a_number, pack, unpack
+from gateway.runtime.tags import TagTable
+
+BIT_TABLES = ("coil", "discrete")
+DIRECT_UNITS = (0, 255)
+"""What a client that knows no unit ids says to a device that stands directly on TCP (TG 4.4.1.2, case MB-057)."""
+
+QUALITY_TABLE: Mapping[ServedTable, ServedTable] = {
+    "input": "input",
+    "holding": "holding",
+    "discrete": "input",
+    "coil": "holding",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class ServedTag:
+    """A tag and where it is served. `quality_at`: the address of its quality register, in `QUALITY_TABLE`'s table."""
+
+    tag: str
+    table: ServedTable
+    address: int
+    type: str = "float32"
+    order: str = "ABCD"
+    quality_at: int | None = None
+    write: bool = False
+
+    @property
+    def count(self) -> int:
+        """Registers or bits that it takes."""
+        return 1 if self.table in BIT_TABLES else REGISTERS[self.type]
+
+
+@dataclass(frozen=True)
+class ServeConfig:
+    """One server. `if_bad` "nan" is for floats; other types of a bad tag have nothing that could not be a value."""
+
+    name: str
+    listen: Endpoint
+    unit: int
+    tags: tuple[ServedTag, ...]
+    if_bad: Literal["exception", "nan"] = "exception"
+    networks: tuple[Network, ...] = EVERYONE
+    clients: int = 16
+
+
+class Writer(Protocol):
+    """Who carries out writes: the output writer."""
+
+    def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
+        """Write once; `done` is told how it ended."""
+        ...
+
+
+@dataclass
+class ServeCounters:
+    """Reads answered; refused because of a bad tag; refused for another reason; writes that were carried out."""
+
+    reads: int = 0
+    bad: int = 0
+    refused: int = 0
+    writes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Cell:
+    """What begins at an address: a tag's value, or its quality register."""
+
+    served: ServedTag
+    is_quality: bool
+
+    @property
+    def count(self) -> int:
+        return 1 if self.is_quality else self.served.count
+
+
+class TagServer:
+    """Serves tags on one port, until cancelled."""
+
+    def __init__(self, config: ServeConfig, tags: TagTable, writer: Writer, clock: Clock) -> None:
+        self.config = config
+        self.counters = ServeCounters()
+        self._tags = tags
+        self._writer = writer
+        self._clock = clock
+        self._cells: dict[ServedTable, dict[int, _Cell]] = {t: {} for t in QUALITY_TABLE}
+        for served in config.tags:
+            self._cells[served.table][served.address] = _Cell(served, is_quality=False)
+            if served.quality_at is not None:
+                self._cells[QUALITY_TABLE[served.table]][served.quality_at] = _Cell(served, is_quality=True)
+        self._writable = {t.table for t in config.tags if t.write}
+        self.front = TcpFront(
+            config.listen,
+            self.ask,
+            clock,
+            max_clients=config.clients,
+            admits=lambda address: within(address, config.networks),
+        )
+
+    async def run(self) -> None:
+        """Serve clients until cancelled."""
+        await self.front.run()
+
+    def describe(self) -> dict[str, Any]:
+        """For the status."""
+        return {**self.front.describe(), **asdict(self.counters), "unit": self.config.unit}
+
+    # -- one request ------------------------------------------------------------------------------------------------
+
+    def ask(self, caller: Caller, unit: int, pdu: bytes) -> Answer:
+        """Answer a request PDU. A unit that does not stand here has no path (0A): silence would only hide a wrong setting."""
+        try:
+            if unit != self.config.unit and unit not in DIRECT_UNITS:
+                raise refusal(pdu[0], NO_PATH)
+            return self._answer(caller, pdu)
+        except ModbusExceptionReply as e:
+            self.counters.bad += e.code == SERVER_FAILURE
+            self.counters.refused += e.code != SERVER_FAILURE
+            return exception_pdu(e)
+
+    def _answer(self, caller: Caller, pdu: bytes) -> Answer:
+        function = pdu[0]
+        if function in (0x01, 0x02, 0x03, 0x04):
+            (access,) = examine(pdu).accesses
+            data = self._read(function, access)
+            self.counters.reads += 1
+            return bytes([function, len(data)]) + data
+        table: ServedTable = "coil" if function in (0x05, 0x0F) else "holding"
+        if function not in (0x05, 0x06, 0x0F, 0x10) or table not in self._writable:
+            raise refusal(function, ILLEGAL_FUNCTION)
+        (access,) = examine(pdu).accesses
+        return self._write(caller, pdu, access)
+
+    # -- reading ----------------------------------------------------------------------------------------------------
+
+    def _read(self, function: int, access: Access) -> bytes:
+        """All of it, or nothing (case MB-041's like for reads)."""
+        now_ns = self._clock.monotonic_ns()
+        parts = [self._cell_bytes(function, cell, now_ns) for cell in self._covered(function, access)]
+        if access.table not in BIT_TABLES:
+            return b"".join(parts)
+        packed = bytearray((access.count + 7) // 8)
+        for i, part in enumerate(parts):
+            packed[i // 8] |= part[-1] << i % 8
+        return bytes(packed)
+
+    def _covered(self, function: int, access: Access) -> list[_Cell]:
+        """The whole cells of a range; a gap or half a value is exception 02 (cases MB-048, MB-049)."""
+        cells, at, end = self._cells[access.table], access.address, access.address + access.count
+        found = []
+        while at < end:
+            cell = cells.get(at)
+            if cell is None or at + cell.count > end:
+                raise refusal(function, ILLEGAL_ADDRESS)
+            found.append(cell)
+            at += cell.count
+        return found
+
+    def _cell_bytes(self, function: int, cell: _Cell, now_ns: int) -> bytes:
+        served = cell.served
+        value = self._tags.current(served.tag, now_ns)
+        data = pack(served.type, served.order, value.value) if self._presentable(served, value) else None
+        if cell.is_quality:
+            return _quality_word(value, fits=data is not None).to_bytes(2)
+        if data is not None:
+            return data
+        substitute = not_a_number(served.type, served.order) if self.config.if_bad == "nan" else None
+        if substitute is None:
+            raise refusal(function, SERVER_FAILURE)
+        return substitute
+
+    @staticmethod
+    def _presentable(served: ServedTag, value: TagValue) -> bool:
+        if value.quality is Quality.UNCERTAIN:
+            return served.quality_at is not None
+        return value.quality is not Quality.BAD
+
+    # -- writing ----------------------------------------------------------------------------------------------------
+
+    def _write(self, caller: Caller, pdu: bytes, access: Access) -> Answer:
+        """One tag, whole. Answered when the device has confirmed it."""
+        function = pdu[0]
+        cells = self._covered(function, access)
+        if any(cell.is_quality or not cell.served.write for cell in cells):
+            raise refusal(function, ILLEGAL_ADDRESS)
+        if len(cells) != 1:
+            raise refusal(function, ILLEGAL_VALUE)  # two tags cannot be written together or not at all
+        served = cells[0].served
+        value = unpack(served.type, served.order, _written(pdu, served))
+        if value is None:
+            raise refusal(function, ILLEGAL_VALUE)
+        promise: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
+
+        def done(error: FieldtwinError | None) -> None:
+            self.counters.writes += error is None
+            self.counters.refused += error is not None
+            if not promise.done():
+                code = _code_of(error) if error is not None else 0
+                promise.set_result(exception_pdu(refusal(function, code)) if code else pdu[:5])
+
+        self._writer.request(served.tag, value, caller.name, done)
+        return promise
+
+
+def _written(pdu: bytes, served: ServedTag) -> bytes:
+    """The register bytes of a write request; a bit as one register."""
+    if pdu[0] == 0x05:
+        return bytes([0, pdu[3] == 0xFF])
+    if pdu[0] == 0x0F:
+        return bytes([0, pdu[6] & 1])
+    return pdu[3:] if pdu[0] == 0x06 else pdu[6:]
+
+
+def _code_of(error: FieldtwinError) -> int:
+    """What a client is told about a write that was not carried out."""
+    if isinstance(error, NotAllowed):
+        return ILLEGAL_VALUE
+    return SERVER_BUSY if isinstance(error, EndpointBusy) else SERVER_FAILURE
+
+
+def _quality_word(value: TagValue, *, fits: bool) -> int:
+    """0: good. Else the quality in the high byte and the reason in the low one; a value that the type cannot hold is bad."""
+    if value.good and not fits:
+        return Quality.BAD << 8 | Reason.OUT_OF_RANGE
+    return value.quality << 8 | value.reason

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from gateway.core.clock import Clock
 from gateway.core.connection import PROTOCOL, CanConnection
-from gateway.core.errors import Bug, NotAllowed, WrongDevice
+from gateway.core.errors import Bug, NotAllowed, SdoAborted, WrongDevice
 from gateway.core.profile import Tag
 from gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
 from gateway.devices.codec import decode_little, encode, reorder
@@ -90,6 +90,16 @@ class CanopenDriver(DeviceDriver):
             raise WrongDevice(
                 "another node answers", expected=expected, got=self.identity_error, where=self.config.where
             )
+
+    async def read_once(self) -> None:
+        """Read over SDO what no TPDO brings and `identify` did not read. What the node refuses has no value."""
+        others = {*(self.config.tpdo1.tags if self.config.tpdo1 else ()), *self.config.expect}
+        for tag in self.profile.tags.values():
+            if tag.readable and tag.name not in others:
+                try:
+                    await self._upload(tag)
+                except SdoAborted:
+                    self.sink.put_bad([f"{self.config.name}.{tag.name}"], Reason.REFUSED)
 
     async def configure(self) -> None:
         """Set heartbeat and TPDO1 as the system file says. These are writes: the caller has leave to write."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 
 from gateway.core.clock import NS_PER_S, Clock
@@ -133,6 +134,7 @@ class CanopenBus:
 
     async def _bring_up(self, driver: CanopenDriver) -> None:
         await driver.identify()
+        await driver.read_once()
         if not self._allow_writes:
             await driver.adopt()
             return
@@ -167,7 +169,9 @@ class CanopenBus:
             return
         for status in self.nodes.values():
             if status.online and status.driver.config.start:
-                self._audit.note("nmt", status.driver.config.name, by="stop", result="asked", what="pre-operational")
+                name = status.driver.config.name
+                with suppress(Unreachable):  # a log that cannot be written keeps nothing from being stopped
+                    self._audit.note("nmt", name, by="stop", result="asked", what="pre-operational")
                 try:
                     async with asyncio.timeout(timeout_s):
                         status.driver.consumer.observe(COMMAND(b"", "nmt_preoperational"))

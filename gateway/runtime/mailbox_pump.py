@@ -7,9 +7,10 @@ A plant whose switch says `local` takes no commands: they are acknowledged, refu
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 
 from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import FieldtwinError
+from gateway.core.errors import FieldtwinError, Unreachable
 from gateway.core.events import Consumer
 from gateway.core.values import DATA, RESPONSE
 from gateway.devices.transmitter import TransmitterDriver
@@ -53,13 +54,14 @@ class MailboxPump:
         if not self._remote:
             for item in self.inbox.drain():
                 self.commands_refused += 1
-                self._audit.note(
-                    "refuse",
-                    self.driver.config.name,
-                    by="far side",
-                    result="the plant says local",
-                    payload=item.data.hex(),
-                )
+                with suppress(Unreachable):  # refused with or without a record, and counted
+                    self._audit.note(
+                        "refuse",
+                        self.driver.config.name,
+                        by="far side",
+                        result="the plant says local",
+                        payload=item.data.hex(),
+                    )
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
         """Start the next exchange. `all_consumed` says that the PLC has consumed everything that it was given."""

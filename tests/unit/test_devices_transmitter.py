@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 from random import Random
 
 import pytest
@@ -23,6 +25,8 @@ from gateway.core.values import COMMAND, DATA, RESPONSE
 from gateway.devices.config import BusConfig, DeviceConfig
 from gateway.devices.transmitter import TransmitterDriver, next_sequence
 from gateway.protocols.modbus.client import ModbusClient
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.mailbox_pump import MailboxPump
 from gateway.runtime.modbus_bus import Job, ModbusBus
 from gateway.runtime.tags import TagTable
 from gateway.wallclock import WallClock
@@ -251,6 +255,31 @@ def test_a_transmitter_needs_a_mailbox_and_a_socket() -> None:
     with pytest.raises(FileInvalid, match="cannot stand on this bus"):
         driver.attach(near)
     assert BusConfig("b", LAN).retries == 1
+
+
+@pytest.mark.parametrize("log", ["audit.jsonl", "/dev/full"])
+def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, log: str) -> None:
+    """With a log that can be written, and with one that cannot: the command is refused either way."""
+
+    async def main() -> None:
+        modems = pair()
+        audit = AuditLog(tmp_path / log, WallClock())
+        async with station(modems, "far") as far, station(modems) as near:
+            pump = MailboxPump(near.driver, near.bus, audit, allow_writes=True, remote=False)
+            far.driver.consumer.observe(COMMAND(b"\0\5"))
+            await far.do("send")
+            await near.do("read")
+            pump.refuse_when_local()
+            assert not pump.inbox.queue
+            assert pump.commands_refused == 1
+            pump.tick(1, all_consumed=True)  # and it is acknowledged: the next one can come
+            await eventually(lambda: not near.driver.to_acknowledge)
+        audit.close()
+        if log == "audit.jsonl":
+            (line,) = (tmp_path / log).read_text(encoding="utf-8").splitlines()
+            assert json.loads(line)["payload"] == "0005"
+
+    run(main())
 
 
 # -- the link between the modems ------------------------------------------------------------------------------------------

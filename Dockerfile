@@ -1,0 +1,32 @@
+# fieldtwin in a container: gateway, PLC and emulators, as one command. Needs no privilege and no kernel CAN.
+#
+#   docker build -t fieldtwin . && docker run --rm fieldtwin run observatory --prototype --for 20s
+#
+# For a real serial port or CAN interface add --device=/dev/ttyUSB0 or --network=host.
+FROM python:3.11-slim-bookworm AS build
+WORKDIR /src
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore
+RUN python -m venv --without-pip /opt/fieldtwin
+# What fieldtwin stands on, in a layer of its own: a change of our code does not fetch it again.
+COPY pyproject.toml ./
+RUN python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" \
+      > /tmp/requirements.txt \
+ && pip --python /opt/fieldtwin/bin/python install -r /tmp/requirements.txt
+COPY . .
+# share: where the shipped profiles and recordings are, whatever the version of Python in their path.
+RUN pip --python /opt/fieldtwin/bin/python install --no-deps . \
+ && cd / && ln -s "$(/opt/fieldtwin/bin/python -c 'from twin.data_files import data_root; print(data_root())')" \
+      /opt/fieldtwin/share
+
+FROM python:3.11-slim-bookworm
+LABEL org.opencontainers.image.title="fieldtwin" org.opencontainers.image.licenses="Apache-2.0"
+RUN useradd --uid 10001 --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin fieldtwin \
+ && install -d -o fieldtwin -g fieldtwin -m 700 /run/fieldtwin
+COPY --from=build /opt/fieldtwin /opt/fieldtwin
+COPY --from=build /src/scripts/container-health /usr/local/bin/container-health
+ENV PATH=/opt/fieldtwin/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \
+    PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 FIELDTWIN_RUN=/run/fieldtwin
+USER fieldtwin
+WORKDIR /
+ENTRYPOINT ["fieldtwin"]
+CMD ["--help"]

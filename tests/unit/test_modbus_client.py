@@ -511,6 +511,51 @@ def test_a_closed_client_says_so() -> None:
     with_client(scenario)
 
 
+def test_an_identification_is_read_to_its_end() -> None:
+    replies = ["01 2b 0e 01 01 ff 01 01 00 02 41 42", "01 2b 0e 01 01 00 00 02 01 01 43 02 01 44"]
+
+    async def scenario(client: ModbusClient, device: Device) -> None:
+        async def answer(_: bytes) -> None:
+            await device.send_frame(replies[len(device.requests) - 1])
+
+        device.answer = answer
+        assert await client.read_identification(1) == {0: b"AB", 1: b"C", 2: b"D"}
+        assert [frame[1:5].hex() for _, frame in device.requests] == ["2b0e0100", "2b0e0101"]
+
+    with_client(scenario)
+
+
+def test_an_identification_that_goes_round_in_circles_ends() -> None:
+    async def scenario(client: ModbusClient, device: Device) -> None:
+        async def answer(_: bytes) -> None:
+            await device.send_frame("01 2b 0e 01 01 ff 01 01 00 02 41 42")
+
+        device.answer = answer
+        with pytest.raises(Desync, match="circles"):
+            await client.read_identification(1)
+        assert len(device.requests) == 2
+
+    with_client(scenario)
+
+
+@pytest.mark.parametrize(
+    ("url", "settings", "says"),
+    [
+        ("tcp://h:502", {"echo": True}, "echoes"),
+        ("tls://h:802", {"strict": True}, "silences"),
+        ("ascii:/dev/x", {"strict": True}, "silences"),
+        ("rtu+tcp://h:1", {"strict": True}, "baud rate"),
+        ("rtu:/dev/x", {"accepts_zero_id": True}, "transaction ids"),
+        ("rtu:/dev/x", {"turnaround_s": 0.0}, "out of range"),
+        ("can:socketcan/can0", {}, "not spoken"),
+    ],
+)
+def test_what_a_wire_has_not_cannot_be_set(url: str, settings: dict[str, bool], says: str) -> None:
+    near, _ = wire("rtu")
+    with pytest.raises(UsageError, match=says):
+        ModbusClient.at(Endpoint.parse(url), near, CLOCK, **settings)  # type: ignore[arg-type]
+
+
 def test_bad_settings_are_refused() -> None:
     near, _ = wire("rtu")
     with pytest.raises(UsageError, match="timeout"):

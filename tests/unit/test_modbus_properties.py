@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymodbus.pdu.bit_message import ReadCoilsResponse
+from pymodbus.pdu.register_message import ReadHoldingRegistersResponse
 
 from gateway.core.errors import FieldtwinError, ReplyTimeout, WireError
+from gateway.protocols.modbus import pdus
+from gateway.protocols.modbus.ascii import AsciiFramer, lrc
 from gateway.protocols.modbus.crc import with_crc
+from gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog, Loopback
+from gateway.protocols.modbus.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
 from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
-from gateway.protocols.modbus.mbap import MbapFramer
+from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
+from gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
 from gateway.protocols.modbus.replies import RegistersReply, Reply
-from gateway.protocols.modbus.request import Request
-from gateway.protocols.modbus.requests import ReadBits, ReadRegisters, WriteRegister, WriteRegisters
-from gateway.protocols.modbus.rtu import RtuFramer
+from gateway.protocols.modbus.request import Request, parse_reply
+from gateway.protocols.modbus.requests import (
+    MaskWriteRegister,
+    ReadBits,
+    ReadRegisters,
+    ReadWriteRegisters,
+    WriteCoil,
+    WriteCoils,
+    WriteRegister,
+    WriteRegisters,
+)
+from gateway.protocols.modbus.rtu import MOST_HUNTED, RtuFramer
 from gateway.protocols.modbus.transaction import Transaction
+from gateway.protocols.modbus.user import CountedShape, FixedShape, UserFunction
 
 UNIT = 1
 TIMEOUT_NS = 1_000_000_000
@@ -26,6 +43,34 @@ REQUESTS = st.one_of(
     st.builds(WriteRegisters, st.just(7), st.lists(st.integers(0, 65535), min_size=1, max_size=123).map(tuple)),
     st.just(ReportServerId()),
     st.just(ReadDeviceIdentification()),
+    st.just(GetCommEventLog()),
+    st.just(ReadFifoQueue(7)),
+    st.builds(UserFunction, st.integers(65, 72), st.binary(max_size=8), st.builds(FixedShape, st.integers(6, 40))),
+    st.builds(
+        UserFunction,
+        st.integers(100, 110),
+        st.binary(max_size=8),
+        st.builds(CountedShape, st.integers(0, 3), st.integers(1, 2), st.integers(0, 3)),
+    ),
+)
+
+ALL_REQUESTS = st.one_of(
+    REQUESTS,
+    st.sampled_from(
+        [
+            WriteCoil(1, True),
+            WriteCoils(1, (True, False)),
+            MaskWriteRegister(1, 2, 3),
+            ReadWriteRegisters(1, 2, 3, (4,)),
+            Diagnostics(0x0B),
+            Loopback(b"abcd"),
+            GetCommEventCounter(),
+            ReadExceptionStatus(),
+            ReadFileRecords((FileSpan(1, 2, 3), FileSpan(4, 5, 1))),
+            WriteFileRecords(((1, 2, (3, 4)),)),
+            ReadDeviceIdentification(4, 2),
+        ]
+    ),
 )
 
 # Bytes that look like something: units, functions and counts in use, whole frames of ours and of others.
@@ -34,6 +79,7 @@ CRUMBS = st.one_of(
     st.sampled_from([b"\x01\x03", b"\x01\x83", b"\x01\x04\x04", b"\x01", b"\x00", b"\xff", b"\x02\x03\xfa"]),
     st.sampled_from([bytes.fromhex(h) for h in ("02 03 02 00 07", "02 83 02", "02 06 00 01 00 02")]).map(with_crc),
     st.sampled_from([bytes.fromhex(h) for h in ("00 01 00 00", "00 01 00 00 00 05 02", "00 00 00 00 ff ff")]),
+    st.sampled_from([b":", b"\r\n", b":0103", b":02030200", b":0183020", b":020302000AEF\r\n", b":010302000AEF\r\n"]),
 )
 GARBAGE = st.lists(CRUMBS, max_size=12).map(b"".join)
 SPLITS = st.lists(st.tuples(st.integers(1, 40), st.integers(0, 40_000_000)), max_size=40)
@@ -42,6 +88,12 @@ SPLITS = st.lists(st.tuples(st.integers(1, 40), st.integers(0, 40_000_000)), max
 def framer_of(kind: str, echo: bool = False, strict: bool = False) -> Framer:
     if kind == "mbap":
         return MbapFramer()
+    if kind == "zero id":
+        return MbapFramer(accepts_zero_id=True)
+    if kind == "udp":
+        return UdpFramer()
+    if kind == "ascii":
+        return AsciiFramer(echo=echo)
     return RtuFramer(echo=echo, strict=strict, char_time_ns=573_000 if strict else 0)
 
 
@@ -71,7 +123,10 @@ def play(framer: Framer, request: Request[Reply], data: bytes, splits: list[tupl
 
 
 def framed(kind: str, transaction: int, pdu: bytes, unit: int = UNIT) -> bytes:
-    if kind == "mbap":
+    if kind == "ascii":
+        frame = bytes([unit]) + pdu
+        return b":" + (frame + bytes([lrc(frame)])).hex().upper().encode() + b"\r\n"
+    if kind != "rtu":
         return transaction.to_bytes(2, "big") + b"\x00\x00" + (len(pdu) + 1).to_bytes(2, "big") + bytes([unit]) + pdu
     return with_crc(bytes([unit]) + pdu)
 
@@ -81,7 +136,7 @@ def registers_pdu(function: int, values: list[int]) -> bytes:
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.sampled_from(["rtu", "mbap"]), st.booleans(), st.booleans(), REQUESTS, GARBAGE, SPLITS)
+@given(st.sampled_from(["rtu", "mbap", "udp", "ascii"]), st.booleans(), st.booleans(), REQUESTS, GARBAGE, SPLITS)
 def test_garbage_gives_typed_errors_only_and_the_next_exchange_works(
     kind: str, echo: bool, strict: bool, request: Request[Reply], garbage: bytes, splits: list[tuple[int, int]]
 ) -> None:
@@ -90,7 +145,7 @@ def test_garbage_gives_typed_errors_only_and_the_next_exchange_works(
     assert isinstance(outcome, FieldtwinError), f"a value out of garbage: {outcome}"
     read = ReadRegisters("holding", 0, 2)
     reply = framed(kind, 2, registers_pdu(3, [7, 0xFFFF]))
-    echoed = with_crc(bytes([UNIT]) + read.encode()) if echo and kind == "rtu" else b""
+    echoed = framed(kind, 0, read.encode()) if echo and kind in ("rtu", "ascii") else b""
     answer = play(framer, read, echoed + reply, [])
     assert isinstance(answer, RegistersReply)
     assert answer.registers == (7, 0xFFFF)
@@ -98,7 +153,7 @@ def test_garbage_gives_typed_errors_only_and_the_next_exchange_works(
 
 @settings(max_examples=200, deadline=None)
 @given(
-    st.sampled_from(["rtu", "mbap"]),
+    st.sampled_from(["rtu", "mbap", "zero id", "ascii"]),
     st.lists(st.integers(0, 65535), min_size=1, max_size=125),
     SPLITS,
     st.lists(st.sampled_from([b"\x00", b"\xff"]), max_size=5).map(b"".join),
@@ -107,7 +162,7 @@ def test_a_reply_is_read_whatever_its_pieces(
     kind: str, values: list[int], splits: list[tuple[int, int]], noise: bytes
 ) -> None:
     data = framed(kind, 1, registers_pdu(4, values))
-    if kind == "rtu":
+    if kind in ("rtu", "ascii"):
         data = noise + data
     outcome = play(framer_of(kind), ReadRegisters("input", 0, len(values)), data, splits)
     if isinstance(outcome, ReplyTimeout):
@@ -135,7 +190,7 @@ def test_a_damaged_rtu_reply_is_never_a_value(values: list[int], data: st.DataOb
 
 @settings(max_examples=300, deadline=None)
 @given(
-    st.sampled_from(["rtu", "mbap"]),
+    st.sampled_from(["rtu", "mbap", "zero id", "ascii"]),
     st.integers(1, 20),
     st.lists(st.integers(0, 65535), min_size=1, max_size=20),
     st.sampled_from([1, 2, 3, 4, 6, 16, 23]),
@@ -153,3 +208,66 @@ def test_a_valid_frame_is_a_value_only_if_it_answers_the_request(
         assert (function, unit, outcome.registers) == (3, UNIT, tuple(values))
     else:
         assert isinstance(outcome, WireError)
+
+
+@settings(max_examples=500, deadline=None)
+@given(ALL_REQUESTS, st.binary(max_size=260), st.booleans(), st.data())
+def test_any_pdu_is_a_reply_or_a_typed_error(
+    request: Request[Reply], tail: bytes, refused: bool, data: st.DataObject
+) -> None:
+    head = bytes([request.function | (0x80 if refused else 0)])
+    size = request.nominal_length() or data.draw(st.integers(1, 253))
+    for pdu in (tail, head + tail, (head + tail).ljust(size, b"\x00")[:size]):
+        try:
+            reply = parse_reply(request, pdu, 1)
+        except FieldtwinError:
+            continue
+        assert isinstance(reply, Reply)
+        assert pdu[0] == request.function
+
+
+@given(st.lists(st.integers(0, 65535), min_size=1, max_size=125), st.binary(min_size=1, max_size=250))
+def test_words_and_bits_are_those_that_pymodbus_reads(words: list[int], packed: bytes) -> None:
+    registers = ReadHoldingRegistersResponse()
+    raw = pdus.words_to_bytes(words)
+    registers.decode(bytes([len(raw)]) + raw)
+    assert pdus.words_of(raw) == tuple(registers.registers) == tuple(words)
+    coils = ReadCoilsResponse()
+    coils.decode(bytes([len(packed)]) + packed)
+    assert pdus.bits_of(packed) == tuple(coils.bits)
+
+
+FLOODS = [
+    bytes(range(256)) * 256,
+    bytes(65536),
+    b"\x01\x03" * 32768,
+    b":\n" * 32768,
+    b"\x00\x01\x00\x00" * 16384,
+    b"\n" * 65536,
+]
+
+
+@pytest.mark.parametrize("kind", ["rtu", "mbap", "udp", "ascii"])
+def test_a_flood_of_garbage_is_bounded_in_memory_and_in_work(kind: str) -> None:
+    """1 MB of each kind while a reply is awaited. The bound on work shows in the test's own time limit."""
+    for flood in FLOODS:
+        framer = framer_of(kind)
+        transaction = Transaction(framer, UNIT, ReadRegisters("holding", 0, 2), timeout_ns=TIMEOUT_NS)
+        transaction.start(0)
+        for i in range(16):
+            try:
+                transaction.feed(flood, i)
+            except FieldtwinError:
+                break
+            assert len(framer._buffer) <= 600  # type: ignore[attr-defined]
+        answer = play(framer, ReadRegisters("holding", 0, 1), framed(kind, 2, registers_pdu(3, [9])), [])
+        assert isinstance(answer, RegistersReply)
+        assert answer.registers == (9,)
+
+
+def test_a_reply_behind_more_noise_than_is_searched_is_given_up() -> None:
+    read, reply = ReadRegisters("holding", 0, 1), framed("rtu", 0, registers_pdu(3, [9]))
+    assert isinstance(play(RtuFramer(), read, b"\x55" * (MOST_HUNTED - 300) + reply, []), RegistersReply)
+    outcome = play(RtuFramer(), read, b"\x55" * (MOST_HUNTED + 300) + reply, [])
+    assert isinstance(outcome, WireError)
+    assert "baud rate" in str(outcome)

@@ -321,6 +321,30 @@ def _box(file: YamlFile, form: ProfileForm, name: str, box: BoxForm) -> Box:
     return Box(name, at, box.bytes, ack)
 
 
+def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
+    """What is one value, message or sample must come in one read, and a sample's counter must be able to count."""
+    most = p.form.limits.read_registers
+    for message in p.messages.values():
+        if message.at.count > most:
+            raise file.error(
+                ("messages", message.name),
+                f"the message {message.name!r} cannot be read at once",
+                expected=f"at most {most} registers (`limits: read_registers`)",
+                got=str(message.at.count),
+            )
+    if p.sampled is None:
+        return
+    count = p.tags[p.sampled.count]
+    if not count.is_integer:
+        raise file.error(("sampled", "count"), f"the counter {count.name!r}", expected="a whole number, without scale")
+    if count.poll != p.sampled.poll:
+        raise file.error(
+            ("sampled",),
+            f"the counter {count.name!r} is not read with {p.sampled.poll!r}",
+            expected=f"poll: {count.poll}",
+        )
+
+
 def _check_references(file: YamlFile, p: DeviceProfile) -> None:
     """Every tag that is named elsewhere in the profile must exist, and be of the kind that its use needs."""
     wanted: list[tuple[tuple[Key, ...], str]] = [(("commands", c), t) for c, t in p.form.commands.items()]
@@ -334,6 +358,7 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
     for loc, tag in wanted:
         if tag not in p.tags:
             raise file.error(loc, f"no tag {tag!r} in this profile", expected="one of " + ", ".join(p.tags))
+    _check_reads(file, p)
     for command, tag in p.form.commands.items():
         if not p.tags[tag].writable:
             raise file.error(("commands", command), f"the tag {tag!r} is read-only", expected="`access: rw` or `wo`")

@@ -24,6 +24,8 @@ from gateway.core.errors import FileInvalid
 MAX_BYTES = 8 * 1024 * 1024
 """A configuration file larger than this is a mistake (a recording given as a system file, say)."""
 
+MAX_VALUES = 100_000
+
 Key = str | int
 Position = tuple[int, int]
 M = TypeVar("M", bound=BaseModel)
@@ -77,8 +79,9 @@ def load(path: Path) -> YamlFile:
 
 def parse(text: str, path: str) -> YamlFile:
     """Parse YAML text; `path` is for messages."""
-    loader = _Loader(text)
+    loader: _Loader | None = None
     try:
+        loader = _Loader(text)
         node = loader.get_single_node()
         positions: dict[tuple[Key, ...], Position] = {}
         if not isinstance(node, yaml.MappingNode):
@@ -93,8 +96,11 @@ def parse(text: str, path: str) -> YamlFile:
         raise FileInvalid(f"not YAML: {problem}", path=path, line=line, column=column, hint=hint) from e
     except yaml.YAMLError as e:
         raise FileInvalid(f"not YAML: {e}", path=path, line=1) from e
+    except RecursionError as e:
+        raise FileInvalid("the file is nested too deeply", path=path, line=1) from e
     finally:
-        loader.dispose()
+        if loader is not None:
+            loader.dispose()
     return YamlFile(path, data, positions)
 
 
@@ -103,6 +109,8 @@ def _note_positions(
 ) -> None:
     """Walk the node tree: remember where each value stands, refuse duplicate keys."""
     out.setdefault(loc, (node.start_mark.line + 1, node.start_mark.column + 1))
+    if len(out) > MAX_VALUES:  # a few aliases of aliases are millions of values
+        raise FileInvalid("the file holds too many values", path=path, line=1, expected=f"at most {MAX_VALUES}")
     if isinstance(node, yaml.SequenceNode):
         for i, child in enumerate(node.value):
             _note_positions(loader, child, (*loc, i), out, path)

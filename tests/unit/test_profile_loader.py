@@ -1,0 +1,125 @@
+"""Device profiles: addresses both ways, groups and commands, and every contradiction found when the file is read."""
+
+from __future__ import annotations
+
+import pytest
+from gateway_rig import PROFILES
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.core.errors import FileInvalid
+from gateway.core.profile import DeviceProfile, RegisterRange, load_profile, resolve, resolve_address
+from gateway.core.yaml_file import parse
+
+HEAD = 'device: test/device\nsource: "a test"\n'
+
+
+def read(text: str) -> DeviceProfile:
+    return resolve(parse(HEAD + text, "p.yaml"))
+
+
+@pytest.mark.parametrize("path", sorted(PROFILES.glob("*.yaml")), ids=lambda p: p.stem)
+def test_every_shipped_profile_loads_and_is_short(path: object) -> None:
+    profile = load_profile(path)  # type: ignore[arg-type]
+    assert profile.command_list
+    assert len(PROFILES.joinpath(path.name).read_text(encoding="utf-8").splitlines()) <= 60  # type: ignore[attr-defined]
+    assert profile.form.source  # where its numbers come from
+
+
+@pytest.mark.parametrize(
+    ("text", "expected", "shown"),
+    [
+        (30001, RegisterRange("input", 0, 1), "30001 (input:0)"),
+        (40001, RegisterRange("holding", 0, 1), "40001 (holding:0)"),
+        ("00001", RegisterRange("coil", 0, 1), "00001 (coil:0)"),
+        ("10020", RegisterRange("discrete", 19, 1), "10020 (discrete:19)"),
+        (400001, RegisterRange("holding", 0, 1), "40001 (holding:0)"),
+        (465536, RegisterRange("holding", 65535, 1), "465536 (holding:65535)"),
+        ("holding:0x10", RegisterRange("holding", 16, 1), "40017 (holding:16)"),
+        ("input:9999", RegisterRange("input", 9999, 1), "310000 (input:9999)"),
+    ],
+)
+def test_addresses_as_printed_and_as_sent(text: int | str, expected: RegisterRange, shown: str) -> None:
+    found = resolve_address(text, "printed")
+    assert found == expected
+    assert str(found) == shown
+
+
+@pytest.mark.parametrize(
+    "text", [20001, 50001, 40000, 465537, "holding:65536", "holding:-1", "register:5", "five", 7, "holding:x", ""]
+)
+def test_addresses_that_are_none(text: int | str) -> None:
+    with pytest.raises(ValueError):
+        resolve_address(text, "printed")
+
+
+@given(st.sampled_from(["coil", "discrete", "input", "holding"]), st.integers(0, 65535))
+def test_what_is_shown_can_be_typed(table: str, address: int) -> None:
+    found = resolve_address(f"{table}:{address}", "sent")
+    assert resolve_address(str(found).split(" ", 1)[0], "printed") == found
+
+
+def test_names_that_count_stand_one_behind_the_other() -> None:
+    tags = read("protocol: modbus\ntags:\n  voltage_l1..3: {at: 30001, type: float32}\n").tags
+    assert [(t.name, t.registers.address) for t in tags.values()] == [
+        ("voltage_l1", 0),
+        ("voltage_l2", 2),
+        ("voltage_l3", 4),
+    ]
+
+
+def test_the_command_list_is_what_the_profile_says_and_follows_from_it() -> None:
+    profile = load_profile(PROFILES / "ctd-reference.yaml")
+    assert profile.command_list == {"read_values", "read_status", "read_identity", "set_period"}
+    assert profile.command_for("sample_period_s") == "set_period"
+    modem = load_profile(PROFILES / "modem-mailbox.yaml")
+    assert {"receive", "acknowledge", "send"} <= modem.command_list
+    node = load_profile(PROFILES / "inclinometer-cia410.yaml")
+    assert {"nmt_start", "nmt_stop"} <= node.command_list
+
+
+TAGS = """protocol: modbus
+tags:
+  a: {at: 40001, access: rw}
+  n: {at: 40002, type: uint32, counter: true}
+  p: {at: 40004, type: int16}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "told"),
+    [
+        ("protocol: modbus\ntags:\n  a: {at: 20001}\n", 5, "starts with 2"),
+        ("protocol: modbus\ntags:\n  a: {object: \"6010:00\"}\n", 5, "`at: 30001`"),
+        ("protocol: modbus\ntags:\n  a: {at: 40001, type: string}\n", 5, "`registers: N`"),
+        ("protocol: modbus\ntags:\n  a: {at: 465536, type: float32}\n", 5, "leaves the table"),
+        ("protocol: modbus\ntags:\n  A: {at: 40001}\n", 5, "pattern"),
+        ("protocol: modbus\ntags:\n  a1..2: {at: 40001}\n  a2: {at: 40009}\n", 6, "'a2' stands twice"),
+        ("protocol: modbus\ntags:\n  a: {at: 40001, typ: int16}\n", 5, "did you mean 'type'?"),
+        ("protocol: modbus\ntags:\n  a: {at: 40001, type: int12}\n", 5, "int16"),
+        ("protocol: canopen\neds: x.eds\ntags:\n  a: {at: 40001}\n", 6, "`object:"),
+        ("protocol: canopen\ntags: {}\n", 1, "names its EDS"),
+        (TAGS + "commands: {set_b: b}\n", 8, "no tag 'b'"),
+        (TAGS + "commands: {set_n: n}\n", 8, "read-only"),
+        (TAGS + "behaviours: {off: {fly: 1}}\n", 8, "no command 'fly'"),
+        (TAGS + "messages: {m: {at: 40001, registers: 2, when: z}}\n", 8, "no tag 'z'"),
+        (TAGS + "messages: {m: {at: 40001, registers: 90, when: n}}\nlimits: {read_registers: 60}\n", 8, "60"),
+        (TAGS + "sampled: {count: z, period: p}\n", 8, "no tag 'z'"),
+        (TAGS + "sampled: {count: n, period: p, poll: fast}\n", 8, "fast"),
+        (TAGS + "  f: {at: 40010, type: float32}\nsampled: {count: f, period: p}\n", 9, "whole number"),
+        (TAGS + "identify: [{tag: z}]\n", 8, "no tag 'z'"),
+    ],
+)  # fmt: skip
+def test_contradictions_are_found_when_the_file_is_read(text: str, line: int, told: str) -> None:
+    with pytest.raises(FileInvalid) as error:
+        read(text)
+    assert told in str(error.value)
+    assert error.value.line == line
+    assert error.value.path == "p.yaml"
+
+
+def test_the_hash_is_of_what_is_said_and_not_of_how() -> None:
+    plain = read("protocol: modbus\ntags:\n  a: {at: 40001}\n")
+    styled = read("# a comment\nprotocol: modbus\ntags:\n  a:\n    at: 40001\n")
+    other = read("protocol: modbus\ntags:\n  a: {at: 40002}\n")
+    assert plain.hash == styled.hash != other.hash

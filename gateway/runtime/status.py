@@ -16,7 +16,7 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
         "buses": {name: _bus(bus) for name, bus in gateway.buses.items()},
         "tags": {name: gateway.tags.current(name, now_ns).describe(now_ns) for name in gateway.tags.names},
         "outputs": [
-            {"tag": o.tag, "wanted": o.wanted, "held": o.held, "by": o.by, "refused": o.refused is not None}
+            {"tag": o.tag, "wanted": o.wanted, "held": o.held, "by": o.by, "refused": o.refused == (o.wanted, o.by)}
             for o in gateway.outputs.outputs
         ],
         "writes": {

@@ -1,0 +1,143 @@
+"""Systems, prototypes and instances: what the shipped ones hold, how they are found, and one name that runs once."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gateway.connections.os_connector import OsConnector
+from gateway.core.device import Communication
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import CommandListMismatch, EndpointBusy, FileInvalid, UsageError
+from gateway.devices.config import BusConfig
+from twin.data_files import data_root, find, find_recording
+from twin.instance import Instance, runtime_root
+from twin.mapping import MappedConnector, mapped_endpoint, mapping_from_json, mapping_to_json
+from twin.physical import gateway_config, image_layout, plc_config
+from twin.prototype_file import load_prototype
+from twin.system import load_system
+
+
+def test_the_observatory_is_what_the_paper_says() -> None:
+    system = load_system("observatory")
+    assert {n: str(b.endpoint) for n, b in system.buses.items()} == {
+        "line1": "rtu:/dev/ttyS0?baudrate=19200&frame=8E1", "can0": "can:socketcan/can0", "lan": "tcp://modem:502",
+    }  # fmt: skip
+    assert system.buses["line1"] == BusConfig(
+        "line1", Endpoint.parse("rtu:/dev/ttyS0?baudrate=19200&frame=8E1"), 0.3, 1
+    )
+    ctd = system.devices["ctd"]
+    assert (ctd.address, ctd.poll, ctd.safe, ctd.writable) == (
+        1, {"values": 500, "status": 1000}, {"sample_period_s": 0}, frozenset({"sample_period_s"}),
+    )  # fmt: skip
+    assert system.devices_on("can0") == [system.devices["inclinometer"]]
+    assert gateway_config(system, allow_writes=False).outputs == {"ctd.sample_period_s", "modem.outbox"}
+    assert plc_config(system, Path("/run/x")).cycle_ms == 10.0
+    names = {tag.name for region in image_layout(system).regions for tag in region.tags}
+    assert {"ctd.pressure", "modem.inbox", "modem.outbox", "relay.state", "ctd.sample_period_s"} <= names
+
+
+def test_the_prototype_maps_every_bus_and_the_plant_never_needs_it(tmp_path: Path) -> None:
+    system = load_system("observatory")
+    prototype = load_prototype(system)
+    assert set(prototype.buses) == set(system.buses)
+    assert set(prototype.devices) == set(system.devices)
+    alone = tmp_path / "observatory.yaml"
+    alone.write_bytes(system.path.read_bytes())
+    assert load_system(str(alone)).hash == system.hash  # without a prototype file beside it
+    with pytest.raises(FileInvalid, match=r"observatory\.prototype\.yaml"):
+        load_prototype(load_system(str(alone)))
+
+
+def test_a_bus_of_the_plants_own_needs_no_emulators(tmp_path: Path) -> None:
+    system = load_system("observatory")
+    text = load_prototype(system).path.read_text(encoding="utf-8")
+    path = tmp_path / "mixed.prototype.yaml"
+    path.write_text(text.replace('{listen: "tcp://127.0.0.1:0"}', "plant"), encoding="utf-8")
+    mixed = load_prototype(system, path)
+    assert mixed.buses["lan"].listen is None
+    assert set(mixed.devices) == {"ctd", "inclinometer"}
+
+
+def test_files_are_found_by_flag_then_variable_then_here_then_shipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = data_root() / "profiles" / "systems" / "observatory.yaml"
+    folders = {name: tmp_path / name for name in ("flag", "variable", "here")}
+    for folder in folders.values():
+        (folder / "systems").mkdir(parents=True)
+    (folders["here"] / "profiles" / "systems").mkdir(parents=True)
+    monkeypatch.chdir(folders["here"])
+    monkeypatch.delenv("FIELDTWIN_PROFILES", raising=False)
+    assert find("systems", "observatory") == shipped
+    here = folders["here"] / "profiles" / "systems" / "observatory.yaml"
+    here.write_bytes(shipped.read_bytes())
+    assert find("systems", "observatory").resolve() == here
+    monkeypatch.setenv("FIELDTWIN_PROFILES", os.pathsep.join([str(tmp_path / "none"), str(folders["variable"])]))
+    (folders["variable"] / "systems" / "observatory.yaml").write_bytes(shipped.read_bytes())
+    assert find("systems", "observatory").parent.parent == folders["variable"]
+    (folders["flag"] / "systems" / "observatory.yaml").write_bytes(shipped.read_bytes())
+    assert find("systems", "observatory", extra=[folders["flag"]]).parent.parent == folders["flag"]
+    with pytest.raises(UsageError, match="observatory"):
+        find("systems", "nothing")
+    with pytest.raises(UsageError, match="no recording"):
+        find_recording("nothing.jsonl")
+
+
+def test_an_instance_runs_once_and_leaves_its_name_free(tmp_path: Path) -> None:
+    with Instance("one", tmp_path) as first:
+        assert first.dir.stat().st_mode & 0o777 == 0o700
+        with pytest.raises(EndpointBusy, match="running already"), Instance("one", tmp_path):
+            pass
+        with Instance("two", tmp_path):  # another one beside it
+            pass
+    with Instance("one", tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "..", "-x", "a" * 41, "a b", "ä"])
+def test_names_that_are_none(name: str, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="instance name"):
+        Instance(name, tmp_path)
+
+
+def test_where_instances_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/5")
+    assert runtime_root() == tmp_path
+    monkeypatch.delenv("FIELDTWIN_RUN")
+    assert runtime_root() == Path("/run/user/5/fieldtwin")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert runtime_root() == Path(f"/tmp/fieldtwin-{os.getuid()}")
+    with pytest.raises(UsageError, match="too long for sockets"):
+        Instance("x", tmp_path / ("y" * 100))
+
+
+def test_the_mapping_keeps_what_the_plant_says_of_its_line() -> None:
+    plant = Endpoint.parse("rtu:/dev/ttyS0?baudrate=9600&frame=8N2")
+    target = mapped_endpoint(plant, Endpoint.parse("pty:/run/x/line1"))
+    assert str(target) == "rtu:/run/x/line1?baudrate=9600&frame=8N2"
+    lan = Endpoint.parse("tcp://modem:502")
+    assert str(mapped_endpoint(lan, Endpoint.parse("tcp://127.0.0.1:4711"))) == "tcp://127.0.0.1:4711"
+    mapping = {plant: target, lan: Endpoint.parse("tcp://127.0.0.1:1")}
+    assert mapping_from_json(mapping_to_json(mapping)) == mapping
+
+
+def test_an_endpoint_that_is_not_mapped_is_never_opened() -> None:
+    connector = MappedConnector(OsConnector(), {})
+    with pytest.raises(UsageError, match="not mapped"):
+        connector.open_bytes(Endpoint.parse("tcp://modem:502")).send(None)
+    with pytest.raises(UsageError, match="not mapped"):
+        connector.open_can(Endpoint.parse("can:socketcan/can0"), 125_000).send(None)
+
+
+def test_command_lists_must_be_the_same_in_both_directions() -> None:
+    same = Communication("ctd", frozenset({"a", "b"}), frozenset({"a", "b"}))
+    same.check()
+    with pytest.raises(CommandListMismatch, match="unknown to the device: b; unknown to the driver: nothing"):
+        replace(same, device_commands=frozenset({"a"})).check()
+    with pytest.raises(CommandListMismatch, match="unknown to the device: nothing; unknown to the driver: c"):
+        replace(same, device_commands=frozenset({"a", "b", "c"})).check()

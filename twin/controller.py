@@ -70,7 +70,13 @@ class GatewayProcess:
             ecs = EmbeddedControlSystem(system)
             with attached(ecs.layout, run_dir / "image") as image:
                 self._gateway = ecs.gateway(
-                    connector, self._clock, image, audit, log, allow_writes=self._config.allow_writes
+                    connector,
+                    self._clock,
+                    image,
+                    audit,
+                    log,
+                    allow_writes=self._config.allow_writes,
+                    free_ports=self._config.mapping is not None,
                 )
                 await self._serve(run_dir / "gateway.sock")
         finally:

@@ -111,8 +111,9 @@ def _check_variables(system: System, bound: BoundProgram) -> None:
                 )
 
 
-def gateway_config(system: System, *, allow_writes: bool) -> GatewayConfig:
-    """What the gateway runs."""
+def gateway_config(system: System, *, allow_writes: bool, free_ports: bool = False) -> GatewayConfig:
+    """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host."""
+    serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
     return GatewayConfig(
         buses=system.buses,
@@ -123,6 +124,8 @@ def gateway_config(system: System, *, allow_writes: bool) -> GatewayConfig:
         log_tags=frozenset(f"{name}.log" for name in system.plc.programs),
         allow_writes=allow_writes,
         remote=system.remote == "remote",
+        serve=serving.serve,
+        bridges=serving.bridges,
     )
 
 
@@ -184,10 +187,18 @@ class EmbeddedControlSystem:
         self.layout: ImageLayout = image_layout(system)
 
     def gateway(
-        self, connector: Connector, clock: Clock, image: Image, audit: AuditLog, log: ExchangeLog, *, allow_writes: bool
+        self,
+        connector: Connector,
+        clock: Clock,
+        image: Image,
+        audit: AuditLog,
+        log: ExchangeLog,
+        *,
+        allow_writes: bool,
+        free_ports: bool = False,
     ) -> Gateway:
         """The gateway with its drivers. Which wires `connector` opens, nobody from here on knows."""
-        config = gateway_config(self.system, allow_writes=allow_writes)
+        config = gateway_config(self.system, allow_writes=allow_writes, free_ports=free_ports)
         return Gateway(config, connector, clock, image, audit, log)
 
     def command_lists(self, clock: Clock) -> dict[str, frozenset[str]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gateway.core.endpoint import Endpoint
@@ -18,6 +18,7 @@ from gateway.core.profile import DeviceProfile, Tag, load_profile
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from twin.data_files import find
+from twin.serving import Serving, resolve_serving
 from twin.system_schema import DeviceForm, PlcForm, SystemForm
 
 SCHEMES = ("rtu", "tcp", "rtu+tcp", "can")
@@ -36,6 +37,7 @@ class System:
     plc: PlcForm
     remote: str
     file: YamlFile
+    serving: Serving = field(default_factory=Serving)
 
     def devices_on(self, bus: str) -> list[DeviceConfig]:
         """The devices of a bus, in the file's order."""
@@ -59,9 +61,14 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
         plc=form.plc,
         remote=form.remote,
         file=file,
+        serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc)),
     )
     _check_programs(system)
     return system
+
+
+def _outputs(plc: PlcForm) -> list[str]:
+    return [tag for program in plc.programs.values() for tag in program.outputs.values()]
 
 
 def _bus(file: YamlFile, name: str, url: str, timeout_ms: int, retries: int, bitrate: int) -> BusConfig:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Name = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 Milliseconds = Annotated[int, Field(ge=1, le=3_600_000)]
+Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 TagName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*\.[a-zA-Z][a-zA-Z0-9_]*$")]
 
 
@@ -96,6 +97,53 @@ class PlcForm(Strict):
     programs: dict[Name, ProgramForm] = Field(min_length=1)
 
 
+class ServedTagForm(Strict):
+    """Where a tag is served: exactly one of the four tables, at a PDU address. `type` as the value is; 0 is good quality."""
+
+    input: Address | None = None
+    holding: Address | None = None
+    discrete: Address | None = None
+    coil: Address | None = None
+    type: Literal["bool", "int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"] | None = None
+    order: Literal["ABCD", "CDAB", "BADC", "DCBA"] = "ABCD"
+    quality: Address | None = Field(default=None, description="address of the tag's quality register")
+    write: bool = Field(default=False, description="clients may write it, where the plant allows writes")
+
+
+class ServeForm(Strict):
+    """The process image as Modbus TCP registers, for HMIs and other controllers."""
+
+    url: str
+    unit: int = Field(default=1, ge=0, le=255)
+    tags: dict[TagName, ServedTagForm] = Field(min_length=1)
+    if_bad: Literal["exception", "nan"] = "exception"
+    networks: list[str] = Field(default=["0.0.0.0/0", "::/0"], alias="from", description="who may connect")
+    clients: int = Field(default=16, ge=1, le=1000)
+
+
+class AllowForm(Strict):
+    """What the clients of some networks may ask. Numbers, or ranges such as 0..99."""
+
+    networks: list[str] = Field(default=["127.0.0.0/8", "::1/128"], alias="from", min_length=1)
+    units: list[int | str] | None = None
+    functions: list[int | Literal["read", "write"]] = ["read"]
+    addresses: dict[Literal["coil", "discrete", "input", "holding"], list[int | str]] | None = None
+
+
+class BridgeForm(Strict):
+    """Modbus TCP clients, or the master of a serial line (`url`), reach units of the system's buses."""
+
+    url: str
+    to: Name | None = Field(default=None, description="the bus on which units keep their ids")
+    units: dict[int, str] = Field(default={}, description="unit id of a client -> BUS/UNIT")
+    allow: list[AllowForm] = Field(default=[], description="default: reading functions, from this host")
+    broadcast: bool = Field(default=False, description="pass unit 0 on to serial lines")
+    cache_ms: int = Field(default=0, ge=0, le=60_000)
+    clients: int = Field(default=16, ge=1, le=1000)
+    queue: int = Field(default=32, ge=1, le=64)
+    in_flight: int = Field(default=16, ge=1, le=64)
+
+
 class SystemForm(Strict):
     """A plant: read by the physical twin and by its prototype, byte for byte the same."""
 
@@ -105,6 +153,8 @@ class SystemForm(Strict):
     devices: dict[Name, DeviceForm] = Field(min_length=1)
     plc: PlcForm
     remote: Literal["local", "remote"] = "local"
+    serve: dict[Name, ServeForm] = {}
+    bridge: dict[Name, BridgeForm] = {}
 
 
 class BusMappingForm(Strict):

@@ -1,4 +1,4 @@
-"""The listening side of TCP: each client becomes a `ByteConnection`, served by a coroutine of its own.
+"""The listening side of TCP and TLS: each client becomes a `ByteConnection`, served by a coroutine of its own.
 
 Knows no protocol. Bounded everywhere: so many clients, so many chunks a client, so many bytes on their way out.
 """
@@ -9,7 +9,9 @@ import asyncio
 import errno
 import socket
 from collections.abc import Awaitable, Callable
+from typing import Any
 
+from emulators.endpoints.tls_server import client_role, make_context
 from gateway.core.connection import ByteConnection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
@@ -18,9 +20,11 @@ MAX_CLIENTS = 32
 MAX_PENDING_CHUNKS = 16
 """A chunk is at most what asyncio reads at once (256 KiB): enough for any pipelining, bounded for a flood."""
 CLOSE_WITHIN_S = 1.0
+HANDSHAKE_WITHIN_S = 10.0
+"""Who says nothing when TLS is to begin is gone by then, and never was a client."""
 KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 3
 
-OnClient = Callable[[ByteConnection], Awaitable[None]]
+OnClient = Callable[["SocketEnd"], Awaitable[None]]
 
 
 class SocketEnd(ByteConnection, asyncio.Protocol):
@@ -28,7 +32,9 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
 
     def __init__(self, listener: SocketListener, endpoint: Endpoint) -> None:
         super().__init__(TCPConnection(), endpoint, MAX_PENDING_CHUNKS)
-        self.peer = ""
+        self.peer = self.host = ""
+        self.role = ""
+        """The role in the client's certificate (MODBUS/TCP Security, 8.4); empty without TLS, certificate or role."""
         self.last_used_s = 0.0
         """Loop time of the last byte in either direction."""
         self._listener = listener
@@ -36,6 +42,7 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
         self._transport: asyncio.Transport | None = None
         self._room: asyncio.Future[None] | None = None
         self._full = False
+        self._secured = False
         self._closed = self._loop.create_future()
 
     async def write(self, data: bytes) -> None:
@@ -83,6 +90,11 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
         self.last_used_s = self._loop.time()
         name = transport.get_extra_info("peername")
         self.peer = f"{name[0]}:{name[1]}" if name else "?"
+        self.host = name[0] if name else ""
+        inside = transport.get_extra_info("ssl_object")
+        self._secured = inside is not None
+        if inside is not None:
+            self.role = client_role(inside.getpeercert(binary_form=True))
         _keep_alive(transport.get_extra_info("socket"))
         self._listener.connected(self)
 
@@ -93,7 +105,7 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
 
     def eof_received(self) -> bool:
         self.feed_lost(ConnectionLost("the client ended the connection", where=f"{self.endpoint}: {self.peer}"))
-        return True
+        return not self._secured  # TLS has no half-closed connections
 
     def pause_writing(self) -> None:
         self._full = True
@@ -115,13 +127,18 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
 class SocketListener:
     """Listens on an endpoint and runs `on_client(connection)` for each client; when that returns, the client is closed.
 
-    When `max_clients` are connected, the next one takes the place of the one that was silent for longest (TG 4.2.1).
+    When `max_clients` are connected, the next one takes the place of the one that was silent for longest. Clients on
+    `priority` hosts (addresses) only give way to each other; where nobody may give way, the new one is refused (TG 4.2.1.1).
     """
 
-    def __init__(self, endpoint: Endpoint, on_client: OnClient, max_clients: int) -> None:
+    def __init__(
+        self, endpoint: Endpoint, on_client: OnClient, max_clients: int, priority: frozenset[str] = frozenset()
+    ) -> None:
         self.accepted = 0
         self.evicted = 0
+        self.refused = 0
         self.max_clients = max_clients
+        self.priority = priority
         self._endpoint = endpoint
         self._on_client = on_client
         self._server: asyncio.Server | None = None
@@ -129,15 +146,27 @@ class SocketListener:
         self._tasks: set[asyncio.Task[None]] = set()
 
     @classmethod
-    async def open(cls, endpoint: Endpoint, on_client: OnClient, max_clients: int = MAX_CLIENTS) -> SocketListener:
-        """Listen; port 0 takes a free one (`bound` says which). Raises `EndpointBusy` or `Unreachable`."""
-        listener = cls(endpoint, on_client, max_clients)
+    async def open(
+        cls,
+        endpoint: Endpoint,
+        on_client: OnClient,
+        max_clients: int = MAX_CLIENTS,
+        priority: frozenset[str] = frozenset(),
+    ) -> SocketListener:
+        """Listen; port 0 takes a free one (`bound` says which). A ``tls`` endpoint names our certificate with ``cert``,
+        ``key``, and with ``ca`` whose clients are let in. Raises `EndpointBusy`, `Unreachable` or `UsageError`."""
+        listener = cls(endpoint, on_client, max_clients, priority)
         loop = asyncio.get_running_loop()
+        secured: dict[str, Any] = {}
+        if endpoint.scheme == "tls":
+            secured = {"ssl": make_context(endpoint), "ssl_handshake_timeout": HANDSHAKE_WITHIN_S}
         try:
             # the first address only: a name with an IPv4 and an IPv6 address would get two different free ports
             infos = await loop.getaddrinfo(endpoint.host, endpoint.port, type=socket.SOCK_STREAM)
             host = str(infos[0][4][0])
-            listener._server = await loop.create_server(lambda: SocketEnd(listener, endpoint), host, endpoint.port)
+            listener._server = await loop.create_server(
+                lambda: SocketEnd(listener, endpoint), host, endpoint.port, **secured
+            )
         except OSError as e:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("the port is in use", where=str(endpoint), hint="another instance?") from e
@@ -159,15 +188,27 @@ class SocketListener:
     def connected(self, client: SocketEnd) -> None:
         """A client was accepted."""
         self.accepted += 1
-        if len(self._clients) >= self.max_clients:
-            idlest = min(self._clients, key=lambda c: c.last_used_s)
-            self.evicted += 1
-            self._clients.remove(idlest)
-            idlest.evict()
+        if len(self._clients) >= self.max_clients and not self._make_room(client):
+            self.refused += 1
+            client.evict()
+            return
         self._clients.append(client)
         task = asyncio.get_running_loop().create_task(self._serve(client))
         self._tasks.add(task)
         task.add_done_callback(self._ended)
+
+    def _make_room(self, client: SocketEnd) -> bool:
+        """Close the client that was silent for longest, of those that must give way to this one."""
+        yielding = [c for c in self._clients if c.host not in self.priority]
+        if not yielding and client.host in self.priority:
+            yielding = self._clients
+        if not yielding:
+            return False
+        idlest = min(yielding, key=lambda c: c.last_used_s)
+        self.evicted += 1
+        self._clients.remove(idlest)
+        idlest.evict()
+        return True
 
     async def aclose(self) -> None:
         """Stop listening, end every client's coroutine, close every client."""

@@ -1,13 +1,14 @@
 """Modbus TCP, server side, for one connection (MODBUS Messaging on TCP/IP Implementation Guide V1.0b, TG below).
 
-Pure: bytes in, response ADUs out, in the order of the requests. It never knows sockets, and no other connection.
+Pure: bytes or datagrams in, response ADUs out, in the order of the requests. It never knows sockets, and no other
+connection. Inside TLS it is the same; what a client's certificate allows is asked of whoever knows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
-from emulators.modbus.rtu import Exchange
+from emulators.modbus.line import Exchange
 from emulators.modbus.unit import ModbusUnit
 from gateway.core.errors import Desync, UsageError
 
@@ -21,6 +22,9 @@ ANY_UNIT = (0, 255)
 """Unit ids that mean the device itself, where there is only one behind the address (TG 4.4.1.2)."""
 NO_PATH = 0x0A
 
+Allow = Callable[[int, bytes], bool]
+"""``(unit id, pdu)`` -> whether this client may ask for that."""
+
 
 class MbapSlave:
     """The units behind one connection. `units`: unit id -> unit.
@@ -29,11 +33,15 @@ class MbapSlave:
     0A, as a gateway does without a route. At most `max_in_flight` requests of those that came together are
     executed; the rest gets exception 06.
 
+    A request that `allow` refuses gets exception 01 (MODBUS/TCP Security, 8.3), unexecuted; without it all are allowed.
+
     `desync` says why nothing more is understood: a length that no ADU can have leaves no way to find the next one.
     The connection is to be closed then; what is fed later is dropped.
     """
 
-    def __init__(self, units: Mapping[int, ModbusUnit], max_in_flight: int = MAX_IN_FLIGHT) -> None:
+    def __init__(
+        self, units: Mapping[int, ModbusUnit], max_in_flight: int = MAX_IN_FLIGHT, allow: Allow | None = None
+    ) -> None:
         for unit_id in units:
             if not 0 <= unit_id <= 255:
                 raise UsageError("unit id", expected="0 to 255", got=str(unit_id))
@@ -43,6 +51,7 @@ class MbapSlave:
         self.requests = 0
         self.discarded = 0
         """ADUs that were dropped: not Modbus, or too short for a function."""
+        self._allow = allow
         self._buffer = bytearray()
 
     @property
@@ -63,7 +72,15 @@ class MbapSlave:
         while adu := self._next_adu():
             self.requests += 1
             busy = len(exchanges) >= self.max_in_flight
-            exchanges.append(Exchange(adu, self._execute(adu, busy, now_ns)))
+            exchanges.append(self._exchange(adu, busy, now_ns))
+        return exchanges
+
+    def receive_datagram(self, data: bytes, now_ns: int) -> list[Exchange]:
+        """Like `receive`, for a datagram: what is not whole at its end is dropped, and nothing outlives it."""
+        exchanges = self.receive(data, now_ns)
+        self.discarded += bool(self._buffer)
+        self._buffer.clear()
+        self.desync = None
         return exchanges
 
     def _next_adu(self) -> bytes | None:
@@ -86,18 +103,22 @@ class MbapSlave:
         del buffer[:at]  # once: a flood of ADUs that are none is cut through in one go
         return adu
 
-    def _execute(self, adu: bytes, busy: bool, now_ns: int) -> bytes:
+    def _exchange(self, adu: bytes, busy: bool, now_ns: int) -> Exchange:
         unit_id, pdu = adu[6], adu[7:]
         unit = self._route(unit_id)
         response: bytes | None
-        if unit is not None:
-            unit.heard(messages=1)
-            response = unit.refuse_busy(pdu) if busy else unit.respond(pdu, now_ns)
-        else:
+        if unit is None:
             response = bytes((pdu[0] | 0x80, NO_PATH)) if pdu[0] < 0x80 else None
+        else:
+            unit.heard(messages=1)
+            if self._allow is not None and not self._allow(unit_id, pdu):
+                response = unit.refuse_function(pdu)
+            else:
+                response = unit.refuse_busy(pdu) if busy else unit.respond(pdu, now_ns)
         if response is None:
-            return b""
-        return adu[:4] + (len(response) + 1).to_bytes(2, "big") + adu[6:7] + response
+            return Exchange(adu)
+        reply = adu[:4] + (len(response) + 1).to_bytes(2, "big") + adu[6:7] + response
+        return Exchange(adu, reply, unit.latency_s if unit is not None else 0.0)
 
     def _route(self, unit_id: int) -> ModbusUnit | None:
         if unit_id in self.units:

@@ -6,35 +6,56 @@ Knows no frame format: when to read, when to write, whom to tell.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 
+from emulators.endpoints.udp_end import UdpEnd
+from emulators.modbus.line import Exchange, LineSlave
 from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import Exchange, RtuSlave
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, Direction
+from gateway.core.endpoint import SerialSettings
 from gateway.core.errors import ConnectionLost
 
 OnFrame = Callable[[Direction, int, bytes], None]
 """``(direction, t_ns, adu)`` for each whole ADU, directions as the gateway sees them: SENT is a request. `t_ns` is
 monotonic: when the request was whole, when the last of the reply was handed over. It may not raise."""
 
+Latency = Callable[[Exchange], float]
+"""How many seconds a device thinks about one exchange."""
+
+
+def as_recorded(line: SerialSettings | None = None) -> Latency:
+    """What each unit itself says, as one that replays a recording does.
+
+    A recorded latency ends with the reply's last byte. Where replies are paced on a `line`, the time that they take there
+    is therefore taken off.
+    """
+    char_time_s = line.char_time_s if line is not None else 0.0
+    return lambda exchange: max(0.0, exchange.latency_s - len(exchange.reply) * char_time_s)
+
 
 async def serve_rtu(
     connection: ByteConnection,
-    slave: RtuSlave,
+    slave: LineSlave,
     clock: Clock,
-    latency_s: float = 0.0,
+    latency_s: float | Latency = 0.0,
     on_frame: OnFrame | None = None,
+    *,
+    echo: bool = False,
 ) -> None:
-    """Serve RTU frames on `connection` (a serial line, or a socket that stands for one) until cancelled or lost.
+    """Serve RTU or ASCII frames on `connection` (a serial line, or a socket that stands for one) until cancelled or lost.
 
-    `latency_s`: how long the device thinks before each reply. Returns when the connection is lost; does not close it.
+    `latency_s`: how long the device thinks before each reply, stated or asked for exchange by exchange. `echo`: the master
+    also hears what it sends, as behind a two-wire adapter that listens to itself. Returns when the connection is lost; does
+    not close it.
     """
     try:
         while True:
             data = await _read_or_silence(connection, slave)
             now_ns = clock.monotonic_ns()
-            await _reply(connection, slave.receive(data, now_ns), clock, now_ns, latency_s, on_frame)
+            if echo and data:
+                await connection.write(data)
+            await _reply(connection.write, slave.receive(data, now_ns), clock, now_ns, latency_s, on_frame)
     except ConnectionLost:
         return
 
@@ -43,7 +64,7 @@ async def serve_mbap(
     connection: ByteConnection,
     slave: MbapSlave,
     clock: Clock,
-    latency_s: float = 0.0,
+    latency_s: float | Latency = 0.0,
     on_frame: OnFrame | None = None,
 ) -> None:
     """Serve Modbus TCP on `connection` until cancelled or lost; pipelined requests are answered in order.
@@ -54,13 +75,37 @@ async def serve_mbap(
         while slave.desync is None:
             data = await connection.read()
             now_ns = clock.monotonic_ns()
-            await _reply(connection, slave.receive(data, now_ns), clock, now_ns, latency_s, on_frame)
+            await _reply(connection.write, slave.receive(data, now_ns), clock, now_ns, latency_s, on_frame)
     except ConnectionLost:
         return
     await connection.aclose()
 
 
-async def _read_or_silence(connection: ByteConnection, slave: RtuSlave) -> bytes:
+async def serve_udp(
+    end: UdpEnd,
+    slave: MbapSlave,
+    clock: Clock,
+    latency_s: float | Latency = 0.0,
+    on_frame: OnFrame | None = None,
+) -> None:
+    """Serve Modbus TCP's ADUs in datagrams until cancelled or closed; one `slave` for all clients, one after the other.
+
+    Each reply goes, in a datagram of its own, to where its request came from. A datagram that comes twice is executed twice.
+    """
+    try:
+        while True:
+            data, peer = await end.receive()
+            now_ns = clock.monotonic_ns()
+
+            async def answer(reply: bytes, peer: tuple[str, int] = peer) -> None:
+                await end.send(reply, peer)
+
+            await _reply(answer, slave.receive_datagram(data, now_ns), clock, now_ns, latency_s, on_frame)
+    except ConnectionLost:
+        return
+
+
+async def _read_or_silence(connection: ByteConnection, slave: LineSlave) -> bytes:
     """What comes next; empty after a pause that ends an unfinished frame."""
     if not slave.pending:
         return await connection.read()
@@ -72,11 +117,11 @@ async def _read_or_silence(connection: ByteConnection, slave: RtuSlave) -> bytes
 
 
 async def _reply(
-    connection: ByteConnection,
+    send: Callable[[bytes], Awaitable[None]],
     exchanges: list[Exchange],
     clock: Clock,
     now_ns: int,
-    latency_s: float,
+    latency_s: float | Latency,
     on_frame: OnFrame | None,
 ) -> None:
     if on_frame is not None:
@@ -86,9 +131,10 @@ async def _reply(
     for exchange in exchanges:
         if not exchange.reply:
             continue
-        if latency_s > 0:
-            due_ns += round(latency_s * NS_PER_S)
+        thinks_s = latency_s(exchange) if callable(latency_s) else latency_s
+        if thinks_s > 0:
+            due_ns += round(thinks_s * NS_PER_S)
             await clock.sleep_until_ns(due_ns)
-        await connection.write(exchange.reply)
+        await send(exchange.reply)
         if on_frame is not None:
             on_frame(Direction.RECEIVED, clock.monotonic_ns(), exchange.reply)

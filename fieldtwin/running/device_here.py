@@ -18,9 +18,12 @@ from emulators.endpoints.bus_server import SoftBusServer
 from emulators.endpoints.can_end import open_can_end
 from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import OnClient, SocketListener
+from emulators.endpoints.udp_end import UdpEnd
+from emulators.modbus.ascii import AsciiSlave
+from emulators.modbus.line import LineSlave
 from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu
+from emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.played_objects import PlayedObjects
@@ -41,6 +44,9 @@ from twin.field import unit_limits
 
 DEFAULT_RECORDINGS = {"fieldtwin/ctd-reference": "cast.jsonl", "fieldtwin/inclinometer-cia410": "incl.jsonl"}
 """What a shipped reference device plays when nothing else is said."""
+MAX_CLIENTS = 32
+LINE_PARAMS = ("mode", "echo")
+"""Parameters of an emulated line that are none of its serial settings."""
 
 
 async def run_device(
@@ -80,7 +86,7 @@ class DeviceHost:
     def __init__(self, speed: float) -> None:
         self._clock = WallClock()
         self._speed = speed
-        self._closing: list[SocketListener | SoftBusServer | ByteConnection | CanConnection] = []
+        self._closing: list[SocketListener | UdpEnd | SoftBusServer | ByteConnection | CanConnection] = []
 
     def modbus(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
         """The unit that a Modbus profile describes."""
@@ -119,22 +125,41 @@ class DeviceHost:
         return SignalPlayer(track, self._clock.monotonic_ns(), speed=self._speed, at_end=WhenUsedUp.LOOP)
 
     async def serve(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
-        """Modbus units on a pty, on RTU over TCP, or on Modbus TCP."""
-        if wire.scheme == "pty":
-            plant = Endpoint("rtu", path=wire.path, params=wire.params)
-            end = await PtyEnd.open(Path(wire.path), plant, plant.serial)
-            self._closing.append(end)
-            nursery.start(serve_rtu(end, RtuSlave(units), self._clock), f"units on {wire}")
-            talk.print(
-                f"units {_list(units)} on {wire.path} ({plant.serial.baudrate} {plant.serial.frame})", soft_wrap=True
-            )
+        """Modbus units on a virtual serial port, a socket that stands for one, or Modbus TCP over TCP, UDP or TLS.
+
+        A line takes ``mode=ascii``, and ``echo=1`` where the master is to hear itself.
+        """
+        if wire.scheme in ("pty", "ascii"):
+            await self._serve_pty(nursery, units, wire)
         elif wire.scheme == "rtu+tcp":
-            line = RtuSlave(units)
-            await self._listen(wire, units, lambda c: serve_rtu(c, line, self._clock), 1)
-        elif wire.scheme == "tcp":
-            await self._listen(wire, units, lambda c: serve_mbap(c, MbapSlave(units), self._clock), 32)
+            line, echo = _line(wire, units), wire.param("echo") == "1"
+            await self._listen(wire, units, lambda c: serve_rtu(c, line, self._clock, as_recorded(), echo=echo), 1)
+        elif wire.scheme in ("tcp", "tls"):
+            await self._listen(
+                wire, units, lambda c: serve_mbap(c, MbapSlave(units), self._clock, as_recorded()), MAX_CLIENTS
+            )
+        elif wire.scheme == "udp":
+            end = await UdpEnd.open(wire)
+            self._closing.append(end)
+            nursery.start(serve_udp(end, MbapSlave(units), self._clock, as_recorded()), f"units on {wire}")
+            talk.print(f"units {_list(units)} on {end.bound}", soft_wrap=True)
         else:
-            raise UsageError(f"cannot emulate on {wire}", expected="pty:PATH, tcp://HOST:PORT or rtu+tcp://HOST:PORT")
+            raise UsageError(
+                f"cannot emulate on {wire}",
+                expected="pty:PATH, ascii:PATH, tcp://HOST:PORT, rtu+tcp://HOST:PORT, udp://HOST:PORT or tls://HOST:PORT",
+            )
+
+    async def _serve_pty(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
+        line, echo = _line(wire, units), wire.param("echo") == "1"
+        scheme = "ascii" if isinstance(line, AsciiSlave) else "rtu"
+        settings = tuple((name, value) for name, value in wire.params if name not in LINE_PARAMS)
+        plant = Endpoint(scheme, path=wire.path, params=settings)
+        end = await PtyEnd.open(Path(wire.path), plant, plant.serial)
+        self._closing.append(end)
+        serving = serve_rtu(end, line, self._clock, as_recorded(plant.serial), echo=echo)
+        nursery.start(serving, f"units on {wire}")
+        framing = f"{plant.serial.baudrate} {plant.serial.frame}" + (", ASCII" if scheme == "ascii" else "")
+        talk.print(f"units {_list(units)} on {wire.path} ({framing})", soft_wrap=True)
 
     async def _listen(
         self, wire: Endpoint, units: dict[int, ModbusUnit], on_client: OnClient, max_clients: int
@@ -177,11 +202,25 @@ class DeviceHost:
 
 
 def _as_from_the_factory(wire: Endpoint, profile: DeviceProfile) -> Endpoint:
-    """A virtual port without settings has those with which the device leaves the factory."""
-    if wire.scheme != "pty" or wire.params:
+    """What is not said of a virtual port's settings is as the device leaves the factory; ASCII has a frame of its own."""
+    if wire.scheme not in ("pty", "ascii"):
         return wire
     factory = profile.form.factory
-    return replace(wire, params=(("baudrate", str(factory.baudrate)), ("frame", factory.frame)))
+    usual = {"baudrate": str(factory.baudrate)}
+    if not _is_ascii(wire):
+        usual["frame"] = factory.frame
+    return replace(wire, params=tuple((usual | dict(wire.params)).items()))
+
+
+def _is_ascii(wire: Endpoint) -> bool:
+    mode = wire.param("mode", "ascii" if wire.scheme == "ascii" else "rtu")
+    if mode not in ("rtu", "ascii"):
+        raise UsageError(f"endpoint {wire}: mode", expected="rtu or ascii", got=repr(mode))
+    return mode == "ascii"
+
+
+def _line(wire: Endpoint, units: dict[int, ModbusUnit]) -> LineSlave:
+    return AsciiSlave(units) if _is_ascii(wire) else RtuSlave(units)
 
 
 def _list(units: dict[int, ModbusUnit]) -> str:

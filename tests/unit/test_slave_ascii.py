@@ -1,0 +1,146 @@
+"""ASCII lines and strictly timed RTU lines, character by character (rows 5, 7 and 70 of the edge case catalogue)."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from emulators.modbus.ascii import MAX_CHARACTERS, AsciiReceiver, AsciiSlave
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.rtu import RtuSlave
+from emulators.modbus.unit import ModbusUnit
+from gateway.core.clock import NS_PER_S
+from gateway.core.endpoint import SerialSettings
+
+
+def framed(text: str) -> bytes:
+    """`text` (hex) as an ASCII frame: the LRC makes all bytes sum up to a multiple of 256."""
+    data = bytes.fromhex(text)
+    return f":{data.hex()}{-sum(data) & 0xFF:02x}\r\n".upper().encode()
+
+
+READ, READ_REPLY = framed("01 03 0000 0002"), framed("01 03 04 00AA 00BB")
+
+
+def make_units(*unit_ids: int) -> dict[int, ModbusUnit]:
+    units = {}
+    for unit_id in unit_ids or (1,):
+        bank = MapBank([Span("holding", 0, 126)])
+        bank.poke("holding", 0, 0xAA, 0xBB)
+        units[unit_id] = ModbusUnit(bank)
+    return units
+
+
+def test_a_frame_of_the_standard_s_kind() -> None:
+    assert READ == b":010300000002FA\r\n"
+    slave = AsciiSlave(make_units())
+    (exchange,) = slave.receive(READ, 0)
+    assert (exchange.heard, exchange.reply) == (READ, READ_REPLY)
+
+
+def test_the_delimiter_can_be_changed() -> None:
+    slave = AsciiSlave(make_units())
+    change = framed("01 08 0003 3B00")
+    assert slave.feed(change, 0) == [change], "answered as it was asked"
+    assert slave.feed(READ[:-1] + b";", 1) == [READ_REPLY[:-1] + b";"]
+    assert slave.feed(READ, 2) == [], "LF ends nothing any more"
+    assert slave.feed(READ[:-1] + b";", 3) == [READ_REPLY[:-1] + b";"]
+
+
+def test_every_unit_of_a_line_counts_what_was_damaged() -> None:
+    slave = AsciiSlave(make_units(1, 2))
+    slave.feed(READ[:-4] + b"00\r\n" + READ, 0)
+    assert [u.counters.bus_errors for u in slave.units.values()] == [1, 1]
+    assert [u.counters.bus_messages for u in slave.units.values()] == [1, 2], "a reply is its neighbour's message"
+    assert (slave.counters.frames, slave.counters.crc_errors, slave.counters.noise_bytes) == (1, 1, 17)
+
+
+CHUNKS = st.lists(
+    st.tuples(
+        st.one_of(st.binary(max_size=40), st.sampled_from([READ, READ[:7], b":", b"\r\n", b":0103", b"0" * 300])),
+        st.integers(0, 2 * NS_PER_S),
+    ),
+    max_size=12,
+)
+
+
+@given(CHUNKS)
+def test_garbage_never_raises_and_a_frame_after_it_is_answered(chunks: list[tuple[bytes, int]]) -> None:
+    slave = AsciiSlave(make_units())
+    now_ns = 0
+    for data, wait_ns in chunks:
+        slave.feed(data, now_ns)
+        assert slave.pending < MAX_CHARACTERS
+        now_ns += wait_ns
+    slave.feed(b"\r\n", now_ns)
+    assert slave.feed(READ, now_ns) == [READ_REPLY], "a colon begins a frame, whatever was before"
+
+
+@given(CHUNKS, st.integers(1, 50))
+def test_the_cut_does_not_matter_and_every_character_is_accounted_for(
+    chunks: list[tuple[bytes, int]], step: int
+) -> None:
+    whole, cut = AsciiReceiver(), AsciiReceiver()
+    now_ns, fed = 0, 0
+    for data, wait_ns in chunks:
+        frames = whole.feed(data, now_ns)
+        assert [f for i in range(0, len(data), step) for f in cut.feed(data[i : i + step], now_ns)] == frames
+        fed += len(data)
+        now_ns += wait_ns
+    assert (whole.frames, whole.crc_errors) == (cut.frames, cut.crc_errors)
+    assert whole.noise_bytes == cut.noise_bytes
+    if not whole.frames:
+        assert whole.noise_bytes + whole.pending == fed
+
+
+# -- strict timing ------------------------------------------------------------------------------------------------
+
+LINE = SerialSettings(9600, "8E1")
+CHAR_NS = 1_145_834  # 11 bits, rounded up
+RTU_READ = bytes.fromhex("01 03 0000 0002 C40B")
+
+
+class StrictLine:
+    def __init__(self) -> None:
+        self.slave = RtuSlave(make_units(), strict=LINE)
+        self.now_ns = 0
+        self.replies: list[bytes] = []
+
+    def chars(self, data: bytes) -> StrictLine:
+        for i in range(len(data)):
+            self.now_ns += CHAR_NS
+            self.replies += self.slave.feed(data[i : i + 1], self.now_ns)
+        return self
+
+    def pause(self, chars: float) -> StrictLine:
+        self.now_ns += round(chars * CHAR_NS)
+        self.replies += self.slave.feed(b"", self.now_ns)
+        return self
+
+
+def test_mb_005_strict_a_pause_over_t1_5_spoils_the_frame() -> None:
+    assert len(StrictLine().chars(RTU_READ).pause(3.6).replies) == 1
+    assert len(StrictLine().chars(RTU_READ[:4]).pause(1.4).chars(RTU_READ[4:]).pause(3.6).replies) == 1
+    line = StrictLine().chars(RTU_READ[:4]).pause(1.6).chars(RTU_READ[4:]).pause(3.6)
+    assert line.replies == []
+    assert line.slave.counters.crc_errors == 1
+    assert len(line.chars(RTU_READ).pause(3.6).replies) == 1
+
+
+def test_mb_007_strict_two_frames_need_t3_5_between_them() -> None:
+    line = StrictLine().chars(RTU_READ + RTU_READ).pause(4)
+    assert (line.replies, line.slave.counters.noise_bytes) == ([], 16)
+    assert len(line.chars(RTU_READ).pause(3.6).chars(RTU_READ).pause(3.6).replies) == 2
+    assert len(line.chars(RTU_READ).replies) == 2, "not before the pause"
+
+
+@pytest.mark.parametrize("length", [3, 257, 100_000])
+def test_strict_frames_of_a_wrong_length(length: int) -> None:
+    line = StrictLine()
+    line.now_ns += length * CHAR_NS
+    assert line.slave.feed(bytes(length), line.now_ns) == []
+    assert line.slave.pending == length
+    line.pause(4)
+    assert line.slave.counters.noise_bytes == length
+    assert len(line.chars(RTU_READ).pause(3.6).replies) == 1

@@ -21,6 +21,7 @@ COLOUR = {"good": "green", "uncertain": "yellow", "bad": "red", "substituted": "
 REFRESH_S = 0.25
 LINE_S = 1.0
 MAX_TAGS = 40
+MAX_TROUBLES = 5
 
 
 def print_mapping(session: RunSession) -> None:
@@ -128,8 +129,9 @@ def render(session: RunSession) -> RenderableType:
     left = session.options.duration_s
     clock = f"{session.elapsed_s:5.1f} s" + (f" of {left:.0f} s" if left else "")
     head = Text.assemble((f" {session.system.name} ", "bold reverse"), f" {kind}  {clock}  ", _states(session))
-    parts: list[RenderableType] = [head, _devices(session), _tags(session), _foot(session)]
-    parts += [Text(f"! {error}", style="red") for error in list(session.errors)[-3:]]
+    parts: list[RenderableType] = [head, _devices(session), _foot(session)]
+    parts += [Text(f"! {trouble}", style="red") for trouble in troubles(session)[-MAX_TROUBLES:]]
+    parts.append(_tags(session))  # last: a low terminal cuts off the end of them and nothing else
     return Group(*parts)
 
 
@@ -151,7 +153,7 @@ def _devices(session: RunSession) -> Table:
         ("replies", "right"),
         ("errors", "right"),
     ):
-        table.add_column(column, justify=justify, no_wrap=column != "state")  # type: ignore[arg-type]
+        table.add_column(column, justify=justify, no_wrap=True)  # type: ignore[arg-type]
     gateway = session.gateway_status or {}
     buses = gateway.get("buses", {})
     for name, device in gateway.get("devices", {}).items():
@@ -159,7 +161,7 @@ def _devices(session: RunSession) -> Table:
         good = device["online"]
         table.add_row(
             name,
-            Text("good", "green") if good else Text(f"bad: {device['error']}", "red", overflow="ellipsis"),
+            Text("good", "green") if good else Text("bad", "red"),  # why stands below, where there is room
             f"{device['bus']}:{device['address']}",
             str(counters.get("requests", counters.get("sdo_requests", 0))),
             str(counters.get("replies", counters.get("sdo_replies", 0))),

@@ -1,0 +1,100 @@
+"""What a person sees of a run, on a narrow and a low terminal and on none: nothing cut that matters, reasons named."""
+
+from __future__ import annotations
+
+from io import StringIO
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from fieldtwin.cli.live_view import age_text, line, render, troubles, value_text
+from fieldtwin.running.options import RunOptions
+from fieldtwin.running.session import RunSession
+
+NOBODY = "rtu:/dev/ttyS0?baudrate=19200&frame=8E1: cannot open the serial port: No such file or directory"
+SILENT = "tcp://modem:502: unit 1: no reply within 2.0 s; expected unit 1, function 03h"
+
+
+@pytest.fixture
+def session() -> RunSession:
+    """A run that was not started, with what its gateway and PLC might have answered."""
+    made = RunSession(RunOptions("observatory", prototype=False, duration_s=20))
+    made.started_ns = made.clock.monotonic_ns()
+    online: dict[str, Any] = {"online": True, "error": "", "errors": 0}
+    made.gateway_status = {
+        "devices": {
+            "ctd": {**online, "bus": "line1", "address": 1, "online": False, "error": NOBODY},
+            "inclinometer": {**online, "bus": "can0", "address": 5},
+            "modem": {**online, "bus": "lan", "address": 1, "online": False, "error": SILENT},
+        },
+        "buses": {
+            "line1": {"error": NOBODY, "counters": {}},
+            "can0": {"error": "", "counters": {"sdo_requests": 18, "sdo_replies": 17}},
+            "lan": {"error": "", "counters": {"requests": 123456, "replies": 123455}},
+        },
+        "tags": {
+            f"{d.name}.{t.name}": {"value": 1.0 / 3, "quality": "uncertain", "reason": "not sampling", "age_s": 99.5}
+            for d in made.system.devices.values()
+            for t in d.profile.tags.values()
+        },
+        "mailboxes": {"modem": {"received": 1, "sent": 2, "taken": 1, "queued": 0}},
+        "plc": {"alive": False},
+        "logged": 5,
+    }
+    late = {"p50": 70.0, "p99": 2060.0, "max": 21270.0}
+    made.plc_status = {"cycle_ms": 10.0, "scans": 707, "missed_periods": 2, "state": "running", "lateness_us": late}
+    return made
+
+
+def shown(session: RunSession, width: int, height: int = 60) -> list[str]:
+    out = StringIO()
+    console = Console(file=out, width=width, height=height, force_terminal=False)
+    console.print(render(session))
+    return out.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", [80, 140])
+def test_it_fits_the_terminal_and_nothing_is_cut_off(session: RunSession, width: int) -> None:
+    lines = shown(session, width)
+    assert max(len(text) for text in lines) <= width
+    text = " ".join(" ".join(lines).split())
+    for wanted in (
+        NOBODY,
+        SILENT,
+        "123456",
+        "123455",
+        "uncertain (not sampling)",
+        "99.50 s",
+        "0.333333",
+        "max 21.27 ms",
+    ):
+        assert wanted in text
+    assert "…" not in text
+
+
+def test_a_low_terminal_still_shows_devices_scan_and_what_is_wrong(session: RunSession) -> None:
+    top = " ".join(" ".join(shown(session, 80)[:20]).split())
+    for wanted in ("ctd", "inclinometer", "modem", "scan 10 ms", NOBODY, SILENT):
+        assert wanted in top
+
+
+def test_without_a_terminal_there_is_no_escape_and_one_line(session: RunSession) -> None:
+    text = line(session)
+    assert "\n" not in text
+    assert "\x1b" not in text + "".join(shown(session, 80))
+    for wanted in ("ctd=bad", "inclinometer=good", "tags_good=0/15", "requests=123474", "PLC LOST"):
+        assert wanted in text
+
+
+def test_every_trouble_is_named_once(session: RunSession) -> None:
+    session.note_error("plc: ended with signal 9")
+    assert troubles(session) == ["plc: ended with signal 9", f"line1: {NOBODY}", f"modem: {SILENT}"]
+    session.gateway_status = session.plc_status = None
+    assert troubles(session) == ["plc: ended with signal 9"]
+    shown(session, 80)  # and nothing breaks while nobody answers
+
+
+def test_values_for_people() -> None:
+    assert [value_text(v) for v in (None, 1.0 / 3, 5, "0042", True)] == ["-", "0.333333", "5", "0042", "True"]
+    assert [age_text(a) for a in (None, 0.049, 99.5, 1234.5)] == ["-", "0.05 s", "99.50 s", "1234 s"]

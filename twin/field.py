@@ -227,9 +227,11 @@ class FieldSide:
                 raise FileInvalid(
                     f"identity {name!r} of {config.name!r}", path=str(self.prototype.path), expected="a number"
                 )
-            raw = factory[tag.object] = encode_object(entry.data_type, int(text))
-            played.journal.note(name, raw, self._clock.monotonic_ns())
+            factory[tag.object] = encode_object(entry.data_type, int(text))
         node = CanopenNode(dictionary, config.address, NodeContext(source=played, factory=factory))
+        for name, tag in emulated.profile.tags.items():  # what nobody plays is held as well: by the data sheet
+            if tag.object is not None and node.data.has(*tag.object):
+                played.journal.note(name, node.data.get(*tag.object), self._clock.monotonic_ns())
         device = self.devices[config.name] = FieldDevice(emulated, None, node)
         device.journal = played.journal
         return node

@@ -57,7 +57,9 @@ def test_Connection_Read_takes_the_head(kind: type[Connection[bytes]], stream: l
 @pytest.mark.parametrize("kind", BYTES)
 @given(steps=st.lists(st.none() | st.binary(max_size=4)))
 def test_Connection_loses_and_changes_nothing(kind: type[Connection[bytes]], steps: list[bytes | None]) -> None:
-    connection, written, read = kind(), [], []
+    connection = kind()
+    written: list[bytes] = []
+    read: list[bytes] = []
     for step in steps:
         if step is not None:
             connection.write(step)

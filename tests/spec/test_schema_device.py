@@ -55,7 +55,7 @@ class Modem(Transmitter):
 @pytest.mark.parametrize("kind", [Device, Sensor, Transmitter, Emulator])
 def test_Device_is_abstract(kind: type[Device]) -> None:
     with pytest.raises(TypeError, match="abstract"):
-        kind(wire(RS232Connection)[0], ["read"])  # type: ignore[abstract]
+        kind(wire(RS232Connection)[0], ["read"])
 
 
 def test_Device_owns_a_concrete_connection_and_never_the_abstract_class() -> None:

@@ -1,0 +1,199 @@
+"""Schemas DeviceDriver, SensorDriver, TransmitterDriver: the drivers of a run, on real wires to its emulators."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from spec_rig import CLOCK, observatory, rig
+from support import run
+
+from gateway.connections.os_connector import OsConnector
+from gateway.core.connection import PROTOCOL, ByteConnection, RS232Connection, TCPConnection
+from gateway.core.errors import Bug, FileInvalid, UnknownCommand
+from gateway.core.events import Consumer, Producer
+from gateway.core.profile import Box
+from gateway.core.values import COMMAND, DATA, MEASUREMENT, RESPONSE
+from gateway.devices.driver import DeviceDriver
+from gateway.devices.register_device import SensorDriver
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.tags import TagTable
+from twin.physical import make_drivers
+
+SYSTEM, _ = observatory()
+
+
+def unattached() -> dict[str, DeviceDriver]:
+    return dict(make_drivers(SYSTEM, TagTable(CLOCK), CLOCK))
+
+
+class Nowhere(ByteConnection):
+    """An open end of a kind, of which only the kind matters here."""
+
+    async def write(self, data: bytes) -> None:
+        raise AssertionError("nothing may be written")
+
+    async def aclose(self) -> None:
+        return
+
+
+def end(kind: type[RS232Connection] | type[TCPConnection]) -> Nowhere:
+    return Nowhere(kind(), SYSTEM.buses["line1"].endpoint)
+
+
+def test_DeviceDriver_is_abstract() -> None:
+    assert inspect.isabstract(DeviceDriver)
+
+
+@pytest.mark.parametrize("name", list(SYSTEM.devices))
+def test_DeviceDriver_owns_an_emitter_and_a_consumer_and_Init_leaves_the_consumer_empty(name: str) -> None:
+    driver = unattached()[name]
+    assert isinstance(driver.emitter, Producer)
+    assert isinstance(driver.consumer, Consumer)
+    assert not driver.consumer.queue
+    with pytest.raises(Bug, match="without a connection"):
+        _ = driver.connection
+
+
+def test_DeviceDriver_Init_takes_a_connection_that_is_initialised(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            for name in ("ctd", "modem"):
+                inbound = r.drivers[name].connection.inbound
+                assert type(inbound) in (RS232Connection, TCPConnection)
+                assert not inbound.data_stream
+
+    run(main())
+
+
+def test_DeviceDriver_opens_nothing_itself() -> None:
+    """Who opens a wire is the connector that the runtime was given; it cannot be reached from a driver."""
+    for driver in unattached().values():
+        assert not any(isinstance(held, OsConnector) for held in vars(driver).values())
+
+
+def test_DeviceDriver_Send_is_consume_then_write(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            driver, unit = r.register_driver("ctd"), r.unit("ctd")
+            with pytest.raises(Bug, match="empty"):
+                await driver.send()
+            for period_s in (7, -1, 0):
+                driver.consumer.observe(driver.command("sample_period_s", period_s))
+            for left, period_s in ((2, 7), (1, -1), (0, 0)):  # in order, one each
+                await driver.send()
+                assert len(driver.consumer.queue) == left
+                assert list(unit.bank.read("holding", 1, 1, CLOCK.monotonic_ns())) == [period_s & 0xFFFF]
+            assert unit.emulator.executed["set_period"] == 3
+
+    run(main())
+
+
+def test_DeviceDriver_Send_refuses_what_is_not_in_the_command_list(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            driver, unit = r.register_driver("ctd"), r.unit("ctd")
+            driver.consumer.observe(COMMAND(b"\0\1", "self_destruct"))
+            with pytest.raises(UnknownCommand, match="self_destruct"):
+                await driver.send()
+            assert unit.counters.requests == 0
+
+    run(main())
+
+
+def test_DeviceDriver_Receive_is_read_then_emit(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            driver, unit = r.register_driver("ctd"), r.unit("ctd")
+            ears: list[Consumer[DATA]] = [Consumer(driver.emitter.event) for _ in range(2)]
+            for ear in ears:
+                driver.emitter.subscribe(ear)
+            await driver.receive("values")  # the base line: how old that sample is, nobody knows
+            driver.consumer.observe(driver.command("sample_period_s", 3600))
+            await driver.send()  # the first sample is taken at once
+            await driver.receive("values")
+            words = unit.bank.read("input", 0, 10, CLOCK.monotonic_ns())
+            sample = MEASUREMENT(b"".join(word.to_bytes(2) for word in words))
+            assert [list(ear.queue) for ear in ears] == [[sample], [sample]]
+
+    run(main())
+
+
+def test_SensorDriver_is_the_driver_on_RS232_and_accepts_no_other_connection() -> None:
+    driver = unattached()["ctd"]
+    assert type(driver) is SensorDriver
+    assert SensorDriver.wire_types == {PROTOCOL.RS232}
+    driver.attach(end(RS232Connection))
+    with pytest.raises(FileInvalid, match="cannot stand on this bus"):
+        driver.attach(end(TCPConnection))
+
+
+def test_SensorDriver_result_of_a_command_is_a_RESPONSE(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            driver = r.register_driver("ctd")
+            ear: Consumer[DATA] = Consumer(driver.emitter.event)
+            driver.emitter.subscribe(ear)
+            await driver.receive("values")
+            driver.consumer.observe(driver.command("sample_period_s", 3600))
+            await driver.send()
+            await driver.receive("values")
+            assert isinstance(ear.consume(), RESPONSE)
+
+    run(main())
+
+
+def test_TransmitterDriver_is_the_driver_on_TCP_and_accepts_no_other_connection() -> None:
+    driver = unattached()["modem"]
+    assert type(driver) is TransmitterDriver
+    assert TransmitterDriver.wire_types == {PROTOCOL.TCP}
+    driver.attach(end(TCPConnection))
+    with pytest.raises(FileInvalid, match="cannot stand on this bus"):
+        driver.attach(end(RS232Connection))
+
+
+@settings(max_examples=10, deadline=None)
+@given(payloads=st.lists(st.binary(min_size=1, max_size=64), min_size=1, max_size=4))
+def test_TransmitterDriver_is_a_pure_relay(tmp_path_factory: pytest.TempPathFactory, payloads: list[bytes]) -> None:
+    """Both ways, payloads unaltered, the same one twice is two (ruling 17). The link loses nothing here."""
+
+    async def main() -> None:
+        async with rig(tmp_path_factory.mktemp("relay")) as r:
+            driver = r.register_driver("modem")
+            assert isinstance(driver, TransmitterDriver)
+            near = r.unit("modem").bank
+            ear: Consumer[DATA] = Consumer(driver.emitter.event)
+            driver.emitter.subscribe(ear)
+            await driver.synchronise()
+            outbox, inbox = driver.profile.outbox, driver.profile.inbox
+            assert outbox is not None
+            assert inbox is not None
+            for sequence, payload in enumerate(payloads, 1):
+                driver.consumer.observe(RESPONSE(payload))
+                await driver.send()
+                words = list(near.read("holding", outbox.at.address, outbox.at.count, CLOCK.monotonic_ns()))
+                assert (words[0], message(words, outbox)) == (sequence, payload)
+                while not await driver.check_outbox():
+                    pass
+                put_into_inbox(near, inbox, sequence, payload)
+                await driver.receive("inbox")
+                await driver.receive("inbox")  # the same sequence again is the same message
+                await driver.acknowledge()
+            assert list(ear.queue) == [COMMAND(payload) for payload in payloads]
+
+    run(main())
+
+
+def message(words: list[int], box: Box) -> bytes:
+    return b"".join(word.to_bytes(2) for word in words[2:])[: words[1]][: box.bytes]
+
+
+def put_into_inbox(near: object, box: Box, sequence: int, payload: bytes) -> None:
+    """What arrives over the acoustic link, without waiting for it: the cells that the modem itself sets."""
+    cells = near._cells  # type: ignore[attr-defined]
+    padded = payload + b"\0" * (len(payload) % 2)
+    body = [int.from_bytes(padded[i : i + 2]) for i in range(0, len(padded), 2)]
+    cells.poke("holding", box.at.address, sequence, len(payload), *body)

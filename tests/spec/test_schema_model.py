@@ -1,0 +1,106 @@
+"""Schemas STATE, ACTIVE, STANDBY, OFF, EventStateMachine, DigitalModel."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from spec_rig import CLOCK, observatory
+
+from fieldtwin.running.states import expected_states
+from gateway.core.errors import Desync
+from gateway.core.statemachine import ACCEPTING, ACTIVE, OFF, STANDBY, STATE, STATES, EventStateMachine, encode_period
+from gateway.core.values import COMMAND
+from twin.model import DigitalModel
+from twin.prototype import DigitalTwinPrototype
+
+PERIODS = st.integers(-32768, 32767)
+
+
+def state_of(x: int) -> type[STATE]:
+    """The row, written once more: x > 0 ACTIVE, x = 0 STANDBY, x < 0 OFF."""
+    return ACTIVE if x > 0 else STANDBY if x == 0 else OFF
+
+
+def test_STATE_is_abstract_and_execute_is_overridden_by_each() -> None:
+    assert inspect.isabstract(STATE)
+    assert {type(state) for state in STATES.values()} == {ACTIVE, STANDBY, OFF}
+    for state in STATES.values():
+        assert "execute" in vars(type(state))
+
+
+@given(period_s=st.integers(1, 32767))
+def test_STATE_execute_samples_at_the_period_in_ACTIVE_and_never_otherwise(period_s: int) -> None:
+    assert ACTIVE().execute(period_s) == period_s
+    assert STANDBY().execute(period_s) == OFF().execute(period_s) == 0
+
+
+def test_STATE_OFF_alone_is_accepting() -> None:
+    """Ruling 6."""
+    assert {"OFF"} == ACCEPTING
+
+
+@pytest.mark.parametrize("kind", [EventStateMachine, DigitalModel])
+def test_EventStateMachine_Init_is_STANDBY_and_period_0(kind: type[EventStateMachine] | type[DigitalModel]) -> None:
+    """Ruling 6: Init also sets STANDBY. The model's Init is its machine's."""
+    made = kind()
+    assert type(made.state) is STANDBY
+    assert made.period_s == 0
+
+
+@given(before=st.lists(PERIODS, max_size=3), x=PERIODS | st.sampled_from([-1, 0, 1, -32768, 32767]))
+def test_EventStateMachine_ProcessEvent_depends_on_the_sign_alone_from_every_state(before: list[int], x: int) -> None:
+    """Ruling 6: total, OFF included, and it sets the period."""
+    machine = EventStateMachine()
+    for earlier in before:
+        machine.process_event(encode_period(earlier))
+    new = machine.process_event(encode_period(x))
+    assert type(new) is type(machine.state) is state_of(x)
+    assert machine.period_s == x
+
+
+@given(bits=st.binary(max_size=5).filter(lambda b: len(b) != 2), x=PERIODS)
+def test_EventStateMachine_what_is_no_command_changes_nothing(bits: bytes, x: int) -> None:
+    machine = EventStateMachine()
+    machine.process_event(encode_period(x))
+    with pytest.raises(Desync):
+        machine.process_event(COMMAND(bits))
+    assert (machine.period_s, type(machine.state)) == (x, state_of(x))
+
+
+def test_DigitalModel_contains_one_state_machine_and_nothing_else() -> None:
+    """No connection to the physical twin of its own: there is no attribute in which it could hold one."""
+    model = DigitalModel()
+    assert DigitalModel.__slots__ == ("state_machine",)
+    assert type(model.state_machine) is EventStateMachine
+    assert set(vars(model.state_machine)) == {"state", "period_s"}
+    with pytest.raises(AttributeError):
+        model.connection = object()  # type: ignore[attr-defined]
+
+
+@given(events=st.lists(PERIODS))
+def test_DigitalModel_ProcessEvent_delegates(events: list[int]) -> None:
+    model, machine = DigitalModel(), EventStateMachine()
+    for x in events:
+        assert model.process_event(encode_period(x)) is machine.process_event(encode_period(x))
+        assert (model.state, model.period_s) == (machine.state, machine.period_s)
+        assert model.state is model.state_machine.state
+
+
+def test_DigitalModel_is_another_instance_in_every_twin() -> None:
+    one, other = (DigitalTwinPrototype(*observatory(), CLOCK) for _ in range(2))
+    one.model.process_event(encode_period(5))
+    assert type(one.model.state) is ACTIVE
+    assert type(other.model.state) is STANDBY
+    assert one.model.state_machine is not other.model.state_machine
+
+
+@given(events=st.lists(PERIODS, max_size=12))
+def test_DigitalModel_is_what_a_run_is_judged_by(events: list[int]) -> None:
+    expected = ["STANDBY"]
+    for x in events:
+        if state_of(x).name != expected[-1]:
+            expected.append(state_of(x).name)
+    assert expected_states(events) == expected

@@ -69,6 +69,17 @@ def test_crc_of_the_check_string_and_of_a_whole_frame() -> None:
     assert crc16(REPLY) == 0
 
 
+@pytest.mark.parametrize("length", [0, 1, 2, 3, 25, 255, 256, 257, 258, 1001])
+def test_crc_is_that_of_the_shift_register(length: int) -> None:
+    data = bytes((i * 89 + 7) & 0xFF for i in range(length))
+    register = 0xFFFF  # SL 6.2.2.1, step by step
+    for byte in data:
+        register ^= byte
+        for _ in range(8):
+            register = (register >> 1) ^ (0xA001 if register & 1 else 0)
+    assert crc16(data) == crc16(bytearray(data)) == register
+
+
 # 19200 8E1: a character takes 573 us, t1.5 is 859 us, t3.5 is 2005 us
 CHAR_NS = 572_917
 

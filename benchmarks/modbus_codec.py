@@ -1,0 +1,151 @@
+#!/usr/bin/env python3
+"""One read without a wire, both ends: request, framing, the slave's answer, framing, checked reply. Against pymodbus.
+
+    benchmarks/modbus_codec.py [--runs 5] [--transactions 3000]
+
+Ours is the master's `Transaction` and the emulator's slave with a map behind it; pymodbus's is its client and server over
+its own null modem, and, apart, its framers and PDU classes alone with a list behind them. Runs are interleaved; times are
+microseconds a transaction, ratios pairwise to the null modem over the same framing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import gc
+import sys
+import time
+from collections.abc import Callable
+from statistics import median
+
+from peers import row
+from pymodbus import FramerType
+from pymodbus.client import AsyncModbusTcpClient
+from pymodbus.framer import FramerRTU, FramerSocket
+from pymodbus.pdu import DecodePDU
+from pymodbus.pdu.register_message import ReadHoldingRegistersRequest, ReadHoldingRegistersResponse
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+from pymodbus.transport import NULLMODEM_HOST
+
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.rtu import RtuSlave
+from emulators.modbus.unit import ModbusUnit
+from gateway.protocols.modbus.mbap import MbapFramer
+from gateway.protocols.modbus.requests import ReadRegisters
+from gateway.protocols.modbus.rtu import RtuFramer
+from gateway.protocols.modbus.transaction import Transaction
+
+VALUES = [(i * 257) & 0xFFFF for i in range(125)]
+TIMEOUT_NS = 1_000_000_000
+GAP_NS = 10_000_000
+UNIT = 1
+
+
+def ours(framing: str, count: int, transactions: int) -> float:
+    """Seconds for `transactions` reads of `count` registers."""
+    bank = MapBank([Span("holding", 0, len(VALUES))])
+    bank.poke("holding", 0, *VALUES)
+    units = {UNIT: ModbusUnit(bank)}
+    slave = MbapSlave(units) if framing == "mbap" else RtuSlave(units)
+    framer = MbapFramer() if framing == "mbap" else RtuFramer()
+    wanted = tuple(VALUES[:count])
+
+    def exchange(now_ns: int) -> None:
+        transaction = Transaction(framer, UNIT, ReadRegisters("holding", 0, count), timeout_ns=TIMEOUT_NS)
+        [answer] = slave.feed(transaction.start(now_ns), now_ns)
+        reply = transaction.feed(answer, now_ns)
+        assert reply is not None
+        assert reply.registers == wanted
+
+    return timed(exchange, transactions)
+
+
+def pymodbus_codec(framing: str, count: int, transactions: int) -> float:
+    framer = FramerSocket if framing == "mbap" else FramerRTU
+    client, server = framer(DecodePDU(False)), framer(DecodePDU(True))
+    wanted = VALUES[:count]
+
+    def exchange(now_ns: int) -> None:
+        number = now_ns // GAP_NS & 0xFFFF
+        request = ReadHoldingRegistersRequest(address=0, count=count, dev_id=UNIT, transaction_id=number)
+        _, asked = server.handleFrame(client.buildFrame(request), 0, 0)
+        assert asked is not None
+        answer = ReadHoldingRegistersResponse(
+            registers=VALUES[asked.address : asked.address + asked.count],
+            dev_id=asked.dev_id,
+            transaction_id=asked.transaction_id,
+        )
+        _, reply = client.handleFrame(server.buildFrame(answer), UNIT, number)
+        assert reply is not None
+        assert reply.registers == wanted
+
+    return timed(exchange, transactions)
+
+
+def timed(exchange: Callable[[int], None], transactions: int) -> float:
+    exchange(0)
+    gc.collect()
+    began = time.perf_counter()
+    for i in range(1, transactions + 1):
+        exchange(i * GAP_NS)
+    return time.perf_counter() - began
+
+
+def pymodbus_null_modem(framing: str, count: int, transactions: int) -> float:
+    async def main() -> float:
+        registers = SimData(0, values=VALUES, datatype=DataType.REGISTERS)
+        bits = SimData(0, values=[False] * 16, datatype=DataType.BITS)
+        framer = FramerType.SOCKET if framing == "mbap" else FramerType.RTU
+        server = ModbusTcpServer(
+            SimDevice(id=UNIT, simdata=([bits], [bits], [registers], [registers])),
+            framer=framer,
+            address=(NULLMODEM_HOST, 5020),
+        )
+        await server.serve_forever(background=True)
+        client = AsyncModbusTcpClient(NULLMODEM_HOST, port=5020, framer=framer)
+        await client.connect()
+        wanted = VALUES[:count]
+        await client.read_holding_registers(0, count=count, device_id=UNIT)
+        gc.collect()
+        began = time.perf_counter()
+        for _ in range(transactions):
+            reply = await client.read_holding_registers(0, count=count, device_id=UNIT)
+            assert reply.registers == wanted
+        took_s = time.perf_counter() - began
+        client.close()
+        await server.shutdown()
+        return took_s
+
+    return asyncio.run(main())
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--transactions", type=int, default=3000)
+    options = parser.parse_args()
+    contestants = {
+        "pymodbus null modem": pymodbus_null_modem,
+        "pymodbus codec only": pymodbus_codec,
+        "fieldtwin": ours,
+    }
+    for framing in ("mbap", "rtu"):
+        for count in (10, 125):
+            took_us: dict[str, list[float]] = {name: [] for name in contestants}
+            for _ in range(options.runs):
+                for name, run in contestants.items():
+                    took_us[name].append(run(framing, count, options.transactions) / options.transactions * 1e6)
+            print(f"{f'{framing}, {count} registers':<22} {'us, median':>12}   ratio")
+            for name, values in took_us.items():
+                print(row(name, values, took_us["pymodbus null modem"]))
+            cheapest = min(took_us["fieldtwin"])
+            print(
+                f"{'':<22} {cheapest:>12.1f}   fieldtwin, best of {options.runs}; median {median(took_us['fieldtwin']):.1f}\n"
+            )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

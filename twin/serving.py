@@ -70,6 +70,8 @@ def resolve_serving(
         *(("serve", s.name, s.listen) for s in servers),
         *(("bridge", b.name, b.listen) for b in bridges),
     ]:
+        if not listen.is_serial and listen.port == 0:
+            continue  # a free port of its own
         if str(listen) in taken:
             raise file.error((section, name, "url"), f"{listen} is taken by {taken[str(listen)]}")
         taken[str(listen)] = f"{section} {name!r}"

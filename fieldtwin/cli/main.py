@@ -19,6 +19,7 @@ COMMANDS = {
     "emulate": ("fieldtwin.cli.emulate_command", "Emulate the field side of a system, or one device."),
     "shore": ("fieldtwin.cli.shore_command", "The far end of a system's transmitter: send commands, show responses."),
     "link": ("fieldtwin.cli.link_command", "The emulated connection on its own: a serial port carried over TCP."),
+    "bridge": ("fieldtwin.cli.bridge_command", "Modbus TCP clients to units on a serial line, or the other way round."),
     "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
     "schema": ("fieldtwin.cli.schema_command", "Print the JSON schema of a kind of file."),

@@ -18,7 +18,6 @@ from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Connector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import (
-    Bug,
     EndpointBusy,
     FieldtwinError,
     ModbusExceptionReply,
@@ -36,6 +35,7 @@ from gateway.protocols.modbus.server import (
     NO_PATH,
     NO_RESPONSE,
     SERVER_BUSY,
+    SERVER_FAILURE,
     Asked,
     examine,
     exception_pdu,
@@ -82,6 +82,8 @@ class BridgeConfig:
     clients: int = 16
     queue: int = 32
     in_flight: int = 16
+    insist: bool = True
+    """Whether a port that cannot be listened on is tried again and again; else that is an error."""
 
     @property
     def buses(self) -> set[str]:
@@ -131,6 +133,8 @@ class Bridge:
         self.counters = BridgeCounters()
         self.cache = ReplyCache(config.cache_ms)
         self._buses = {name: buses[name] for name in config.buses}
+        if any(r.unit == 0 and self._is_line(r.bus) for r in config.routes.values()):
+            raise UsageError(f"bridge {config.name!r}: unit 0 of a line is every unit", hint="`broadcast` passes it on")
         self._clock = clock
         self._audit = audit
         self._blocked = blocked
@@ -150,6 +154,7 @@ class Bridge:
                 max_clients=config.clients,
                 in_flight=config.in_flight,
                 admits=config.policy.admits,
+                insist=config.insist,
             )
 
     async def run(self) -> None:
@@ -293,7 +298,7 @@ class Bridge:
 
     def _code_of(self, error: FieldtwinError, route: Route) -> int:
         """What a client is told: the unit's own exception as it is, 0B where nobody answered (properly), 06 where there was
-        no room, 0A where our own wire is gone. Behind TCP that wire is the unit's."""
+        no room, 0A where our own wire is gone. Behind TCP that wire is the unit's. Anything else is our own failure, 04."""
         match error:
             case ModbusExceptionReply():
                 return error.code
@@ -304,7 +309,7 @@ class Bridge:
             case WireError() | VerifyFailed():
                 return NO_RESPONSE
             case _:
-                raise Bug(f"no Modbus exception for {type(error).__name__}: {error}")
+                return SERVER_FAILURE
 
     def _broadcast(self, caller: Caller, pdu: bytes, asked: Asked) -> None:
         """To every serial line, once, without retry; nobody answers, nor do we (case MB-028)."""

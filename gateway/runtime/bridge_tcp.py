@@ -53,7 +53,8 @@ class FrontCounters:
 
 
 class TcpFront:
-    """A listening port, until cancelled. A port that cannot be had is tried again, and the status says so."""
+    """A listening port, until cancelled. A port that cannot be had is tried again, and the status says so; with `insist`
+    False it is the end (`EndpointBusy`, `Unreachable`)."""
 
     def __init__(
         self,
@@ -64,6 +65,7 @@ class TcpFront:
         max_clients: int = 16,
         in_flight: int = 16,
         admits: Callable[[str], bool] = lambda address: True,
+        insist: bool = True,
     ) -> None:
         self.endpoint = endpoint
         self.counters = FrontCounters()
@@ -74,6 +76,7 @@ class TcpFront:
         self._max_clients = max_clients
         self._in_flight = in_flight
         self._admits = admits
+        self._insist = insist
 
     @property
     def bound(self) -> Endpoint | None:
@@ -87,6 +90,8 @@ class TcpFront:
             try:
                 self.listener = await TcpListener.open(self.endpoint, self._serve, self._max_clients, self._admits)
             except Unreachable as e:
+                if not self._insist:
+                    raise
                 self.error = str(e)
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(backoff.next_s() * NS_PER_S))
         self.error = ""

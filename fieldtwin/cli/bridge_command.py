@@ -1,0 +1,95 @@
+"""`fieldtwin bridge`: Modbus TCP clients to units on a serial line, or the other way round, in one command."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option, pairs
+from fieldtwin.cli.talk import talk
+from fieldtwin.running.bridging import BridgeOptions, run_bridge
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.runtime.bridge_policy import LOOPBACK, network
+
+ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
+
+
+@click.command("bridge")
+@click.argument("listen")
+@click.argument("target")
+@click.option(
+    "--allow", "networks", multiple=True, metavar="NETWORK", help="Who may connect; default: this host. Repeatable."
+)
+@click.option("--allow-writes", is_flag=True, help="Pass on every function; without it, those that only read.")
+@click.option(
+    "--unit", "units", multiple=True, metavar="UNIT=UNIT", help="A client's unit id = the target's. Repeatable."
+)
+@click.option(
+    "--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="How long a unit may take."
+)
+@click.option(
+    "--retries", type=click.IntRange(0, 10), default=1, show_default=True, help="Of reads that nobody answered."
+)
+@click.option("--cache", "cache_s", type=Duration(), default="0", help="Answer reads from replies at most this old.")
+@click.option("--clients", type=click.IntRange(1, 1000), default=16, show_default=True, help="Connections at a time.")
+@click.option("--queue", type=click.IntRange(1, 64), default=32, show_default=True, help="Requests that may wait.")
+@click.option("--broadcast", is_flag=True, help="Pass unit 0 on to the line; nobody answers.")
+@click.option("--instance", default="", help="Name of the run directory, where the audit log is.")
+@json_option
+def command(
+    listen: str,
+    target: str,
+    networks: tuple[str, ...],
+    allow_writes: bool,
+    units: tuple[str, ...],
+    timeout_s: float,
+    retries: int,
+    cache_s: float,
+    clients: int,
+    queue: int,
+    broadcast: bool,
+    instance: str,
+    as_json: bool,
+) -> int:
+    """Let the clients of LISTEN reach the units behind TARGET.
+
+    \b
+    fieldtwin bridge tcp://0.0.0.0:502 "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1" --allow 10.0.0.0/24
+    fieldtwin bridge "rtu:/dev/ttyS1?baudrate=19200" tcp://plc:502 --unit 1=255     a master on a line asks a TCP device
+
+    Read-only and for this host, unless told otherwise. Unknown units are refused with exception 0A, silent ones with 0B, and
+    those are then left alone for a while.
+    """
+    options = BridgeOptions(
+        listen=Endpoint.parse(listen),
+        target=Endpoint.parse(target),
+        networks=tuple(network(text) for text in networks) or LOOPBACK,
+        allow_writes=allow_writes,
+        units=tuple((_unit(a), _unit(b)) for a, b in pairs(units, "--unit").items()),
+        timeout_s=timeout_s,
+        retries=retries,
+        cache_ms=round(1000 * cache_s),
+        clients=clients,
+        queue=queue,
+        broadcast=broadcast,
+        instance=instance,
+    )
+    if not networks and options.listen.host not in ANYWHERE:
+        talk.print("only clients of this host may ask; --allow NETWORK lets others in")
+    result = asyncio.run(run_bridge(options, lambda text: talk.print(text, soft_wrap=True, markup=False)))
+    if as_json:
+        json.dump(result, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        talk.print(f"{result['requests']} requests: " + ", ".join(f"{k} {v}" for k, v in result["target"].items() if v))
+    return 0
+
+
+def _unit(text: str) -> int:
+    if not text.isascii() or not text.isdigit() or int(text) > 255:
+        raise UsageError("a unit id", expected="0 to 255", got=repr(text))
+    return int(text)

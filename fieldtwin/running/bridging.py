@@ -1,0 +1,126 @@
+"""A bridge of its own: one bus, one listening side, until it is told to stop. What `fieldtwin bridge` runs.
+
+The same parts as in a system's gateway, with no devices to poll and no PLC to serve first.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from gateway.connections.os_connector import OsConnector
+from gateway.core.clock import NS_PER_S
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.nursery import Nursery
+from gateway.devices.config import BusConfig
+from gateway.protocols.modbus.framings import framing_of
+from gateway.protocols.modbus.server import READ_FUNCTIONS
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.bridge import Bridge, BridgeConfig, Route
+from gateway.runtime.bridge_policy import LOOPBACK, AllowRule, Network, Policy
+from gateway.runtime.modbus_bus import ModbusBus
+from gateway.runtime.tags import TagTable
+from gateway.wallclock import WallClock
+from twin.instance import Instance
+
+TARGET = "target"
+WATCH_NS = NS_PER_S // 5
+
+
+@dataclass(frozen=True)
+class BridgeOptions:
+    """What the command line said. `units` maps a client's unit id to the target's; empty: every unit keeps its own."""
+
+    listen: Endpoint
+    target: Endpoint
+    networks: tuple[Network, ...] = LOOPBACK
+    allow_writes: bool = False
+    units: tuple[tuple[int, int], ...] = ()
+    timeout_s: float = 1.0
+    retries: int = 1
+    cache_ms: int = 0
+    clients: int = 16
+    queue: int = 32
+    broadcast: bool = False
+    instance: str = ""
+
+
+def bridge_config(options: BridgeOptions) -> BridgeConfig:
+    """The bridge that the options ask for: reading functions only, unless writes are allowed; then every function."""
+    functions = frozenset(range(1, 128)) if options.allow_writes else READ_FUNCTIONS
+    return BridgeConfig(
+        name="bridge",
+        listen=options.listen,
+        to=None if options.units else TARGET,
+        routes={unit: Route(TARGET, there) for unit, there in options.units},
+        policy=Policy((AllowRule(networks=options.networks, functions=functions),), options.allow_writes),
+        broadcast=options.broadcast,
+        cache_ms=options.cache_ms,
+        clients=options.clients,
+        queue=options.queue,
+        insist=False,
+    )
+
+
+def instance_name(options: BridgeOptions) -> str:
+    """A run directory's name for the audit log: the listening side tells bridges of one host apart."""
+    where = (
+        f"{options.listen.host}-{options.listen.port or os.getpid()}" if options.listen.host else options.listen.path
+    )
+    return options.instance or "bridge-" + re.sub(r"[^A-Za-z0-9.]+", "-", where).strip("-")[-32:]
+
+
+async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict[str, Any]:
+    """Bridge until SIGINT or SIGTERM; `say` is told what happens. The counters at the end.
+
+    Raises `UsageError` for endpoints that make no bridge, `EndpointBusy` or `Unreachable` when it cannot listen.
+    """
+    framing_of(options.target)
+    if options.listen == options.target:
+        raise UsageError("a bridge has two ends", got=f"{options.listen} twice")
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    clock, connector = WallClock(), OsConnector()
+    with Instance(instance_name(options)) as instance:
+        audit = AuditLog(instance.path("audit.jsonl"), clock)
+        try:
+            config = BusConfig(TARGET, options.target, options.timeout_s, options.retries)
+            bus = ModbusBus(config, [], connector, clock, TagTable(clock), lambda driver: None)
+            bridge = Bridge(bridge_config(options), {TARGET: bus}, connector, clock, audit)
+            if options.allow_writes:
+                say(f"writes go on record in {instance.path('audit.jsonl')}")
+            async with Nursery() as nursery:
+                nursery.start(bus.run(), "target")
+                nursery.start(bridge.run(), "bridge")
+                stopping = nursery.start(stop.wait(), "until stopped")
+                nursery.start(_report(bridge, bus, clock, say), "report")
+                failing = asyncio.ensure_future(nursery.wait())
+                try:
+                    await asyncio.wait([stopping, failing], return_when=asyncio.FIRST_COMPLETED)
+                    if failing.done():
+                        failing.result()
+                    return {**bridge.describe(), "target": dict(bus.totals()), "target_error": bus.error}
+                finally:
+                    failing.cancel()
+        finally:
+            audit.close()
+
+
+async def _report(bridge: Bridge, bus: ModbusBus, clock: WallClock, say: Callable[[str], None]) -> None:
+    """Say where it listens, and each time that one of the ends comes or goes."""
+    said: tuple[str, str] | None = None
+    while True:
+        bound = bridge.front.bound
+        here = str(bound) if bound is not None else bridge.front.error
+        there = str(bus.config.endpoint) if bus.connected else bus.error
+        if there and (bound is not None or bridge.config.listen.is_serial) and (here, there) != said:
+            said = here, there
+            say(f"{here}  →  {there}")
+        await clock.sleep_until_ns(clock.monotonic_ns() + WATCH_NS)

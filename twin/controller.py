@@ -30,6 +30,8 @@ from twin.physical import EmbeddedControlSystem, attached
 from twin.system import load_system
 
 FLUSH_EVERY_NS = NS_PER_S // 2
+PUBLISHED_AT_ONCE = 20_000
+"""What a line of the control channel takes."""
 
 
 class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -127,9 +129,11 @@ class GatewayProcess:
         return {**describe(self._gateway, self._clock.monotonic_ns()), "store_error": self._store_error}
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
+        """At most `PUBLISHED_AT_ONCE` entries, the oldest first: who wants them all asks again."""
         since = int(args.get("since", 0))
         tags = self._gateway.tags
-        entries = [(p.number, p.tag, p.raw.hex(), p.t_ns, _plain(p.value)) for p in tags.journal_since(since)]
+        newer = tags.journal_since(since)[:PUBLISHED_AT_ONCE]
+        entries = [(p.number, p.tag, p.raw.hex(), p.t_ns, _plain(p.value)) for p in newer]
         return {"entries": entries, "published": tags.published, "dropped": tags.journal_dropped}
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:

@@ -26,6 +26,9 @@ from twin.prototype import DigitalTwinPrototype
 from twin.prototype_file import load_prototype
 from twin.system import load_system
 
+HELD_AT_ONCE = 5_000
+"""A field side that stood for hours holds more than a line of the control channel takes."""
+
 
 class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the process is told. `recordings` maps a device to a file, `listen` a bus to an endpoint, over the prototype
@@ -111,8 +114,9 @@ class FieldProcess:
         return self._field.status()
 
     async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
+        """At most `HELD_AT_ONCE` entries a device, the oldest first: who wants them all asks again."""
         since = {str(name): int(number) for name, number in (args.get("since") or {}).items()}
-        return self._field.held_since(since)
+        return {name: held[:HELD_AT_ONCE] for name, held in self._field.held_since(since).items()}
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         asyncio.get_running_loop().call_later(0.05, self._stop.set)

@@ -28,6 +28,8 @@ class FieldContact:
         self.mapping = mapping
         self.far = far
         self.links: list[LinkChild] = []
+        self.counted_before: dict[str, dict[str, int]] = {}
+        """By device, what its counters said when we came: a field side may have served others before us."""
 
     async def aclose(self) -> None:
         await self.client.aclose()
@@ -70,6 +72,7 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
             got=f"{status['system']!r} (hash {status['system_hash']})",
         )
     contact = FieldContact(client, {}, {})
+    contact.counted_before = {name: dict(device["counters"]) for name, device in status["devices"].items()}
     try:
         for bus_name, url in status["listening"].items():
             plant = system.buses[bus_name].endpoint

@@ -30,16 +30,28 @@ class Oracle:
         self._emulated: set[str] = set()
 
     async def update(self, gateway: ControlClient, field: ControlClient) -> None:
-        """Fetch published first, then held: what was published before is held by then."""
-        answer = await gateway.call("published", since=self._published)
+        """Fetch published first, then held: what was published before is held by then. Both come in pieces."""
+        published: list[Any] = []
+        while piece := (await gateway.call("published", since=self._published))["entries"]:
+            published += piece
+            self._published = piece[-1][0]
+            if len(published) >= KEPT:
+                break  # the rest next time
+        while await self._fetch_held(field):
+            pass
+        for _, tag, raw, _, value in published:
+            self._judge(tag, raw, value)
+
+    async def _fetch_held(self, field: ControlClient) -> bool:
+        """Take the next piece of what the devices held; False when there was nothing new."""
+        new = False
         for device, entries in (await field.call("held", since=self._held_numbers)).items():
             self._emulated.add(device)
             for number, tag, raw, _ in entries:
                 self._held_numbers[device] = number
                 self._keep(f"{device}.{tag}", raw)
-        for number, tag, raw, _, value in answer["entries"]:
-            self._published = number
-            self._judge(tag, raw, value)
+                new = True
+        return new
 
     def _keep(self, tag: str, raw: str) -> None:
         if raw in self._held[tag]:

@@ -61,6 +61,7 @@ class RunSession:
         self.instance = Instance(options.instance or self.system.name)
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
+        self.counted_before: dict[str, dict[str, int]] = {}
         self.children: dict[str, Child] = {}
         self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
         self.oracle = Oracle()
@@ -151,6 +152,7 @@ class RunSession:
             self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far
+        self.counted_before = self._field.counted_before
 
     def _start_watching(self) -> None:
         self._nursery.start(self._watch(), "states")
@@ -224,6 +226,8 @@ class RunSession:
         self.gateway_status = await self._get(self._clients.get("gateway"))
         self.plc_status = await self._get(self._clients.get("plc"))
         self.field_status = await self._get(self._field.client if self._field else None)
+        if self.options.field_host and self.field_status is None:
+            self.note_error(f"the field side at {self.options.field_host} was lost: nobody knows what its devices held")
 
     async def _get(self, client: ControlClient | None) -> dict[str, Any] | None:
         if client is None:

@@ -86,7 +86,10 @@ def _exchanges(run: RunSession) -> dict[str, Any]:
         devices = [d for d in run.system.devices_on(name) if d.name in field.get("devices", {})]
         if devices:
             row["emulators"] = {
-                what: sum(field["devices"][d.name]["counters"][what] for d in devices)
+                what: sum(
+                    field["devices"][d.name]["counters"][what] - run.counted_before.get(d.name, {}).get(what, 0)
+                    for d in devices
+                )
                 for what in ("requests", "replies")
             }
         out[name] = row

@@ -301,12 +301,6 @@ def test_the_two_sections_of_a_right_file(tmp_path: Path) -> None:
     (server,), (bridge,) = serving.serve, serving.bridges  # type: ignore[attr-defined]
     first = server.tags[0]
     assert (first.tag, first.table, first.address, first.count, first.quality_at) == ("ctd.pressure", "input", 0, 2, 2)
-        "ctd.pressure",
-        "input",
-        0,
-        2,
-        2,
-    )
     assert server.tags[1].type == "uint32"
     assert bridge.buses == {"line1", "lan"}
     (rule,) = bridge.policy.rules

@@ -1,0 +1,204 @@
+"""The files for containers and scripts hold together: what can be told of them without a Docker engine.
+
+The containers themselves are proven by scripts/test-compose. Here: the compose file asks for no privilege, its command lines and
+variables are ones that `fieldtwin` knows, paths that it names are those of the image; and the same three
+processes, started by hand from the same prototype file, work together.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+import yaml
+from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
+
+from fieldtwin.cli.main import cli
+from fieldtwin.running.field_contact import reachable
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from twin.prototype_file import load_prototype
+from twin.system import load_system
+
+IMAGE_SHARE = "/opt/fieldtwin/share/"
+SYSTEMS = CHECKOUT / "profiles" / "systems"
+PROTOTYPE_FILE = SYSTEMS / "observatory.compose.yaml"
+DOCKERFILE = (CHECKOUT / "Dockerfile").read_text(encoding="utf-8")
+COMPOSE: dict[str, Any] = yaml.safe_load((CHECKOUT / "docker-compose.yml").read_text(encoding="utf-8"))
+SERVICES: dict[str, Any] = COMPOSE["services"]
+SCRIPTS = [*sorted(p for p in (CHECKOUT / "scripts").iterdir() if p.is_file() and not p.suffix), CHECKOUT / ".ci/run"]
+
+
+# -- the compose file -----------------------------------------------------------------------------------------------
+
+
+def test_three_services_without_privileges_and_without_published_ports() -> None:
+    assert set(SERVICES) == {"field", "controller", "shore"}
+    for name, service in SERVICES.items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"], name
+        assert "no-new-privileges:true" in service["security_opt"], name
+        asked = {"privileged", "cap_add", "devices", "ports", "network_mode", "pid", "user", "volumes"} & set(service)
+        assert not asked, (name, asked)
+    assert re.search(r"^USER fieldtwin$", DOCKERFILE, re.MULTILINE)
+
+
+def test_services_wait_for_health_and_never_sleep() -> None:
+    assert SERVICES["controller"]["depends_on"] == {"field": {"condition": "service_healthy"}}
+    assert SERVICES["shore"]["depends_on"] == {"controller": {"condition": "service_healthy"}}
+    for name in ("field", "controller"):
+        assert SERVICES[name]["healthcheck"]["test"][:2] == ["CMD", "container-health"]
+    assert "sleep" not in str(COMPOSE)
+    assert "version" not in COMPOSE  # compose 2 warns about it; 1.29 reads the file as the specification without it
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_a_service_s_command_line_and_variables_are_known_to_the_program(service: str) -> None:
+    name, *args = (a.replace(IMAGE_SHARE, f"{CHECKOUT}/") for a in SERVICES[service]["command"])
+    command = cli.get_command(click.Context(cli), name)
+    assert command is not None
+    context = command.make_context(name, list(args))  # raises for an unknown option or a file that is not there
+    variables = {f"FIELDTWIN_{name.upper()}_{(p.name or '').upper()}" for p in context.command.params}
+    assert set(SERVICES[service]["environment"]) <= variables
+    token = SERVICES[service]["environment"][f"FIELDTWIN_{name.upper()}_TOKEN"]
+    assert token == "${FIELDTWIN_TOKEN:-for-demonstration-only}"
+
+
+def test_the_memory_disk_is_the_run_directory_and_belongs_to_the_image_s_user() -> None:
+    match = re.search(r"FIELDTWIN_RUN=(\S+)", DOCKERFILE)
+    uid = re.search(r"useradd --uid (\d+)", DOCKERFILE)
+    assert match
+    assert uid
+    for service in SERVICES.values():
+        where, _, options = service["tmpfs"][0].partition(":")
+        assert where == match[1]
+        assert {f"uid={uid[1]}", "mode=700"} <= set(options.split(","))
+    assert SERVICES["field"]["healthcheck"]["test"][2:] == [f"{match[1]}/observatory-field/field.sock"]
+    sockets = [f"{match[1]}/observatory/{p}.sock" for p in ("gateway", "plc")]
+    assert SERVICES["controller"]["healthcheck"]["test"][2:] == sockets
+
+
+# -- what goes into the image -----------------------------------------------------------------------------------------
+
+
+def test_the_build_sees_everything_that_the_wheel_is_made_of() -> None:
+    lines = (CHECKOUT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    let_in = {line[1:] for line in lines if line.startswith("!")}
+    assert all((CHECKOUT / name).exists() for name in let_in)
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))
+    wheel = project["tool"]["hatch"]["build"]["targets"]["wheel"]
+    needed = {*wheel["packages"], *wheel["force-include"], project["project"]["readme"], "pyproject.toml"}
+    assert {*needed, *project["project"]["license-files"]} <= let_in
+    assert re.search(r"COPY --from=build /src/(scripts/container-health) /usr/local/bin/container-health", DOCKERFILE)
+    assert "scripts/container-health" in let_in
+
+
+def test_the_prototype_file_differs_from_the_shipped_one_in_where_it_listens_only() -> None:
+    system = load_system(str(SYSTEMS / "observatory.yaml"))
+    here, there = load_prototype(system), load_prototype(system, PROTOTYPE_FILE)
+    for bus in there.buses.values():
+        assert bus.listen is not None
+        assert bus.listen.address[0] == "0.0.0.0"
+        assert bus.listen.address[1] != 0, "other containers and firewalls want to know the port beforehand"
+        assert bus.pace == here.buses[bus.name].pace
+    assert there.seed == here.seed
+    for name, device in there.devices.items():
+        ours = here.devices[name].form.model_dump(exclude={"far"})
+        assert device.form.model_dump(exclude={"far"}) == ours, name
+
+
+# -- the same by hand --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("listening", "host", "seen"),
+    [
+        ("tcp://0.0.0.0:1502", "field", "tcp://field:1502"),
+        ("can:fieldtwin/0.0.0.0:29536", "field", "can:fieldtwin/field:29536"),
+        ("tcp://[::]:1502", "fd00::7", "tcp://[fd00::7]:1502"),
+        ("tcp://10.0.0.9:1502", "field", "tcp://10.0.0.9:1502"),
+        ("tcp://127.0.0.1:1502", "localhost", "tcp://127.0.0.1:1502"),
+        ("can:socketcan/vcan0", "field", "can:socketcan/vcan0"),
+    ],
+)
+def test_a_wildcard_address_is_reached_by_the_name_of_its_host(listening: str, host: str, seen: str) -> None:
+    """By name, not by today's address: a container that was restarted may have another."""
+    assert str(reachable(Endpoint.parse(listening), host)) == seen
+
+
+@pytest.mark.parametrize("listening", ["pty:line1", "tcp://127.0.0.1:1502", "can:fieldtwin/127.0.0.1:29536"])
+def test_what_stays_on_the_field_side_s_host_is_refused_elsewhere(listening: str) -> None:
+    with pytest.raises(UsageError, match="prototype file"):
+        reachable(Endpoint.parse(listening), "field")
+
+
+def container_health(*sockets: Path) -> tuple[int, str]:
+    """What the health check of a container says."""
+    done = subprocess.run(
+        [sys.executable, str(CHECKOUT / "scripts" / "container-health"), *map(str, sockets)],
+        capture_output=True, text=True, timeout=20, check=False,
+    )  # fmt: skip
+    return done.returncode, done.stdout.strip()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(150)  # a shore of 8 s and four starts: half a minute on a busy computer
+def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> None:
+    """The compose file's three commands on free ports: health checks, exit codes and the summary are as it relies on."""
+    text = PROTOTYPE_FILE.read_text(encoding="utf-8")
+    prototype = tmp_path / "any-port.yaml"
+    prototype.write_text(re.sub(r"0\.0\.0\.0:\d+", "0.0.0.0:0", text), encoding="utf-8")
+    port = free_port()
+    emulate = ("emulate", "observatory", f"--prototype-file={prototype}", f"--control=0.0.0.0:{port}")
+    run = ("run", "observatory", "--prototype", f"--field=localhost:{port}", "--commands=none")
+    shore = ("shore", "observatory", f"--field=localhost:{port}", "--commands=1,2,0,-1", "--for=8s", "--token=s3cret")
+    run_env = {"FIELDTWIN_RUN_TOKEN": "s3cret", "FIELDTWIN_RUN_AS_JSON": "1"}
+    field_socket = tmp_path / "observatory-field" / "field.sock"
+    sockets = [tmp_path / "observatory" / f"{p}.sock" for p in ("gateway", "plc")]
+
+    assert container_health(field_socket)[0] == 1
+    with fieldtwin(tmp_path, *emulate, name="field", env={"FIELDTWIN_EMULATE_TOKEN": "s3cret"}) as field:
+        wait_for(lambda: container_health(field_socket) == (0, "ok"), 20, "the field side is healthy")
+        stranger = run_to_end(tmp_path, *run, "--token=wrong", name="stranger")
+        assert stranger.process.returncode != 0
+        assert "token" in stranger.err
+        with fieldtwin(tmp_path, *run, name="run", env=run_env) as controller:
+            wait_for(lambda: container_health(*sockets) == (0, "ok"), 20, "the controller is healthy")
+            ashore = run_to_end(tmp_path, *shore, name="shore")
+            assert ashore.process.returncode == 0, ashore.err
+            relay = ["STANDBY", "ACTIVE", "STANDBY", "OFF"]
+            controller.signal(15)
+            assert controller.wait(10) == 0, controller.out + controller.err
+            summary = controller.summary
+            assert summary["ok"]
+            assert summary["states"]["relay"] == relay
+            assert summary["far_end"] is None  # it is the shore's; a second one would take its responses
+        with fieldtwin(tmp_path, *run, name="again", env=run_env):
+            wait_for(lambda: container_health(*sockets)[0] == 0, 20, "healthy again")
+            field.process.kill()
+            field.process.wait()
+            wait_for(lambda: all(d in container_health(*sockets)[1] for d in ("ctd", "inclinometer", "modem")), 20)
+            assert container_health(*sockets)[0] == 1
+    no_tracebacks(tmp_path)
+
+
+# -- scripts ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda p: p.name)
+def test_a_script_may_be_run_and_reads_well(script: Path) -> None:
+    assert os.access(script, os.X_OK)
+    text = script.read_text(encoding="utf-8")
+    if text.startswith("#!/usr/bin/env bash"):
+        assert "set -euo pipefail" in text
+        subprocess.run(["bash", "-n", str(script)], check=True)
+    else:
+        assert text.startswith("#!/usr/bin/env python3")
+        compile(text, str(script), "exec")

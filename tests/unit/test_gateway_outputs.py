@@ -73,9 +73,10 @@ async def rig(
     safe: dict[str, float] | None = None,
     expect: dict[str, str] | None = None,
     text: str = PROFILE,
+    bank: type[MapBank] = MapBank,
 ) -> AsyncIterator[Rig]:
     p = profile(text)
-    cells = MapBank([Span("holding", 0, 200), Span("coil", 0, 8)])
+    cells = bank([Span("holding", 0, 200), Span("coil", 0, 8)])
     cells.poke("holding", 100, 0x6162, 0x6300)
     config = DeviceConfig(
         "d",
@@ -258,8 +259,7 @@ def test_a_device_that_acknowledges_and_does_not_hold_is_a_failure(tmp_path: Pat
             return
 
     async def main() -> None:
-        async with rig(tmp_path / "a", "period") as r:
-            r.bus.field.units[1].bank = Forgetful([Span("holding", 0, 200), Span("coil", 0, 8)])
+        async with rig(tmp_path / "a", "period", bank=Forgetful) as r:
             r.writer.want("d.period", 5)
             await eventually(lambda: r.writer.failures == 1)
             assert "not held" in str(r.audit[-1]["result"])

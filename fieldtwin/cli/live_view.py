@@ -66,21 +66,43 @@ class LiveView:
                 pass  # that is what was asked for
 
     async def _show_table(self) -> None:
+        open_ports: set[str] = set()
         with Live(render(self._session), console=talk, auto_refresh=False, transient=True) as live:
             while True:
+                open_ports = self._tell_ports(open_ports)
                 live.update(render(self._session), refresh=True)
                 await asyncio.sleep(REFRESH_S)
 
     async def _show_lines(self) -> None:
         told: set[str] = set()
+        open_ports: set[str] = set()
         while True:
             await asyncio.sleep(LINE_S)
+            open_ports = self._tell_ports(open_ports)
             now = troubles(self._session)
             for trouble in now:
                 if trouble not in told:  # once, and again only when it had gone
                     talk.print(f"! {trouble}", soft_wrap=True, markup=False)
             told = set(now)
             talk.print(line(self._session), soft_wrap=True, markup=False)
+
+    def _tell_ports(self, told: set[str]) -> set[str]:
+        """Say once where the gateway listens: a prototype takes free ports."""
+        now = set(ports(self._session))
+        for text in sorted(now - told):
+            talk.print(f"  {text}", soft_wrap=True, markup=False)
+        return now
+
+
+def ports(session: RunSession) -> list[str]:
+    """Where the gateway serves tags and lets clients reach units."""
+    gateway = session.gateway_status or {}
+    return [
+        f"{kind} {name}  ←  {front['listening']}"
+        for kind in ("serve", "bridge")
+        for name, front in gateway.get(kind, {}).items()
+        if front["listening"]
+    ]
 
 
 def troubles(session: RunSession) -> list[str]:
@@ -89,6 +111,8 @@ def troubles(session: RunSession) -> list[str]:
     found = list(session.errors)
     closed = {name: bus["error"] for name, bus in gateway.get("buses", {}).items() if bus["error"]}
     found += [f"{name}: {error}" for name, error in closed.items()]
+    for kind in ("serve", "bridge"):
+        found += [f"{kind} {name}: {front['error']}" for name, front in gateway.get(kind, {}).items() if front["error"]]
     for name, device in gateway.get("devices", {}).items():
         if device["error"] and device["error"] != closed.get(device["bus"]):
             found.append(f"{name}: {device['error']}")

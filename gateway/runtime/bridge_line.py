@@ -40,7 +40,7 @@ class LineFront:
         self.endpoint = endpoint
         self.counters = LineCounters()
         self.connected = False
-        self.error = "not opened yet"
+        self.error = ""
         self._connector = connector
         self._ask = ask
         self._ours = ours

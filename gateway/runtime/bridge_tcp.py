@@ -70,7 +70,7 @@ class TcpFront:
         self.endpoint = endpoint
         self.counters = FrontCounters()
         self.listener: TcpListener | None = None
-        self.error = "not listening yet"
+        self.error = ""
         self._ask = ask
         self._clock = clock
         self._max_clients = max_clients

@@ -78,10 +78,11 @@ class RtuRequests:
         return 0
 
     def _unknown(self, lengths: list[int], more: bool, silent: bool) -> int:
-        """A function that nobody knows has no length; before a silence all there is may be its frame."""
+        """A function that nobody knows has no length: at a silence, or at the longest that a frame can be, it is all there."""
         size = len(self._buffer)
-        known = bool(lengths) or more
-        return size if silent and not known and MIN_FRAME <= size <= MAX_FRAME and crc16(self._buffer) == 0 else 0
+        if lengths or more or not MIN_FRAME <= size <= MAX_FRAME or not (silent or size == MAX_FRAME):
+            return 0
+        return size if crc16(self._buffer) == 0 else 0
 
     def _may_grow(self, lengths: list[int], more: bool) -> bool:
         size = len(self._buffer)

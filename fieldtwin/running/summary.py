@@ -14,7 +14,7 @@ def summarise(run: RunSession) -> dict[str, Any]:
     gateway = run.gateway_status or {}
     plc = run.plc_status or {}
     exchanges = _exchanges(run)
-    checks = [*_device_checks(gateway), *_plc_checks(plc), *_loss_checks(gateway)]
+    checks = [*_device_checks(gateway), *_output_checks(gateway), *_plc_checks(plc), *_loss_checks(gateway)]
     if run.options.prototype:
         checks += _exchange_checks(exchanges) + _oracle_checks(run) + _state_checks(run)
     errors = [*run.errors, *checks]
@@ -111,6 +111,15 @@ def _exchange_checks(exchanges: dict[str, Any]) -> list[str]:
 
 def _device_checks(gateway: dict[str, Any]) -> list[str]:
     return [f"{name}: {d['error']}" for name, d in gateway.get("devices", {}).items() if not d["online"] or d["error"]]
+
+
+def _output_checks(gateway: dict[str, Any]) -> list[str]:
+    """An output that the device does not hold at the end, though it may be written."""
+    return [
+        f"{o['tag']}: {o['wanted']:g} was commanded by {o['by']}, and the device does not hold it"
+        for o in gateway.get("outputs", [])
+        if o["wanted"] is not None and o["held"] != o["wanted"] and not o["refused"]
+    ]
 
 
 def _plc_checks(plc: dict[str, Any]) -> list[str]:

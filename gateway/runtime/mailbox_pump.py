@@ -17,6 +17,7 @@ from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.modbus_bus import Job, ModbusBus
 
+RETRY_NS = 1000 * NS_PER_MS
 ASK_EVERY_NS = 50 * NS_PER_MS
 """How often a full outbox is looked at again."""
 
@@ -38,6 +39,7 @@ class MailboxPump:
         self._busy = False
         self._sending = 0
         self._next_ns = 0
+        self._recorded: tuple[str, object] | None = None
 
     def offer(self, payloads: list[bytes]) -> None:
         """The control logic sent these, in order."""
@@ -68,14 +70,27 @@ class MailboxPump:
         if self._busy or now_ns < self._next_ns or not self._allow_writes or not self._bus.online(self.driver):
             return
         if self.driver.to_acknowledge and all_consumed and not self.inbox.queue:
-            self._submit(self.driver.acknowledge)
+            if self._on_record("inbox_ack", self.driver.to_acknowledge, now_ns):
+                self._submit(self.driver.acknowledge)
         elif self.driver.consumer.queue:
             if self.driver.outbox_free:
-                self._sending = 1
-                self._submit(self.driver.send)
+                if self._on_record("outbox", self.driver.consumer.queue[0].data.hex(), now_ns):
+                    self._sending = 1
+                    self._submit(self.driver.send)
             else:
                 self._next_ns = now_ns + ASK_EVERY_NS
                 self._submit(self._ask)
+
+    def _on_record(self, tag: str, new: object, now_ns: int) -> bool:
+        """Note the write before it happens; without a record it waits and is tried again."""
+        name = self.driver.config.name
+        try:
+            self._audit.note("write", name, by="plc", result="asked", tag=f"{name}.{tag}", old=None, new=new)
+        except Unreachable:
+            self._next_ns = now_ns + RETRY_NS
+            return False
+        self._recorded = (f"{name}.{tag}", new)
+        return True
 
     async def _ask(self) -> None:
         await self.driver.check_outbox()
@@ -87,3 +102,8 @@ class MailboxPump:
     def _done(self, error: FieldtwinError | None) -> None:
         self._busy = False
         self._sending = 0
+        if self._recorded is not None:
+            (tag, new), self._recorded = self._recorded, None
+            result = "done" if error is None else f"failed: {error}"
+            with suppress(Unreachable):  # the next write will not start without a record
+                self._audit.note("write", self.driver.config.name, by="plc", result=result, tag=tag, new=new)

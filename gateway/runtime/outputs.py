@@ -45,6 +45,10 @@ class Output:
     asked: Callable[[FieldtwinError | None], None] | None = None
     """Who asked for one write and waits for its end; None for what the PLC or the safe state commands."""
 
+    def shown(self, value: object) -> object:
+        """`value` as the audit log may show it: a secret is not written down."""
+        return "(secret)" if self.driver.profile.tags[self.local].secret else value
+
     def answer(self, error: FieldtwinError | None) -> None:
         """Tell who asked how it ended. It was for once: nothing is written again behind a person's back."""
         asked, self.asked = self.asked, None
@@ -151,7 +155,15 @@ class OutputWriter:
             output.refused = (value, output.by)
             self.refusals += 1
             try:
-                self._audit.note("refuse", name, by=output.by, result=str(e), tag=output.tag, old=old, new=value)
+                self._audit.note(
+                    "refuse",
+                    name,
+                    by=output.by,
+                    result=str(e),
+                    tag=output.tag,
+                    old=output.shown(old),
+                    new=output.shown(value),
+                )
             except Unreachable:
                 self.failures += 1  # counted; refused all the same
             output.answer(e)
@@ -166,7 +178,15 @@ class OutputWriter:
     def _on_record(self, output: Output, name: str, old: object, value: float) -> bool:
         """Note the write before it happens. Without a record only a safe value is written; the rest is tried again."""
         try:
-            self._audit.note("write", name, by=output.by, result="asked", tag=output.tag, old=old, new=value)
+            self._audit.note(
+                "write",
+                name,
+                by=output.by,
+                result="asked",
+                tag=output.tag,
+                old=output.shown(old),
+                new=output.shown(value),
+            )
         except Unreachable:
             self.failures += 1
             output.next_try_ns = self._now_ns + RETRY_NS
@@ -193,7 +213,9 @@ class OutputWriter:
             output.driver.consumer.queue.clear()  # the command that failed must not go out ahead of a newer one
         result = "done" if error is None else f"failed: {error}"
         try:
-            self._audit.note("write", output.driver.config.name, by=output.by, result=result, tag=output.tag, new=value)
+            self._audit.note(
+                "write", output.driver.config.name, by=output.by, result=result, tag=output.tag, new=output.shown(value)
+            )
         except Unreachable:
             self.failures += 1  # counted; the next write will not start without a record
         output.answer(error)

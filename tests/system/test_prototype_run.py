@@ -81,7 +81,7 @@ def test_the_exchanges_of_active_times_are_stored(ended: Fieldtwin) -> None:
 def test_every_write_is_on_record(ended: Fieldtwin) -> None:
     entries = [json.loads(line) for line in (ended.root / "a" / "audit.jsonl").read_text().splitlines()]
     assert all(e["utc_ns"] > 10**18 and e["by"] and e["result"] for e in entries)
-    writes = [e for e in entries if e["action"] == "write"]
+    writes = [e for e in entries if e["action"] == "write" and e["device"] == "ctd"]
     asked = [(e["by"], e["old"], e["new"]) for e in writes if e["result"] == "asked"]
     assert asked[0][:1] + asked[0][2:] == ("plc", 0)
     assert [(by, new) for by, _, new in asked[1:5]] == [("plc", 1), ("plc", 2), ("plc", 0), ("plc", -1)]
@@ -90,6 +90,9 @@ def test_every_write_is_on_record(ended: Fieldtwin) -> None:
     assert asked[-1][0].startswith("safe: ")
     done = [e["new"] for e in writes if e["result"] == "done"]
     assert done == [new for _, _, new in asked]
+    boxes = [(e["tag"], e["result"]) for e in entries if e["device"] == "modem"]
+    for tag in ("modem.inbox_ack", "modem.outbox"):
+        assert boxes.count((tag, "asked")) == boxes.count((tag, "done")) > 0
     others = [(e["action"], e["by"]) for e in entries if e["device"] == "inclinometer"]
     assert others == [("sdo", "start-up"), ("nmt", "start-up"), ("nmt", "stop")]
 

@@ -130,10 +130,8 @@ def test_mb_004_half_a_request_then_a_whole_one() -> None:
 def test_mb_050_a_frame_of_256_bytes_and_one_of_257() -> None:
     line = RtuRequests(86_000)
     pdu = bytes([0x64]) + bytes(range(252))
-    line.feed(with_crc(b"\5" + pdu))
-    assert line.silence() == [LineRequest(5, pdu)]
-    line.feed(with_crc(b"\5" + pdu + b"\x01"))
-    assert line.silence() == []
+    assert line.feed(with_crc(b"\5" + pdu)) == [LineRequest(5, pdu)]
+    assert line.feed(with_crc(b"\5" + pdu + b"\x01")) + line.silence() == []
 
 
 # -- passed on --------------------------------------------------------------------------------------------------------------

@@ -183,6 +183,10 @@ def test_TransmitterDriver_is_a_pure_relay(tmp_path_factory: pytest.TempPathFact
                 await driver.receive("inbox")  # the same sequence again is the same message
                 await driver.acknowledge()
             assert list(ear.queue) == [COMMAND(payload) for payload in payloads]
+            assert r.unit("modem").unlisted == 0  # all that the driver asked is in the command list
+            executed = r.unit("modem").emulator.executed
+            assert set(executed) == {"send", "receive", "acknowledge"}
+            assert executed["acknowledge"] == len(payloads)
 
     run(main())
 

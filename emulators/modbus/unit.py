@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from emulators.modbus.bank import Busy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
 from emulators.modbus.diagnostics import Diagnostics, UnitCounters
+from emulators.modbus.event_log import MAX_EVENTS
 from emulators.modbus.fifo import FifoQueues
 from emulators.modbus.file_records import FileRecords
 from emulators.modbus.identification import Identification
@@ -154,7 +155,7 @@ class ModbusUnit:
         """The line carried so many whole and damaged frames, for whomever."""
         self.counters.bus_messages += messages
         self.counters.bus_errors += errors
-        for _ in range(errors):
+        for _ in range(min(errors, MAX_EVENTS)):
             self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, damaged=True)
 
     def _counted(self, pdu: bytes, now_ns: int, busy: bool) -> bytes | None:

@@ -246,7 +246,8 @@ def test_prose_2_a_plant_needs_no_emulators(deserted: Path, tmp_path: Path) -> N
     without = Ended(tmp_path / "without", str(deserted), "--plant", "--for", "2s", code=bare)
     whole = Ended(tmp_path / "with", str(deserted), "--plant", "--for", "2s")
     assert without.code == whole.code == 1, without.err
-    assert len(without.summary["errors"]) == 3
+    said = " ".join(without.summary["errors"])
+    assert all(endpoint in said for endpoint in ("ttyNONE", "nocan0", "127.0.0.1:"))
     assert without.summary["errors"] == whole.summary["errors"]
     assert without.summary["plc"]["state"] == "running"
     assert without.summary["plc"]["scans"] > 50

@@ -48,7 +48,9 @@ async def line_of_two(tmp_path: Path) -> AsyncIterator[dict[int, MapBank]]:
 async def bridge(tmp_path: Path, *options: str) -> AsyncIterator[tuple[Fieldtwin, int]]:
     """The program, once it listens and has its line; its port."""
     target = f"rtu:{tmp_path / 'line'}?{LINE}"
-    program = Fieldtwin(tmp_path / "run", "bridge", "tcp://127.0.0.1:0", target, "--timeout", "150ms", *options)
+    program = Fieldtwin(
+        tmp_path / "run", "bridge", "tcp://127.0.0.1:0", target, "--timeout", "150ms", "--instance", "b", *options
+    )
     try:
         await eventually(lambda: "→  rtu:" in program.err or program.process.poll() is not None, within_s=15)
         found = re.search(r"tcp://127\.0\.0\.1:(\d+)  →", program.err)

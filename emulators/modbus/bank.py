@@ -8,7 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, get_args
 
 from gateway.core.errors import DeviceRefused, UsageError
 
@@ -131,65 +131,63 @@ class MapBank(RegisterBank):
     """
 
     def __init__(self, spans: Iterable[Span], on_write: OnWrite | None = None) -> None:
-        self._cells: dict[tuple[Table, int], int] = {}
-        self._readable: set[tuple[Table, int]] = set()
-        self._writable: set[tuple[Table, int]] = set()
+        self._cells: dict[Table, dict[int, int]] = {table: {} for table in get_args(Table)}
+        self._declared: dict[Table, set[int]] = {table: set() for table in self._cells}
+        self._readable: dict[Table, set[int]] = {table: set() for table in self._cells}
+        self._writable: dict[Table, set[int]] = {table: set() for table in self._cells}
         self._on_write = on_write
         self._hooks: dict[tuple[Table, int], CellHooks] = {}
         for span in spans:
             self._declare(span)
 
     def _declare(self, span: Span) -> None:
-        for address in range(span.start, span.start + span.count):
-            cell = (span.table, address)
-            if cell in self._cells:
-                raise UsageError("two spans hold the same cell", where=f"{span.table}:{address}")
-            self._cells[cell] = 0
-            if span.access != "wo":
-                self._readable.add(cell)
-            if span.access != "ro" and span.table in WRITABLE_TABLES:
-                self._writable.add(cell)
+        addresses = range(span.start, span.start + span.count)
+        twice = self._declared[span.table].intersection(addresses)
+        if twice:
+            raise UsageError("two spans hold the same cell", where=f"{span.table}:{min(twice)}")
+        self._cells[span.table].update(dict.fromkeys(addresses, 0))
+        self._declared[span.table].update(addresses)
+        if span.access != "wo":
+            self._readable[span.table].update(addresses)
+        if span.access != "ro" and span.table in WRITABLE_TABLES:
+            self._writable[span.table].update(addresses)
 
     def hook(self, table: Table, address: int, hooks: CellHooks) -> None:
         """Give a cell side effects, in place of those that it had. Raises `IllegalAddress` where there is none."""
-        self._require([(table, address)], self._cells, "hooked")
+        self._require(self._declared, table, range(address, address + 1), "hooked")
         self._hooks[table, address] = hooks
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
-        cells = [(table, a) for a in range(address, address + count)]
-        self._require(cells, self._readable, "read")
-        values = [self._cells[cell] for cell in cells]
+        addresses = range(address, address + count)
+        self._require(self._readable, table, addresses, "read")
+        values = list(map(self._cells[table].__getitem__, addresses))
         if self._hooks:
-            for i, cell in enumerate(cells):
-                reading = self._hooks.get(cell, _NO_HOOKS).reading
+            for i, place in enumerate(addresses):
+                reading = self._hooks.get((table, place), _NO_HOOKS).reading
                 if reading is not None:
                     values[i] = reading(values[i], now_ns)
         return values
 
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
-        self._require([(table, a) for a in range(address, address + count)], self._readable, "read")
+        self._require(self._readable, table, range(address, address + count), "read")
 
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
-        self._require([(table, a) for a in range(address, address + len(values))], self._writable, "written")
-        touched = [
-            (self._hooks[table, a], v)
-            for a, v in enumerate(values, address)
-            if self._hooks and (table, a) in self._hooks
-        ]
-        for hooks, value in touched:
+        self._require(self._writable, table, range(address, address + len(values)), "written")
+        hooked = self._hooks and [(self._hooks.get((table, a), _NO_HOOKS), v) for a, v in enumerate(values, address)]
+        for hooks, value in hooked or ():
             if hooks.checking is not None:
                 hooks.checking(value, now_ns)
         if self._on_write is not None:
             self._on_write(table, address, tuple(values), now_ns)
         self.poke(table, address, *values)
-        for hooks, value in touched:
+        for hooks, value in hooked or ():
             if hooks.written is not None:
                 hooks.written(value, now_ns)
 
     def peek(self, table: Table, address: int) -> int:
         """The device's own view of a cell, whatever its access. Raises `IllegalAddress` where there is none."""
-        self._require([(table, address)], self._cells, "read")
-        return self._cells[table, address]
+        self._require(self._declared, table, range(address, address + 1), "read")
+        return self._cells[table][address]
 
     def poke(self, table: Table, address: int, *values: int) -> None:
         """The device sets its own cells, read-only ones included. Raises `IllegalAddress` or `IllegalValue`."""
@@ -197,14 +195,12 @@ class MapBank(RegisterBank):
         for value in values:
             if not 0 <= value <= limit:
                 raise IllegalValue("value does not fit", expected=f"0 to {limit}", got=str(value), where=table)
-        cells = [(table, address + i) for i in range(len(values))]
-        self._require(cells, self._cells, "set")
-        self._cells.update(zip(cells, values, strict=True))
+        addresses = range(address, address + len(values))
+        self._require(self._declared, table, addresses, "set")
+        self._cells[table].update(zip(addresses, values, strict=True))
 
     @staticmethod
-    def _require(
-        cells: list[tuple[Table, int]], allowed: dict[tuple[Table, int], int] | set[tuple[Table, int]], verb: str
-    ) -> None:
-        for table, address in cells:
-            if (table, address) not in allowed:
-                raise IllegalAddress(f"no cell that can be {verb}", where=f"{table}:{address}")
+    def _require(allowed: dict[Table, set[int]], table: Table, addresses: range, verb: str) -> None:
+        if not allowed[table].issuperset(addresses):
+            missing = next(address for address in addresses if address not in allowed[table])
+            raise IllegalAddress(f"no cell that can be {verb}", where=f"{table}:{missing}")

@@ -6,6 +6,7 @@ lengths (03), addresses (02), then execution. A refused request has changed noth
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -138,11 +139,11 @@ class RegisterFunctions:
 
 
 def _words(data: bytes) -> list[int]:
-    return [data[i] << 8 | data[i + 1] for i in range(0, len(data), 2)]
+    return list(struct.unpack(f">{len(data) // 2}H", data))
 
 
 def _pack_words(values: Sequence[int]) -> bytes:
-    return b"".join(value.to_bytes(2, "big") for value in values)
+    return struct.pack(f">{len(values)}H", *values)
 
 
 def _pack_bits(values: Sequence[int]) -> bytes:

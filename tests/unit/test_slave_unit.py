@@ -120,7 +120,7 @@ def test_answer(request_hex: str, expected: str | None) -> None:
 
 
 def snapshot(bank: MapBank) -> dict[object, int]:
-    return dict(bank._cells)
+    return {(table, a): value for table, cells in bank._cells.items() for a, value in cells.items()}
 
 
 def test_writes_arrive() -> None:

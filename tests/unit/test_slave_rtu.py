@@ -268,3 +268,23 @@ def test_the_cut_does_not_matter(frames: list[bytes], data: st.DataObject) -> No
         at += size
     assert found == frames
     assert receiver.noise_bytes == 0
+
+
+PIECES = st.one_of(
+    st.sampled_from(
+        [READ, READ[:5], READ[3:], crc("05 03 0000 0002"), crc("05 10 0000 0004 08" + READ.hex()), crc("01 64 010203")]
+    ),
+    st.sampled_from([crc("01 08 0000 1234 5678"), crc("00 06 0001 0001"), crc("01 2B 0E 01 00"), b"\x00", b"\xff"]),
+    st.binary(max_size=30),
+)
+
+
+@given(st.lists(PIECES, max_size=12), st.integers(1, 40))
+def test_the_cut_does_not_matter_in_noise_either(pieces: list[bytes], step: int) -> None:
+    """What is found in garbage, and what is counted as such, is the same in one piece and in many."""
+    data = b"".join(pieces)
+    whole, cut = RtuReceiver(frozenset({1, 16})), RtuReceiver(frozenset({1, 16}))
+    frames = whole.feed(data, 0) + whole.feed(b"", PAUSE_NS)
+    found = [frame for i in range(0, len(data), step) for frame in cut.feed(data[i : i + step], 0)]
+    assert found + cut.feed(b"", PAUSE_NS) == frames
+    assert (whole.frames, whole.crc_errors, whole.noise_bytes) == (cut.frames, cut.crc_errors, cut.noise_bytes)

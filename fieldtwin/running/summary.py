@@ -114,11 +114,15 @@ def _device_checks(gateway: dict[str, Any]) -> list[str]:
 
 
 def _output_checks(gateway: dict[str, Any]) -> list[str]:
-    """An output that the device does not hold at the end, though it may be written."""
+    """An output that the device does not hold at the end, though it may be written and the device is there."""
+    devices = gateway.get("devices", {})
     return [
         f"{o['tag']}: {o['wanted']:g} was commanded by {o['by']}, and the device does not hold it"
         for o in gateway.get("outputs", [])
-        if o["wanted"] is not None and o["held"] != o["wanted"] and not o["refused"]
+        if o["wanted"] is not None
+        and o["held"] != o["wanted"]
+        and not o["refused"]
+        and devices.get(o["tag"].partition(".")[0], {}).get("online")
     ]
 
 

@@ -259,7 +259,10 @@ def test_a_transmitter_needs_a_mailbox_and_a_socket() -> None:
 
 @pytest.mark.parametrize("log", ["audit.jsonl", "/dev/full"])
 def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, log: str) -> None:
-    """With a log that can be written, and with one that cannot: the command is refused either way."""
+    """With a log that can be written, and with one that cannot: the command is refused either way.
+
+    Acknowledging it is a write: it waits for a log that can be written.
+    """
 
     async def main() -> None:
         modems = pair()
@@ -272,12 +275,18 @@ def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, lo
             pump.refuse_when_local()
             assert not pump.inbox.queue
             assert pump.commands_refused == 1
-            pump.tick(1, all_consumed=True)  # and it is acknowledged: the next one can come
-            await eventually(lambda: not near.driver.to_acknowledge)
+            pump.tick(1, all_consumed=True)
+            if log == "audit.jsonl":  # it is acknowledged: the next one can come
+                await eventually(lambda: not near.driver.to_acknowledge)
+            assert bool(near.driver.to_acknowledge) == (log == "/dev/full")
         audit.close()
         if log == "audit.jsonl":
-            (line,) = (tmp_path / log).read_text(encoding="utf-8").splitlines()
-            assert json.loads(line)["payload"] == "0005"
+            refused, *acknowledged = map(json.loads, (tmp_path / log).read_text(encoding="utf-8").splitlines())
+            assert refused["payload"] == "0005"
+            assert [(e["tag"], e["result"]) for e in acknowledged] == [
+                ("d.inbox_ack", "asked"),
+                ("d.inbox_ack", "done"),
+            ]
 
     run(main())
 

@@ -7,35 +7,15 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from ctypes.util import find_library
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from conversation import Conversation, canopen_conversation, rtu_conversation, tcp_conversation
 from flagship import Run, converse
+from held import Held
 from targets import emulated, independent, samples_like, slopes_like
 
 MISSING = [p for p in ("socat",) if shutil.which(p) is None] + ([] if find_library("modbus") else ["libmodbus"])
-
-
-@dataclass
-class Held:
-    """A run and what was said in it, by device."""
-
-    run: Run
-    talks: dict[str, Conversation]
-
-    @classmethod
-    def of(cls, run: Run) -> Held:
-        return cls(
-            run,
-            {
-                "ctd": rtu_conversation("ctd", run.of_bus("line1")),
-                "modem": tcp_conversation("modem", run.of_bus("lan")),
-                "inclinometer": canopen_conversation("inclinometer", run.of_bus("can0"), 5),
-            },
-        )
 
 
 @pytest.fixture(scope="session")

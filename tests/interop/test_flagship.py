@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 import yaml
 from compare import Comparison, DeviceRules, Tolerances, compare, load_tolerances, reply_differences
-from conftest import Held
 from conversation import Conversation
+from held import Held
 
 pytestmark = [pytest.mark.interop, pytest.mark.slow, pytest.mark.timeout(120)]
 

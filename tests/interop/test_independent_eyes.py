@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from conftest import Held
+from held import Held
 from tshark import dissect, needs_tshark
 
 from fieldtwin.formats.pcap import read_capture

@@ -284,8 +284,8 @@ def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, lo
             refused, *acknowledged = map(json.loads, (tmp_path / log).read_text(encoding="utf-8").splitlines())
             assert refused["payload"] == "0005"
             assert [(e["tag"], e["result"]) for e in acknowledged] == [
-                ("d.inbox_ack", "asked"),
-                ("d.inbox_ack", "done"),
+                ("modem.inbox_ack", "asked"),
+                ("modem.inbox_ack", "done"),
             ]
 
     run(main())

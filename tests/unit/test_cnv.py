@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import gzip
+import os
 import math
 import struct
 import tracemalloc
@@ -19,7 +20,8 @@ from fieldtwin.formats.cnv import import_cnv
 from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from gateway.core.recording import RecordingReader
 
-REAL_CAST = Path("/work/shared/data/ctd/g01l02s01.cnv.gz")
+REAL_CAST = Path(os.environ.get("FIELDTWIN_REAL_CAST", "no-such-cast.cnv.gz"))
+"""A whole cast of a real instrument, which does not ship with the project: name one to test with it."""
 
 NAMES = ("prDM: Pressure, Digiquartz [db]", "t090C: Temperature", "c0S/m: Conductivity [S/m]", "timeS: Time", "flag: 0")
 ROWS = ((1.5, 20.25, 4.5, 0.0), (2.5, 19.125, 4.25, 0.5), (3.5, -9.99e-29, 4.125, 1.0))

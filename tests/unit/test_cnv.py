@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bz2
 import gzip
-import os
 import math
+import os
 import struct
 import tracemalloc
 from collections.abc import Sequence

@@ -6,7 +6,7 @@ that bus behind it. Here the paper's emulators meet the system file; what gatewa
 
 from __future__ import annotations
 
-from collections.abc import Sized
+from collections.abc import Mapping, Sized
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,14 @@ from emulators.endpoints.bus_server import SoftBusServer
 from emulators.endpoints.can_end import open_can_end
 from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import OnClient, SocketListener
+from emulators.endpoints.udp_end import UdpEnd
 from emulators.journal import HeldJournal
+from emulators.modbus.ascii import AsciiSlave
 from emulators.modbus.bank import RegisterBank
+from emulators.modbus.line import LineSlave
 from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu
+from emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit, UnitLimits
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.played_objects import PlayedObjects
@@ -89,7 +92,7 @@ class FieldSide:
         self._run_dir = run_dir
         self._clock = clock
         self._nursery = Nursery()
-        self._listeners: list[SocketListener | SoftBusServer] = []
+        self._listeners: list[SocketListener | SoftBusServer | UdpEnd] = []
         self._connections: list[ByteConnection | CanConnection] = []
         self._pairs: dict[str, ModemPair] = {}
 
@@ -135,9 +138,17 @@ class FieldSide:
             end = await PtyEnd.open(self._run_dir / listen.path, plant, pace)
             self._connections.append(end)
             self.listening[bus.name] = Endpoint("pty", path=str(end.link))
-            self._nursery.start(serve_rtu(end, RtuSlave(units), self._clock, latency_s), f"emulators on {bus.name}")
-        elif plant.is_serial:
-            line = RtuSlave(units)
+            self._nursery.start(
+                serve_rtu(end, line_of(plant, units), self._clock, latency_s), f"emulators on {bus.name}"
+            )
+        elif listen.scheme == "udp":
+            datagrams = await UdpEnd.open(listen)
+            self._listeners.append(datagrams)
+            self.listening[bus.name] = datagrams.bound
+            slave = MbapSlave(units)
+            self._nursery.start(serve_udp(datagrams, slave, self._clock, latency_s), f"emulators on {bus.name}")
+        elif plant.is_serial or plant.scheme == "rtu+tcp":
+            line = line_of(plant, units)
             self.listening[bus.name] = await self._listen(
                 listen, lambda c: serve_rtu(c, line, self._clock, latency_s), 1
             )
@@ -289,6 +300,11 @@ class FieldSide:
             name: [(h.number, h.tag, h.raw.hex(), h.t_ns) for h in d.journal.since(numbers.get(name, 0))]
             for name, d in self.devices.items()
         }
+
+
+def line_of(plant: Endpoint, units: Mapping[int, ModbusUnit]) -> LineSlave:
+    """The units of a serial line, in the framing that the plant's endpoint speaks."""
+    return AsciiSlave(units) if plant.scheme == "ascii" else RtuSlave(units)
 
 
 def unit_limits(profile: DeviceProfile) -> UnitLimits:

@@ -111,7 +111,7 @@ def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> Emul
     except UsageError as e:
         raise file.error(("buses", name, "listen"), e.message, expected=e.expected, got=e.got) from e
     plant = system.buses[name].endpoint
-    kinds = ("can",) if plant.is_can else ("pty", "tcp") if plant.is_serial else ("tcp",)
+    kinds = ("can",) if plant.is_can else ("pty", "tcp") if plant.is_serial else (plant.scheme,)
     if listen.scheme not in kinds:
         raise file.error(
             ("buses", name, "listen"),

@@ -21,7 +21,7 @@ from twin.data_files import find
 from twin.serving import Serving, resolve_serving
 from twin.system_schema import DeviceForm, PlcForm, SystemForm
 
-SCHEMES = ("rtu", "tcp", "rtu+tcp", "can")
+SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
 """What the gateway can talk over so far."""
 
 

@@ -25,6 +25,7 @@ HANDSHAKE_WITHIN_S = 10.0
 KEEPALIVE_IDLE_S, KEEPALIVE_INTERVAL_S, KEEPALIVE_PROBES = 10, 5, 3
 
 OnClient = Callable[["SocketEnd"], Awaitable[None]]
+Answer = Callable[[bytes], tuple[bytes, bool]]
 
 
 class SocketEnd(ByteConnection, asyncio.Protocol):
@@ -44,6 +45,29 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
         self._full = False
         self._secured = False
         self._closed = self._loop.create_future()
+        self._answer: Answer | None = None
+
+    async def answer_at_once(self, answer: Answer) -> None:
+        """Answer every chunk within the callback that brings it, until lost: no task is woken for a request.
+
+        `answer` returns what to send, possibly nothing, and whether to hang up behind it. While the client does not take its
+        answers, nothing more is read from it. Raises `ConnectionLost` in the end.
+        """
+        self._answer = answer
+        if pending := self.read_pending():
+            self._give(pending)
+        await self.read()  # nothing is fed any more: it only ever ends by the loss
+
+    def _give(self, data: bytes) -> None:
+        assert self._answer is not None
+        assert self._transport is not None
+        out, hang_up = self._answer(data)
+        if out:
+            self._transport.write(out)
+        if hang_up:
+            self._transport.close()
+        elif self._full:
+            self._transport.pause_reading()
 
     async def write(self, data: bytes) -> None:
         self._raise_if_gone()
@@ -100,7 +124,9 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         self.last_used_s = self._loop.time()
-        if not self.feed(data) and self._transport is not None:
+        if self._answer is not None:
+            self._give(data)
+        elif not self.feed(data) and self._transport is not None:
             self._transport.pause_reading()
 
     def eof_received(self) -> bool:
@@ -112,6 +138,8 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
 
     def resume_writing(self) -> None:
         self._full = False
+        if self._answer is not None and self._transport is not None:
+            self._transport.resume_reading()
         if self._room is not None:
             self._room.set_result(None)
             self._room = None

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from emulators.endpoints.socket_end import SocketEnd
 from emulators.endpoints.udp_end import UdpEnd
 from emulators.modbus.line import Exchange, LineSlave
 from emulators.modbus.mbap import MbapSlave
@@ -70,8 +71,11 @@ async def serve_mbap(
     """Serve Modbus TCP on `connection` until cancelled or lost; pipelined requests are answered in order.
 
     One `MbapSlave` a connection. Closes the connection when the client's stream makes no sense any more (`desync`).
+    A device that never thinks is answered within the callback that brings the request, which takes half the time.
     """
     try:
+        if isinstance(connection, SocketEnd) and on_frame is None and latency_s == 0.0:
+            await connection.answer_at_once(lambda data: _at_once(slave, data, clock))
         while slave.desync is None:
             data = await connection.read()
             now_ns = clock.monotonic_ns()
@@ -79,6 +83,12 @@ async def serve_mbap(
     except ConnectionLost:
         return
     await connection.aclose()
+
+
+def _at_once(slave: MbapSlave, data: bytes, clock: Clock) -> tuple[bytes, bool]:
+    """The replies to a chunk, and whether the stream makes no sense behind it."""
+    exchanges = slave.receive(data, clock.monotonic_ns())
+    return b"".join([exchange.reply for exchange in exchanges]), slave.desync is not None
 
 
 async def serve_udp(

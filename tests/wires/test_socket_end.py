@@ -9,7 +9,7 @@ import struct
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.socket_end import SocketListener
+from emulators.endpoints.socket_end import SocketEnd, SocketListener
 from emulators.modbus.bank import MapBank, Span
 from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.serve import serve_mbap
@@ -244,3 +244,54 @@ def test_modbus_pipelined_in_order_and_told_to_the_tap() -> None:
 
     run(main())
     assert (unit.counters.requests, unit.counters.replies) == (8, 8)
+
+
+def units() -> dict[int, ModbusUnit]:
+    bank = MapBank([Span("holding", 0, 125)])
+    bank.poke("holding", 0, 7)
+    return {1: ModbusUnit(bank)}
+
+
+def test_a_stream_that_makes_no_sense_is_answered_so_far_and_hung_up_on() -> None:
+    async def main() -> None:
+        listener = await SocketListener.open(ANY_PORT, lambda c: serve_mbap(c, MbapSlave(units()), WallClock()))
+        reader, writer = await connect(listener)
+        writer.write(READ + bytes.fromhex("0002 0000 ffff 01"))
+        assert await reader.read(100) == REPLY
+        assert await reader.read(100) == b""
+        await hang_up(writer)
+        await listener.aclose()
+
+    run(main())
+
+
+def test_a_client_that_does_not_read_its_answers_is_not_read_from_and_gets_all_of_them_in_the_end() -> None:
+    long_read = bytes.fromhex("0001 0000 0006 01 03 0000 007d")
+
+    async def main() -> None:
+        served: list[SocketEnd] = []
+        slave = MbapSlave(units(), max_in_flight=1_000_000)
+
+        async def serve(client: SocketEnd) -> None:
+            served.append(client)
+            await serve_mbap(client, slave, WallClock())
+
+        listener = await SocketListener.open(ANY_PORT, serve)
+        reader, writer = await connect(listener)
+        asked = 0
+        for _ in range(200):  # far more than the kernel's buffers hold: at some point nothing more is taken
+            writer.write(long_read * 500)
+            asked += 500
+            if writer.transport.get_write_buffer_size() > 1_000_000:
+                break
+            await asyncio.sleep(0)
+        await eventually(lambda: slave.requests > 0)
+        assert slave.requests < asked
+        size = 0
+        while size < asked * 259:
+            size += len(await reader.read(1 << 20))
+        assert slave.requests == asked
+        await hang_up(writer)
+        await listener.aclose()
+
+    run(main(), timeout_s=50)

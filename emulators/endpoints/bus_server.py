@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from typing import Any
+from typing import Any, cast
 
 from emulators.endpoints.bus_hello import VERSION, WANTS_CONFIRMATIONS, Hello, Status, unpack_hello
 from emulators.endpoints.bus_runner import BusRunner
@@ -131,7 +131,7 @@ class _Client(asyncio.Protocol):
     # -- the transport's side -------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
+        transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
         self._transport = transport
         connection: socket.socket = transport.get_extra_info("socket")
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)

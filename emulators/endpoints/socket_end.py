@@ -9,7 +9,7 @@ import asyncio
 import errno
 import socket
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, cast
 
 from emulators.endpoints.tls_server import client_role, make_context
 from gateway.core.connection import ByteConnection, TCPConnection, closed_here
@@ -109,10 +109,9 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
     # -- called by asyncio ----------------------------------------------------------------------------------------
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        self._transport = transport
+        self._transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
         self.last_used_s = self._loop.time()
-        name = transport.get_extra_info("peername")
+        name = self._transport.get_extra_info("peername")
         self.peer = f"{name[0]}:{name[1]}" if name else "?"
         self.host = name[0] if name else ""
         inside = transport.get_extra_info("ssl_object")

@@ -14,6 +14,7 @@ import select
 import socket
 import threading
 from dataclasses import replace
+from typing import cast
 
 import can
 from can.typechecking import CanFilters
@@ -150,7 +151,7 @@ class _Wire(asyncio.Protocol):
         self._gone: asyncio.Future[None] = loop.create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
+        transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
         self._transport = transport
 
     def data_received(self, data: bytes) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import ssl
-from typing import Self
+from typing import Self, cast
 
 from gateway.core.connection import ByteConnection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
@@ -130,7 +130,7 @@ class _Wire(asyncio.BufferedProtocol):
             self.transport.resume_reading()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
+        transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
         self.transport = transport
         transport.set_write_buffer_limits(high=WRITE_HIGH_WATER)
         _tune(transport.get_extra_info("socket"))

@@ -83,14 +83,13 @@ def command(
             )
         )
     from fieldtwin.running.device_here import run_device
+    from fieldtwin.running.loops import run as run_loop
 
     if not endpoints:
         raise UsageError("where shall it listen?", expected="--on pty:PATH or --on tcp://HOST:PORT")
     if len(recordings) > 1:
         raise UsageError("one device plays one recording")
-    return asyncio.run(
-        run_device(kind, path, endpoints, unit, Path(recordings[0]) if recordings else None, speed or 1.0)
-    )
+    return run_loop(run_device(kind, path, endpoints, unit, Path(recordings[0]) if recordings else None, speed or 1.0))
 
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:

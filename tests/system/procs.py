@@ -56,7 +56,10 @@ class Asking:
             s.connect(self._address)
             s.sendall(json.dumps({"v": 1, "id": 1, "verb": verb, "args": args}).encode() + b"\n")
             with s.makefile("rb") as lines:
-                answer = json.loads(lines.readline())
+                line = lines.readline()
+        if not line:
+            raise ConnectionResetError("the process closed its control channel without an answer")
+        answer = json.loads(line)
         assert answer["ok"], answer
         return answer["result"]
 

@@ -1,7 +1,8 @@
 """The audit log: every write, NMT command and refusal, one JSON line each, appended and never rewritten.
 
 Who asked (the PLC, the safe-state logic, the start-up configuration), what, the old and the new value, and how it ended.
-A secret tag's values are not written down. A log that cannot be written stops writes to the plant: what is not on record does not happen.
+A secret tag's values are not written down. A log that cannot be written stops writes to the plant: what is not on record
+does not happen.
 """
 
 from __future__ import annotations

@@ -7,7 +7,6 @@ took the last.
 
 from __future__ import annotations
 
-import asyncio
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -147,12 +146,3 @@ class Shore:
             "responses": self.responses_received,
             "last_response": self.responses[-1].hex() if self.responses else "",
         }
-
-
-async def run_for(shore: Shore, commands: list[Scripted], duration_s: float) -> None:
-    """Run a far end for a time: for the shore service on its own."""
-    try:
-        async with asyncio.timeout(duration_s or None):
-            await shore.run(commands)
-    except TimeoutError:
-        pass  # the time asked for is over

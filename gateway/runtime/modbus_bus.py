@@ -20,7 +20,6 @@ from gateway.core.errors import (
     DeviceRefused,
     EndpointBusy,
     FieldtwinError,
-    ModbusExceptionReply,
     ReplyTimeout,
     Unreachable,
     WireError,
@@ -32,13 +31,12 @@ from gateway.devices.register_device import RegisterDriver
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.protocols.modbus.client import ModbusClient
 from gateway.protocols.modbus.framings import framing_of
+from gateway.protocols.modbus.refusals import Acknowledged, ServerBusy
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.bridge_queue import GuestQueue
 from gateway.runtime.tags import TagTable
 
 MAX_JOBS = 256
-LATER = (0x05, 0x06)
-"""Exceptions that ask for time: acknowledge, and server device busy (AP 7)."""
 
 
 def reason_of(error: FieldtwinError) -> Reason:
@@ -285,7 +283,7 @@ class ModbusBus:
         """
         device.poll_errors += 1
         device.error = str(error)
-        if isinstance(error, ModbusExceptionReply) and error.code in LATER and device.online:
+        if isinstance(error, Acknowledged | ServerBusy) and device.online:
             device.due_ns[group] = self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S)
             return
         names = [t.name for t in device.driver.profile.group(group)] if group else list(device.driver.profile.tags)

@@ -23,6 +23,14 @@ class ChildFailed(FieldtwinError):
         super().__init__(f"{name}: {text}", hint=f"log: {log}")
 
 
+def spawn(argv: list[str], log: Path) -> subprocess.Popen[bytes]:
+    """Start a process that talks to `log`, in a session of its own: Ctrl-C reaches only us, and we end it in order."""
+    with log.open("wb") as out:
+        return subprocess.Popen(
+            argv, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, start_new_session=True
+        )
+
+
 class Child:
     """One process. In a session of its own, so that Ctrl-C reaches only us and we end it in order.
 
@@ -34,14 +42,7 @@ class Child:
         self.log = run_dir / f"{name}.log"
         self.socket = run_dir / f"{name}.sock"
         self.socket.unlink(missing_ok=True)
-        with self.log.open("wb") as log:
-            self._process = subprocess.Popen(
-                command(module, str(config), linger_s=linger_s),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+        self._process = spawn(command(module, str(config), linger_s=linger_s), self.log)
 
     @property
     def pid(self) -> int:

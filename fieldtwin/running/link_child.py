@@ -6,6 +6,7 @@ import asyncio
 import subprocess
 from pathlib import Path
 
+from fieldtwin.running.children import spawn
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ReplyTimeout, Unreachable
 from twin.child import command
@@ -21,14 +22,7 @@ class LinkChild:
         self._link = link
         self._log = log
         link.unlink(missing_ok=True)
-        with log.open("wb") as out:
-            self._process = subprocess.Popen(
-                command("fieldtwin", "link", str(link), str(target), linger_s=LINGER_S),
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+        self._process = spawn(command("fieldtwin", "link", str(link), str(target), linger_s=LINGER_S), log)
 
     async def ready(self, timeout_s: float = 10.0) -> None:
         deadline = asyncio.get_running_loop().time() + timeout_s

@@ -1,0 +1,83 @@
+"""ALARM: two warnings and two alarms on one value, with delay, hysteresis and acknowledgement.
+
+    LL  alarm     L  warning          H  warning     HH  alarm
+
+A limit is violated when X is beyond it, and no longer so when X is back by more than HYS. A violation that lasts DELAY
+raises its condition; one that ends earlier was none. A raised condition stays *unacknowledged* until ACK rises, also after
+the value came back; acknowledged and back is gone. A value that is not a number changes nothing.
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+from plc.blocks.block import FunctionBlock
+
+
+class _Limit:
+    """One limit's state: `sign` +1 for a high one, -1 for a low one."""
+
+    __slots__ = ("active", "sign", "since_ns", "unacknowledged", "violated")
+
+    def __init__(self, sign: int) -> None:
+        self.sign = sign
+        self.violated = self.active = self.unacknowledged = False
+        self.since_ns = 0
+
+    def watch(self, x: float, limit: float, hysteresis: float, delay_ns: int, now_ns: int) -> None:
+        beyond = (x - limit) * self.sign
+        if not self.violated:
+            if beyond > 0:
+                self.violated, self.since_ns = True, now_ns
+        elif beyond < -hysteresis or (hysteresis == 0 and beyond <= 0):
+            self.violated = self.active = False
+        if self.violated and not self.active and now_ns - self.since_ns >= delay_ns:
+            self.active = self.unacknowledged = True
+
+
+class ALARM(FunctionBlock):
+    """See the module. QLL, QL, QH, QHH: the condition is there. UNACK: one was not acknowledged. Q: alarm, WARN: warning."""
+
+    __slots__ = (
+        "ACK", "DELAY", "H", "HH", "HYS", "L", "LL", "Q", "QH", "QHH", "QL", "QLL", "UNACK", "WARN", "X",
+        "_ack_before", "_limits",
+    )  # fmt: skip
+    inputs = {
+        "X": "LREAL", "LL": "LREAL", "L": "LREAL", "H": "LREAL", "HH": "LREAL", "HYS": "LREAL", "DELAY": "TIME",
+        "ACK": "BOOL",
+    }  # fmt: skip
+    outputs = {
+        "Q": "BOOL", "WARN": "BOOL", "QLL": "BOOL", "QL": "BOOL", "QH": "BOOL", "QHH": "BOOL", "UNACK": "BOOL",
+    }  # fmt: skip
+
+    def __init__(self) -> None:
+        self.X = self.HYS = 0.0
+        self.LL = self.L = -inf
+        self.H = self.HH = inf
+        self.DELAY = 0
+        self.ACK = self._ack_before = False
+        self.Q = self.WARN = self.QLL = self.QL = self.QH = self.QHH = self.UNACK = False
+        self._limits = (_Limit(-1), _Limit(-1), _Limit(1), _Limit(1))
+
+    def execute(self, now_ns: int) -> None:
+        if self.ACK and not self._ack_before:
+            for limit in self._limits:
+                limit.unacknowledged = False
+        self._ack_before = self.ACK
+        if self.X == self.X:
+            hysteresis, delay_ns = max(0.0, self.HYS), max(0, self.DELAY)
+            for limit, at in zip(self._limits, (self.LL, self.L, self.H, self.HH), strict=True):
+                limit.watch(self.X, at, hysteresis, delay_ns, now_ns)
+        self.QLL, self.QL, self.QH, self.QHH = (limit.active for limit in self._limits)
+        self.Q = self.QLL or self.QHH
+        self.WARN = self.QL or self.QH
+        self.UNACK = any(limit.unacknowledged for limit in self._limits)
+
+    def __call__(
+        self, now_ns: int, *, X: float, LL: float = -inf, L: float = -inf, H: float = inf, HH: float = inf,
+        HYS: float = 0.0, DELAY: int = 0, ACK: bool = False,
+    ) -> ALARM:  # fmt: skip
+        self.X, self.LL, self.L, self.H, self.HH = X, LL, L, H, HH
+        self.HYS, self.DELAY, self.ACK = HYS, DELAY, ACK
+        self.execute(now_ns)
+        return self

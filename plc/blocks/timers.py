@@ -1,0 +1,96 @@
+"""Timers: TON, TOF, TP (IEC 61131-3, 6.6.3.5.5 with its timing diagrams).
+
+Time is the scan's, so an edge counts from the scan that saw it, and an output changes in the first scan at or after its
+time. ET never exceeds PT. What the standard leaves open: a PT that changes while the timer runs counts from the same
+start; one that changes after the timer ran out changes nothing until the next start; a negative PT is 0; a rise of TP's
+IN in the very scan that ends the pulse is none.
+"""
+
+from __future__ import annotations
+
+from plc.blocks.block import FunctionBlock
+
+
+class TON(FunctionBlock):
+    """On-delay: Q follows IN's rise PT later, and its fall at once. ET: how long IN has been true, at most PT."""
+
+    __slots__ = ("ET", "IN", "PT", "Q", "_since_ns")
+    inputs = {"IN": "BOOL", "PT": "TIME"}
+    outputs = {"Q": "BOOL", "ET": "TIME"}
+
+    def __init__(self) -> None:
+        self.IN = self.Q = False
+        self.PT = self.ET = 0
+        self._since_ns: int | None = None
+
+    def execute(self, now_ns: int) -> None:
+        if not self.IN:
+            self.Q, self.ET, self._since_ns = False, 0, None
+        elif not self.Q:
+            if self._since_ns is None:
+                self._since_ns = now_ns
+            preset = max(0, self.PT)
+            self.ET = min(now_ns - self._since_ns, preset)
+            self.Q = self.ET >= preset
+
+    def __call__(self, now_ns: int, *, IN: bool, PT: int) -> TON:
+        self.IN, self.PT = IN, PT
+        self.execute(now_ns)
+        return self
+
+
+class TOF(FunctionBlock):
+    """Off-delay: Q follows IN's rise at once, and its fall PT later. ET: how long IN has been false, at most PT."""
+
+    __slots__ = ("ET", "IN", "PT", "Q", "_since_ns")
+    inputs = {"IN": "BOOL", "PT": "TIME"}
+    outputs = {"Q": "BOOL", "ET": "TIME"}
+
+    def __init__(self) -> None:
+        self.IN = self.Q = False
+        self.PT = self.ET = 0
+        self._since_ns: int | None = None
+
+    def execute(self, now_ns: int) -> None:
+        if self.IN:
+            self.Q, self.ET, self._since_ns = True, 0, None
+        elif self.Q:
+            if self._since_ns is None:
+                self._since_ns = now_ns
+            preset = max(0, self.PT)
+            self.ET = min(now_ns - self._since_ns, preset)
+            self.Q = self.ET < preset
+
+    def __call__(self, now_ns: int, *, IN: bool, PT: int) -> TOF:
+        self.IN, self.PT = IN, PT
+        self.execute(now_ns)
+        return self
+
+
+class TP(FunctionBlock):
+    """Pulse: a rise of IN makes Q true for PT, whatever IN does meanwhile. ET stays at PT until IN is false."""
+
+    __slots__ = ("ET", "IN", "PT", "Q", "_before", "_since_ns")
+    inputs = {"IN": "BOOL", "PT": "TIME"}
+    outputs = {"Q": "BOOL", "ET": "TIME"}
+
+    def __init__(self) -> None:
+        self.IN = self.Q = self._before = False
+        self.PT = self.ET = 0
+        self._since_ns = 0
+
+    def execute(self, now_ns: int) -> None:
+        preset = max(0, self.PT)
+        if self.IN and not self._before and not self.Q:
+            self.Q, self._since_ns = True, now_ns
+        if self.Q:
+            self.ET = min(now_ns - self._since_ns, preset)
+            self.Q = self.ET < preset
+        if not self.Q and not self.IN:
+            self.ET = 0
+        self._before = self.IN
+
+    def __call__(self, now_ns: int, *, IN: bool, PT: int) -> TP:
+        self.IN, self.PT = IN, PT
+        self.execute(now_ns)
+        return self

@@ -1,0 +1,279 @@
+"""What is written in a Structured Text file, as a tree: frozen nodes with their place. What names mean is not decided here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Pos:
+    """Line and column, both from 1."""
+
+    line: int
+    column: int
+
+
+# -- types ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class NamedType:
+    pos: Pos
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class SubrangeType:
+    pos: Pos
+    name: str
+    low: Expr
+    high: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class StringType:
+    pos: Pos
+    wide: bool
+    length: Expr | None
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayType:
+    pos: Pos
+    ranges: tuple[tuple[Expr, Expr], ...]
+    of: TypeSpec
+
+
+TypeSpec = NamedType | SubrangeType | StringType | ArrayType
+
+
+@dataclass(frozen=True, slots=True)
+class InitArray:
+    """`items`: how often, and what (None: the type's own initial value)."""
+
+    pos: Pos
+    items: tuple[tuple[int, Init | None], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class InitStruct:
+    pos: Pos
+    members: tuple[tuple[str, Init], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class VarDecl:
+    """One declared name; `location` is the direct address after AT, if any."""
+
+    pos: Pos
+    name: str
+    type: TypeSpec
+    initial: Init | None
+    location: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StructDecl:
+    pos: Pos
+    name: str
+    fields: tuple[VarDecl, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class EnumDecl:
+    """`values`: names with the number that was stated, if one was."""
+
+    pos: Pos
+    name: str
+    values: tuple[tuple[str, int | None], ...]
+    initial: Init | None
+
+
+@dataclass(frozen=True, slots=True)
+class AliasDecl:
+    pos: Pos
+    name: str
+    type: TypeSpec
+    initial: Init | None
+
+
+TypeDecl = StructDecl | EnumDecl | AliasDecl
+
+
+@dataclass(frozen=True, slots=True)
+class VarBlock:
+    """`kind` in capitals (VAR, VAR_INPUT, ..., VAR_GLOBAL), `qualifiers` too."""
+
+    pos: Pos
+    kind: str
+    qualifiers: frozenset[str]
+    variables: tuple[VarDecl, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Pou:
+    """A program organization unit: `kind` is PROGRAM, FUNCTION or FUNCTION_BLOCK; `returns` a function's type."""
+
+    pos: Pos
+    kind: str
+    name: str
+    returns: TypeSpec | None
+    blocks: tuple[VarBlock, ...]
+    body: tuple[Statement, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """All that one file declares."""
+
+    types: tuple[TypeDecl, ...] = ()
+    globals: tuple[VarBlock, ...] = ()
+    pous: tuple[Pou, ...] = ()
+
+
+# -- expressions --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Literal:
+    """`kind` is the token's (INTEGER, REAL, BASED, TYPED, DURATION...), `text` as written."""
+
+    pos: Pos
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    pos: Pos
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bit:
+    pos: Pos
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Index:
+    pos: Pos
+    indices: tuple[Expr, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Ref:
+    pos: Pos
+    name: str
+    selectors: tuple[Member | Bit | Index, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """Positional (`name` empty), ``name := value``, or ``name => target`` (`target` set, `inverted` by NOT)."""
+
+    pos: Pos
+    name: str
+    value: Expr | None
+    target: Ref | None = None
+    inverted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    pos: Pos
+    ref: Ref
+    arguments: tuple[Argument, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Binary:
+    pos: Pos
+    op: str
+    left: Expr
+    right: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class Unary:
+    pos: Pos
+    op: str
+    operand: Expr
+
+
+Expr = Literal | Ref | Call | Binary | Unary
+Init = Literal | Ref | Call | Binary | Unary | InitArray | InitStruct
+
+# -- statements ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Assign:
+    pos: Pos
+    target: Ref
+    value: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class CallStatement:
+    pos: Pos
+    call: Call
+
+
+@dataclass(frozen=True, slots=True)
+class If:
+    pos: Pos
+    branches: tuple[tuple[Expr, tuple[Statement, ...]], ...]
+    otherwise: tuple[Statement, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class CaseLabel:
+    """One value, or a range: each a literal or an enumerated value's name."""
+
+    pos: Pos
+    low: Expr
+    high: Expr | None
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    pos: Pos
+    selector: Expr
+    branches: tuple[tuple[tuple[CaseLabel, ...], tuple[Statement, ...]], ...]
+    otherwise: tuple[Statement, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class For:
+    pos: Pos
+    variable: Ref
+    first: Expr
+    last: Expr
+    step: Expr | None
+    body: tuple[Statement, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class While:
+    pos: Pos
+    condition: Expr
+    body: tuple[Statement, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    pos: Pos
+    body: tuple[Statement, ...]
+    until: Expr
+
+
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """EXIT, CONTINUE or RETURN."""
+
+    pos: Pos
+    word: str
+
+
+Statement = Assign | CallStatement | If | Case | For | While | Repeat | Jump

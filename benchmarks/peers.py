@@ -69,10 +69,36 @@ def free_port() -> int:
         return port
 
 
+def ratio(values: list[float], base: list[float]) -> float:
+    """The median of the pairwise ratios: each pair was measured one after the other."""
+    return median(v / b for v, b in zip(values, base, strict=True))
+
+
 def row(name: str, values: list[float], base: list[float]) -> str:
     """One line of a table: median, and the median of the pairwise ratios to `base`."""
-    ratio = median(v / b for v, b in zip(values, base, strict=True))
-    return f"{name:<22} {median(values):>12.1f}   {ratio:>6.2f}"
+    return f"{name:<24} {median(values):>12.1f}   {ratio(values, base):>6.2f}"
+
+
+class Goals:
+    """What is to be reached, and whether it was."""
+
+    def __init__(self) -> None:
+        self._missed = 0
+
+    def least(self, what: str, got: float, goal: float, unit: str = "") -> None:
+        self._judge(what, got, f"at least {goal:g}", got >= goal, unit)
+
+    def most(self, what: str, got: float, goal: float, unit: str = "") -> None:
+        self._judge(what, got, f"at most {goal:g}", got <= goal, unit)
+
+    def _judge(self, what: str, got: float, goal: str, reached: bool, unit: str) -> None:
+        self._missed += not reached
+        shown = f"{got:.3g}" if abs(got) < 1000 else f"{got:.0f}"
+        print(f"{'reached' if reached else 'MISSED ':<8} {what}: {shown} (goal: {goal}{' ' + unit if unit else ''})")
+
+    def verdict(self) -> int:
+        """The exit status: 0 when all were reached."""
+        return 1 if self._missed else 0
 
 
 def python() -> str:

@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 import sys
 
-from pymodbus.datastore import ModbusDeviceContext, ModbusSequentialDataBlock, ModbusServerContext
 from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
 
 
 async def main(port: int) -> None:
-    block = ModbusSequentialDataBlock(1, [0] * 100)
-    context = ModbusServerContext(devices=ModbusDeviceContext(hr=block), single=True)
-    server = ModbusTcpServer(context, address=("127.0.0.1", port))
+    device = SimDevice(1, [SimData(0, count=100, values=0, datatype=DataType.REGISTERS)])
+    server = ModbusTcpServer(device, address=("127.0.0.1", port))
     await server.serve_forever(background=True)
     print("ready", flush=True)
     await asyncio.Event().wait()

@@ -35,7 +35,8 @@ class DictionaryEntry:
     `name` is ``Parent.Child`` for a sub-object. `type_code` is that of CiA 301 (see `datatypes.DataType`). `access` is
     ro, wo, rw, rwr, rww or const. `default` is the DCF's ParameterValue where it has one, else the DefaultValue, with
     $NODEID filled in when a node id was given; None when the file has none, or none that can be read. `low` and
-    `high` are limits of integers, None where there is none.
+    `high` are limits of integers, None where there is none. `configured` says that a DCF sets it: `default` is then its
+    ParameterValue, None where that cannot be read.
     """
 
     index: int
@@ -47,6 +48,7 @@ class DictionaryEntry:
     low: int | None = None
     high: int | None = None
     pdo_mappable: bool = False
+    configured: bool = False
 
     @property
     def readable(self) -> bool:
@@ -155,15 +157,16 @@ def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[
     template = known[1]
     known[0] = replace(known[0], access="ro", default=count)
     for sub in range(2, min(count, 254) + 1):
-        known.setdefault(sub, replace(template, subindex=sub, name=f"{array.name}.{array.name}{sub}"))
+        known.setdefault(sub, replace(template, subindex=sub, name=f"{array.name}.{array.name}{sub}", configured=False))
     return list(known.values())
 
 
 def _entry(var: ODVariable, name: str) -> DictionaryEntry:
-    default = var.default if var.value is None else var.value
+    configured = bool(getattr(var, "value_raw", ""))
+    default = var.value if configured else var.default
     if var.data_type == DataType.BOOLEAN and default is not None:
         default = bool(default)
     kind = DataType.DOMAIN if var.data_type is None else var.data_type
     return DictionaryEntry(
-        var.index, var.subindex, name, kind, var.access_type, default, var.min, var.max, var.pdo_mappable
+        var.index, var.subindex, name, kind, var.access_type, default, var.min, var.max, var.pdo_mappable, configured
     )

@@ -12,15 +12,16 @@ from collections.abc import Callable
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import CanConnection
-from gateway.core.errors import ConnectionLost, FieldtwinError
-from gateway.protocols.canopen import cob_id, nmt
+from gateway.core.errors import Bug, ConnectionLost, Desync, FieldtwinError, ReplyTimeout, SdoAborted, UsageError
+from gateway.protocols.canopen import abort_codes, cob_id, nmt
 from gateway.protocols.canopen.heartbeat import HeartbeatConsumer
 from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
 from gateway.protocols.canopen.sdo import SdoDownload, SdoTransfer, SdoUpload
+from gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 from gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
 
 PdoCallback = Callable[[bytes, int], None]
-"""Called with the PDO's data and when it came (monotonic, ns)."""
+"""Called with the frame's data and when it came (monotonic, ns)."""
 
 EventCallback = Callable[[NodeEvent], None]
 
@@ -34,6 +35,9 @@ class CanopenMaster:
 
     `run` must be running for anything to be received. `on_event` may be set at any time; it and PDO callbacks are called
     from `run`, must be quick, and end it with whatever they raise: an error of a callback is a bug and is not hidden.
+
+    `sdo_timeout_s` is for each SDO reply of a node that has no time of its own; `sdo_retries` is how often an upload
+    that got no good reply is repeated; `short_sdo` takes SDO replies of fewer than 8 bytes too (CO-026).
     """
 
     def __init__(
@@ -42,6 +46,8 @@ class CanopenMaster:
         clock: Clock,
         *,
         sdo_timeout_s: float = 0.5,
+        sdo_retries: int = 0,
+        short_sdo: bool = False,
         on_event: EventCallback | None = None,
     ) -> None:
         self.counters = Counters()
@@ -49,9 +55,13 @@ class CanopenMaster:
         self._connection = connection
         self._clock = clock
         self._sdo_timeout_s = sdo_timeout_s
+        self._sdo_retries = sdo_retries
+        self._short_sdo = short_sdo
+        self._timeouts_s: dict[int, float] = {}
         self._heartbeat = HeartbeatConsumer()
         self._channels: dict[int, SdoChannel] = {}
         self._pdos: dict[int, list[PdoCallback]] = {}
+        self._services: dict[int, PdoCallback] = {}
         self._stopped: ConnectionLost | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -59,9 +69,11 @@ class CanopenMaster:
 
     # -- what drivers ask -----------------------------------------------------------------------------------------
 
-    def add_node(self, node: int, *, heartbeat_consumer_ms: int = 0) -> None:
+    def add_node(self, node: int, *, heartbeat_consumer_ms: int = 0, sdo_timeout_s: float | None = None) -> None:
         """Make `node` known; with a consumer time it is watched from its first heartbeat on."""
         self._channel(cob_id.check_node(node))
+        if sdo_timeout_s is not None:
+            self._timeouts_s[node] = sdo_timeout_s
         self._heartbeat.monitor(node, heartbeat_consumer_ms)
         self._arm()
 
@@ -74,28 +86,77 @@ class CanopenMaster:
         return self._heartbeat.is_lost(node)
 
     async def sdo_upload(
-        self, node: int, index: int, subindex: int, timeout_s: float | None = None, *, length: int | None = None
+        self,
+        node: int,
+        index: int,
+        subindex: int,
+        timeout_s: float | None = None,
+        *,
+        length: int | None = None,
+        block: bool = False,
+        retries: int | None = None,
     ) -> bytes:
         """Read an object. `timeout_s` is for each reply; `length` is the object's size where known (CO-029).
 
         One transfer a node at a time, in the order asked; nodes in parallel. A late reply is never taken for the reply
-        to a later request, for the same object neither (`late_replies` tells how). Raises `SdoAborted`, `ReplyTimeout`,
-        `Desync` or `ConnectionLost`.
+        to a later request, for the same object neither (`late_replies` tells how). What got no good reply is asked for
+        again `retries` times. `block` is for long objects; a node that knows no block transfer is asked again without.
+        Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`.
         """
-        return await self._transfer(SdoUpload(node, index, subindex, self._ns(timeout_s), length=length))
+        timeout_ns = self._ns(node, timeout_s)
+        again = self._sdo_retries if retries is None else retries
+        if block:
+            try:
+                return await self._transfer(
+                    lambda: SdoBlockUpload(node, index, subindex, timeout_ns, length=length), again
+                )
+            except SdoAborted as e:
+                if e.code != abort_codes.UNKNOWN_SPECIFIER:
+                    raise
+        return await self._transfer(lambda: SdoUpload(node, index, subindex, timeout_ns, length=length), again)
 
     async def sdo_download(
-        self, node: int, index: int, subindex: int, data: bytes, timeout_s: float | None = None
+        self,
+        node: int,
+        index: int,
+        subindex: int,
+        data: bytes,
+        timeout_s: float | None = None,
+        *,
+        block: bool = False,
+        retries: int = 0,
     ) -> None:
-        """Write an object. As `sdo_upload`; after a `ReplyTimeout` the node may have taken the value or not."""
-        await self._transfer(SdoDownload(node, index, subindex, self._ns(timeout_s), data))
+        """Write an object. As `sdo_upload`; after a `ReplyTimeout` the node may have taken the value or not.
+
+        So a write is repeated only where the caller says so: it may be a command.
+        """
+        timeout_ns = self._ns(node, timeout_s)
+        if block:
+            try:
+                await self._transfer(lambda: SdoBlockDownload(node, index, subindex, timeout_ns, data), retries)
+                return
+            except SdoAborted as e:
+                if e.code != abort_codes.UNKNOWN_SPECIFIER:
+                    raise
+        await self._transfer(lambda: SdoDownload(node, index, subindex, timeout_ns, data), retries)
 
     async def nmt(self, command: NmtCommand, node: int) -> None:
         """Send an NMT command to `node`, or to all (0). Unconfirmed: the node's heartbeat tells what came of it."""
         frame = nmt.command_frame(command, node)
         if command.boots:
             self._heartbeat.expect_boot_up(node)
-        await self._send(frame)
+        await self.send(frame)
+
+    async def send(self, frame: CanFrame) -> None:
+        """Put a frame on the bus: SYNC, TIME, LSS. Waits while the transmit queue is full; raises `ConnectionLost`."""
+        await self._connection.send(frame)
+        self.counters.frames_out += 1
+
+    def listen(self, can_id: int, callback: PdoCallback) -> None:
+        """Call `callback` for each data frame of a service that is no node's: 7E4h (LSS). One callback an identifier."""
+        if can_id in self._services:
+            raise UsageError("somebody listens to this identifier already", got=f"{can_id:X}h")
+        self._services[can_id] = callback
 
     def subscribe_pdo(self, cob_id_: int, callback: PdoCallback) -> None:
         """Call `callback` for each data frame with that CAN-ID. Raises `UsageError` for one that no PDO may have."""
@@ -142,6 +203,8 @@ class CanopenMaster:
             self.counters.pdos += 1
             for callback in callbacks:
                 callback(frame.data, t_ns)
+        elif (service := self._services.get(frame.can_id)) is not None:
+            service(frame.data, t_ns)
         elif node == 0:
             self.counters.ignored += 1  # NMT, SYNC and other broadcasts of somebody else
         elif base == cob_id.SDO_RESPONSE_BASE:
@@ -206,22 +269,24 @@ class CanopenMaster:
 
     # -- helpers --------------------------------------------------------------------------------------------------
 
-    async def _transfer(self, transfer: SdoTransfer) -> bytes:
-        try:
-            return await self._channel(transfer.node).run(transfer)
-        except ConnectionLost:
-            raise
-        except FieldtwinError as e:
-            raise e.at(f"{self._where()} node {transfer.node}") from e.__cause__
-
-    async def _send(self, frame: CanFrame) -> None:
-        await self._connection.send(frame)
-        self.counters.frames_out += 1
+    async def _transfer(self, make: Callable[[], SdoTransfer], retries: int) -> bytes:
+        for left in range(retries, -1, -1):
+            transfer = make()
+            transfer.tolerate_short = self._short_sdo
+            try:
+                return await self._channel(transfer.node).run(transfer)
+            except ConnectionLost:
+                raise
+            except FieldtwinError as e:
+                if not (left and isinstance(e, ReplyTimeout | Desync)):
+                    raise e.at(f"{self._where()} node {transfer.node}") from e.__cause__
+                self.counters.sdo_retries += 1
+        raise Bug("retries without end", got=str(retries))
 
     def _channel(self, node: int) -> SdoChannel:
         channel = self._channels.get(node)
         if channel is None:
-            channel = SdoChannel(node, self._send, self._clock, self.counters)
+            channel = SdoChannel(node, self.send, self._clock, self.counters)
             channel.lose(self._stopped)
             self._channels[node] = channel
         return channel
@@ -231,8 +296,8 @@ class CanopenMaster:
         for channel in self._channels.values():
             channel.lose(reason)
 
-    def _ns(self, timeout_s: float | None) -> int:
-        return int((self._sdo_timeout_s if timeout_s is None else timeout_s) * NS_PER_S)
+    def _ns(self, node: int, timeout_s: float | None) -> int:
+        return int((self._timeouts_s.get(node, self._sdo_timeout_s) if timeout_s is None else timeout_s) * NS_PER_S)
 
     def _where(self) -> str:
         return str(self._connection.endpoint)

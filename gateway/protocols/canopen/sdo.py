@@ -2,11 +2,12 @@
 
 A transfer is a pure object: `start` gives the request, `feed` takes what came and gives what to do next, `expire` ends
 it when its time is over. It knows no bus, no clock and no other transfer; which replies may belong to an *earlier*
-transfer is the business of `late_replies`. A block transfer would be one more subclass of `SdoTransfer`.
+transfer is the business of `late_replies`. Block transfers are in `sdo_block`.
 
-What is never paired with a request: a frame that is not 8 bytes, of another COB-ID, remote, extended, or with another
-multiplexor (index and subindex). Such strays are counted, do not prolong the transfer, and end it when there are too
-many. Segments carry no multiplexor: there, anything that breaks the protocol aborts the transfer.
+What is never paired with a request: a frame that is not 8 bytes (`tolerate_short` pads it: CO-026), of another COB-ID,
+remote, extended, or with another multiplexor (index and subindex). Such strays are counted, do not prolong the
+transfer, and end it when there are too many. Segments carry no multiplexor: there, anything that breaks the protocol
+aborts the transfer.
 """
 
 from __future__ import annotations
@@ -31,16 +32,23 @@ _UPLOAD_REPLY, _DOWNLOAD_REPLY, _ABORT = 2, 3, 4
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """The transfer goes on: send this."""
+    """The transfer goes on: send this. With `more`, `SdoTransfer.more` gives the next one to send at once."""
 
     frame: CanFrame
+    more: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Wait:
+    """The frame carried the transfer on; nothing is to be sent yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """The transfer succeeded. `data` is the object's value (upload) or empty (download)."""
+    """The transfer succeeded. `data` is the object's value (upload) or empty (download). `last` is still to be sent."""
 
     data: bytes
+    last: CanFrame | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +66,7 @@ class Stray:
     why: str
 
 
-Step = Send | Done | Failed | Stray
+Step = Send | Wait | Done | Failed | Stray
 
 
 class SdoTransfer(ABC):
@@ -67,6 +75,9 @@ class SdoTransfer(ABC):
     `timeout_ns` is for each reply and starts again with every reply that carries the transfer on (CO-022).
     `answered` tells whether the node has replied to the initiate request (or aborted).
     """
+
+    tolerate_short = False
+    """Whether a reply of fewer than 8 bytes is one that lacks zeros at its end, as old PLCs send them (CO-026)."""
 
     _reply: ClassVar[int]
     _segment_reply: ClassVar[int]
@@ -81,6 +92,7 @@ class SdoTransfer(ABC):
         self.subindex = subindex
         self.timeout_ns = timeout_ns
         self.deadline_ns = 0
+        self.started = False
         self.answered = False
         self.over = False
         self.strays = 0
@@ -95,36 +107,53 @@ class SdoTransfer(ABC):
     def start(self, now_ns: int) -> CanFrame:
         """The initiate request."""
         self.deadline_ns = now_ns + self.timeout_ns
+        self.started = True
         return self._frame(self._request())
 
     def feed(self, frame: CanFrame, now_ns: int) -> Step:
         """Take a frame that came at `now_ns`."""
         if frame.can_id != cob_id.SDO_RESPONSE_BASE + self.node or frame.extended or frame.remote or frame.error:
             return self._stray("another identifier or kind of frame")
-        if len(frame.data) != 8:
+        data = frame.data.ljust(8, b"\0") if self.tolerate_short and frame.data else frame.data
+        if len(data) != 8:
             return self._stray("an SDO has 8 bytes")
         if self.over:
             return self._stray("the transfer is over")
-        specifier, ours = frame.data[0] >> 5, frame.data[1:4] == self._multiplexor
-        if specifier == _ABORT:
-            return self._aborted(frame.data) if ours else self._stray("an abort of another object")
+        ours = data[1:4] == self._multiplexor
+        if self._is_abort(data):
+            return self._aborted(data) if ours else self._stray("an abort of another object")
         if not self.answered:
-            if specifier != self._reply or not ours:
+            if not (ours and self._is_reply(data)):
                 return self._stray("a reply to another request")
             self.answered = True
-            return self._go_on(self._on_reply(frame.data), now_ns)
-        if specifier == self._segment_reply:
-            return self._go_on(self._on_segment_reply(frame.data), now_ns)
-        if specifier in (_UPLOAD_SEGMENT_REPLY, _DOWNLOAD_SEGMENT_REPLY) or (
-            specifier in (_UPLOAD_REPLY, _DOWNLOAD_REPLY) and ours
-        ):
-            return self._break(abort_codes.UNKNOWN_SPECIFIER, "a reply of another kind amid the segments", frame.data)
-        return self._stray("a reply to another request")
+            return self._go_on(self._on_reply(data), now_ns)
+        return self._go_on(self._on_next(data), now_ns)
 
-    def expire(self, now_ns: int) -> Failed | None:
-        """The end of the transfer when its reply is overdue at `now_ns`, else None."""
+    def more(self, now_ns: int) -> Send | None:
+        """What to send next without waiting for a reply, where the last `Send` said that there is more."""
+        return None
+
+    @property
+    def unmarked(self) -> bool:
+        """Whether what the node sends now may look like a reply that carries a multiplexor, and carries none."""
+        return False
+
+    @property
+    def to_abort(self) -> bool:
+        """Whether the node has to be told when this transfer is left as it is: it may take the next request for a segment."""
+        return self.answered and not self.over
+
+    def expire(self, now_ns: int) -> Send | Failed | None:
+        """What to do when its reply is overdue at `now_ns`: as a rule, to end the transfer. None before that."""
         if self.over or now_ns < self.deadline_ns:
             return None
+        return self._recover(now_ns) or self._timed_out()
+
+    def _recover(self, now_ns: int) -> Send | None:
+        """What may still help when nothing comes any more; None where nothing does."""
+        return None
+
+    def _timed_out(self) -> Failed:
         self.over = True
         what = "between segments" if self.answered else "to the request"
         error = ReplyTimeout(f"{self.name}: no reply {what} within {self.timeout_ns / 1e9:g} s")
@@ -143,13 +172,34 @@ class SdoTransfer(ABC):
     @abstractmethod
     def _on_segment_reply(self, data: bytes) -> Step: ...
 
+    def _is_abort(self, data: bytes) -> bool:
+        return data[0] >> 5 == _ABORT
+
+    def _is_reply(self, data: bytes) -> bool:
+        """Whether it is the reply to the initiate request, by its specifier; its multiplexor is ours."""
+        return data[0] >> 5 == self._reply
+
+    def _on_next(self, data: bytes) -> Step:
+        """Take what came after the reply to the initiate request."""
+        specifier = data[0] >> 5
+        if specifier == self._segment_reply:
+            return self._on_segment_reply(data)
+        marked = specifier in (_UPLOAD_REPLY, _DOWNLOAD_REPLY) and data[1:4] == self._multiplexor
+        if marked or specifier in (_UPLOAD_SEGMENT_REPLY, _DOWNLOAD_SEGMENT_REPLY):
+            return self._break(abort_codes.UNKNOWN_SPECIFIER, "a reply of another kind amid the segments", data)
+        return self._stray("a reply to another request")
+
+    def _patience_ns(self) -> int:
+        """How long the next frame may take."""
+        return self.timeout_ns
+
     def _frame(self, data: bytes) -> CanFrame:
         return CanFrame(cob_id.SDO_REQUEST_BASE + self.node, data.ljust(8, b"\0"))
 
     def _go_on(self, step: Step, now_ns: int) -> Step:
-        if isinstance(step, Send):
-            self.deadline_ns = now_ns + self.timeout_ns
-        else:
+        if isinstance(step, Send | Wait):
+            self.deadline_ns = now_ns + self._patience_ns()
+        elif not isinstance(step, Stray):
             self.over = True
         return step
 

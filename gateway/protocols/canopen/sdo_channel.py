@@ -9,13 +9,15 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted
+from gateway.protocols.canopen import abort_codes
 from gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
-from gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, SdoUpload, Send, Stray
+from gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
 
 MAX_INBOX = 128
 """Frames that wait for the transfer's task; a flood beyond that is dropped and counted."""
@@ -27,8 +29,8 @@ class Counters:
 
     Requests and replies are counted in frames, as a bus analyser would: each initiate and each segment that is sent,
     each reply that carried a transfer on or ended it. Aborts that the node sent are in `sdo_aborts` only, aborts that
-    the master sent in `frames_out` only. `sdo_timeouts` are requests that got no reply; `sdo_probes` are the transfers
-    made to get past late replies. `ignored` are frames that were for nobody.
+    the master sent in `frames_out` only. `sdo_timeouts` are requests that got no reply, `sdo_retries` transfers that
+    were begun again; `sdo_probes` are the transfers made to get past late replies. `ignored` are frames that were for nobody.
     """
 
     frames_in: int = 0
@@ -37,6 +39,7 @@ class Counters:
     sdo_replies: int = 0
     sdo_aborts: int = 0
     sdo_timeouts: int = 0
+    sdo_retries: int = 0
     sdo_probes: int = 0
     pdos: int = 0
     heartbeats: int = 0
@@ -47,6 +50,11 @@ class Counters:
 def is_final(data: bytes) -> bool:
     """Whether an SDO reply leaves no transfer open in the node: an abort, or an expedited upload's reply."""
     return len(data) == 8 and (data[0] >> 5 == 4 or (data[0] >> 5 == 2 and bool(data[0] & 0x02)))
+
+
+def has_multiplexor(data: bytes) -> bool:
+    """Whether an SDO reply carries one: replies to initiate requests and aborts. Segments look like anything."""
+    return data[0] >> 5 in (2, 3, 4) or (data[0] >> 5 in (5, 6) and not data[0] & 3)
 
 
 def multiplexor_of(data: bytes) -> Multiplexor:
@@ -71,6 +79,7 @@ class SdoChannel:
         self._arrived = asyncio.Event()
         self._lost: ConnectionLost | None = None
         self._last_answer: Multiplexor | None = None
+        self._owed: CanFrame | None = None
 
     def deliver(self, frame: CanFrame) -> bool:
         """A frame came from the node. True when it answers what was answered before (CO-042).
@@ -94,7 +103,7 @@ class SdoChannel:
     def on_boot_up(self) -> None:
         """The node booted: what it owed, it will never send."""
         self._late.settle()
-        self._last_answer = None
+        self._last_answer = self._owed = None
 
     async def run(self, transfer: SdoTransfer) -> bytes:
         """Do `transfer` when its turn comes. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`."""
@@ -128,6 +137,7 @@ class SdoChannel:
         request, complete = (transfer.index, transfer.subindex), False
         self._active, self._last_answer = transfer, None
         try:
+            await self._tell_owed(transfer)
             data = await self._drive(transfer)
             complete = True
             self._last_answer = request
@@ -143,26 +153,58 @@ class SdoChannel:
                 self._late.answered(request)
             if not complete:
                 self._late.unanswered(request)
+            self._owe(transfer)
+
+    def _owe(self, transfer: SdoTransfer) -> None:
+        """`transfer` is left as it is (cancelled, or the bus takes no frames): the node has to be told later."""
+        if transfer.to_abort:
+            self._owed = transfer.abort_frame(abort_codes.GENERAL_ERROR)
+
+    async def _tell_owed(self, transfer: SdoTransfer) -> None:
+        """An earlier transfer was left as it was: the node might take our request for one of its segments."""
+        if self._owed is not None:
+            try:
+                async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
+                    await self._send(self._owed)
+            except TimeoutError as e:
+                raise ReplyTimeout(f"{transfer.name}: nothing can be sent", hint="the bus takes no frames") from e
+            self._owed = None
 
     async def _drive(self, transfer: SdoTransfer) -> bytes:
-        await self._request(transfer.start(self._clock.monotonic_ns()), transfer)
+        step: Step | None = Send(transfer.start(self._clock.monotonic_ns()))
         while True:
-            frame = await self._next_frame(transfer)
-            if frame is None:
-                self._counters.sdo_timeouts += 1
-                await self._fail(transfer.expire(transfer.deadline_ns), transfer)
-                continue
-            match transfer.feed(frame, self._clock.monotonic_ns()):
-                case Send(request):
-                    self._counters.sdo_replies += 1
-                    await self._request(request, transfer)
-                case Done(data):
-                    self._counters.sdo_replies += 1
+            match step:
+                case Send(frame, more):
+                    await self._request(frame, transfer)
+                    step = await self._after_send(transfer) if more else None
+                    if step is not None:
+                        continue
+                case Done(data, last):
+                    await self._confirm(last, transfer)
                     return data
                 case Failed() as failed:
                     await self._fail(failed, transfer)
-                case Stray():
-                    self._counters.ignored += 1
+                case Stray() | Wait() | None:
+                    pass
+            step = await self._next_step(transfer)
+
+    async def _after_send(self, transfer: SdoTransfer) -> Step | None:
+        """The next frame of several, unless the node has something to say meanwhile (CO-018)."""
+        await asyncio.sleep(0)  # a bus that takes frames at once would otherwise let nobody read
+        return None if self._inbox else transfer.more(self._clock.monotonic_ns())
+
+    async def _next_step(self, transfer: SdoTransfer) -> Step | None:
+        frame = await self._next_frame(transfer)
+        if frame is None:
+            self._counters.sdo_timeouts += 1
+            return transfer.expire(transfer.deadline_ns)
+        step = transfer.feed(frame, self._clock.monotonic_ns())
+        if isinstance(step, Send | Wait | Done):
+            self._counters.sdo_replies += 1
+        if isinstance(step, Stray):  # no answer: what was being sent goes on
+            self._counters.ignored += 1
+            return transfer.more(self._clock.monotonic_ns())
+        return step
 
     async def _request(self, frame: CanFrame, transfer: SdoTransfer) -> None:
         """Send within the time of the reply: a transmit queue that never empties must not block for ever (CO-063)."""
@@ -172,13 +214,19 @@ class SdoChannel:
                 await self._send(frame)
         except TimeoutError as e:
             self._counters.sdo_timeouts += 1
+            self._owe(transfer)
             transfer.over = True
             raise ReplyTimeout(f"{transfer.name}: the request could not be sent", hint="the bus takes no frames") from e
 
-    async def _fail(self, failed: Failed | None, transfer: SdoTransfer) -> None:
+    async def _confirm(self, last: CanFrame | None, transfer: SdoTransfer) -> None:
+        """The node has said all; that it hears so is a courtesy, and the value is good without it."""
+        if last is not None:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
+                    await self._send(last)
+
+    async def _fail(self, failed: Failed, transfer: SdoTransfer) -> None:
         """Tell the node why, if it was us who gave up, and raise."""
-        if failed is None:
-            return
         if isinstance(failed.error, SdoAborted):
             self._counters.sdo_aborts += 1
         if failed.abort is not None:
@@ -186,7 +234,7 @@ class SdoChannel:
                 async with asyncio.timeout(transfer.timeout_ns / NS_PER_S):
                     await self._send(failed.abort)
             except TimeoutError:
-                pass  # the abort is a courtesy: the next initiate request ends the old transfer as well
+                self._owed = failed.abort  # before the next request
         raise failed.error
 
     async def _next_frame(self, transfer: SdoTransfer) -> CanFrame | None:
@@ -210,7 +258,7 @@ class SdoChannel:
 
     def _is_foreign(self, frame: CanFrame, active: SdoTransfer | None) -> bool:
         """Put a reply that answers no present request on record; True when it repeats the last answer."""
-        if len(frame.data) != 8 or frame.data[0] >> 5 not in (2, 3, 4):
+        if len(frame.data) != 8 or not has_multiplexor(frame.data) or (active is not None and active.unmarked):
             return False
         request = multiplexor_of(frame.data)
         if active is not None and (active.index, active.subindex) == request:

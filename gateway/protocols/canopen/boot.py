@@ -1,0 +1,111 @@
+"""Booting a node as CiA 302-2 has it: is it the one that is expected, and does it hold the configuration that it should?
+
+Procedures over a master. They know object numbers of the standards and nothing of any device. Who may write, and what
+follows from an error, is the caller's business.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gateway.core.errors import SdoAborted
+from gateway.protocols.canopen.concise_dcf import CONFIGURATION_DATE, Setting
+from gateway.protocols.canopen.configure import DEVICE_TYPE, IDENTITY, read_number, verify_number, write_number
+from gateway.protocols.canopen.datatypes import DataType
+from gateway.protocols.canopen.master import CanopenMaster
+
+STORE_PARAMETERS = 0x1010
+SAVE = b"save"
+STORE_TIMEOUT_S = 5.0
+"""Non-volatile memory is slow."""
+
+_U32 = DataType.UNSIGNED32
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedIdentity:
+    """What a node has to say of itself (1F84h to 1F88h). None is not looked at."""
+
+    device_type: int | None = None
+    vendor: int | None = None
+    product: int | None = None
+    revision: int | None = None
+    serial: int | None = None
+
+    @property
+    def objects(self) -> dict[str, tuple[int, int, int]]:
+        """Of what is expected: name -> index, subindex, value, in the order in which CiA 302 asks."""
+        every = {
+            "device_type": (DEVICE_TYPE, 0, self.device_type),
+            "vendor": (IDENTITY, 1, self.vendor),
+            "product": (IDENTITY, 2, self.product),
+            "revision": (IDENTITY, 3, self.revision),
+            "serial": (IDENTITY, 4, self.serial),
+        }
+        return {name: (index, sub, value) for name, (index, sub, value) in every.items() if value is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """What a node shall hold. `date` is the expected configuration date and time (1F26h, 1F27h), None to write always.
+
+    `store` lets the node keep it (1010h:01), so that after its next start it need not be written again.
+    """
+
+    settings: tuple[Setting, ...]
+    date: tuple[int, int] | None = None
+    store: bool = False
+
+
+async def identity_differences(master: CanopenMaster, node: int, expected: ExpectedIdentity) -> dict[str, str]:
+    """Read what is expected of the node's identity; name -> "expected X, got Y" of what is otherwise.
+
+    An object that the node does not have is otherwise too. Raises what a read raises when the node does not answer.
+    """
+    wrong: dict[str, str] = {}
+    for name, (index, sub, value) in expected.objects.items():
+        try:
+            held = await read_number(master, node, index, sub, _U32)
+        except SdoAborted as e:
+            wrong[name] = f"expected {value:X}h, got an abort with {e.code:08X}h"
+            continue
+        if held != value:
+            wrong[name] = f"expected {value:X}h, got {held:X}h"
+    return wrong
+
+
+async def holds_configuration(master: CanopenMaster, node: int, date: tuple[int, int] | None) -> bool:
+    """Whether the node says that it was configured on `date` (1020h:01 and :02). Never, without a date."""
+    if date is None or date == (0, 0):
+        return False
+    try:
+        held = [await read_number(master, node, CONFIGURATION_DATE, sub, _U32) for sub in (1, 2)]
+    except SdoAborted:
+        return False  # it has no 1020h
+    return (held[0], held[1]) == date
+
+
+async def download_configuration(master: CanopenMaster, node: int, configuration: Configuration) -> bool:
+    """Write the configuration unless the node holds it; whether it was written. Call it in PRE-OPERATIONAL.
+
+    Date and time are written last: a node that was interrupted does not pass for configured. Raises `SdoAborted` for the
+    first object that the node refuses, `VerifyFailed` when it does not keep the date.
+    """
+    if await holds_configuration(master, node, configuration.date):
+        return False
+    await write_settings(master, node, configuration.settings)
+    if configuration.date is not None:
+        for sub, value in enumerate(configuration.date, 1):
+            await write_number(master, node, CONFIGURATION_DATE, sub, _U32, value)
+        for sub, value in enumerate(configuration.date, 1):
+            await verify_number(master, node, CONFIGURATION_DATE, sub, _U32, value)
+    if configuration.store:
+        await master.sdo_download(node, STORE_PARAMETERS, 1, SAVE, STORE_TIMEOUT_S)
+    return True
+
+
+async def write_settings(master: CanopenMaster, node: int, settings: Sequence[Setting]) -> None:
+    """Write objects one after the other, as the concise DCF has them."""
+    for setting in settings:
+        await master.sdo_download(node, setting.index, setting.subindex, setting.data)

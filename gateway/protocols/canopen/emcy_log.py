@@ -1,0 +1,60 @@
+"""What a node has said is wrong with it: the last emergency messages and the errors that are still there. Pure, bounded."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from gateway.protocols.canopen.emcy import Emcy
+
+MAX_ENTRIES = 32
+MAX_ACTIVE = 32
+
+
+@dataclass(frozen=True, slots=True)
+class EmcyEntry:
+    """An emergency message and when it came (monotonic, ns)."""
+
+    t_ns: int
+    emcy: Emcy
+
+
+class EmcyLog:
+    """One node's. `total` counts all messages, `forgotten` those that the log has no more room for."""
+
+    def __init__(self) -> None:
+        self._entries: deque[EmcyEntry] = deque(maxlen=MAX_ENTRIES)
+        self._active: dict[int, None] = {}
+        self.total = 0
+
+    def add(self, emcy: Emcy, t_ns: int) -> None:
+        """A message came. An error reset ends all errors, unless its error register says that some are left (CO-054).
+
+        Which of them ended is not in the message: then all are kept, until the register is clear.
+        """
+        self.total += 1
+        self._entries.append(EmcyEntry(t_ns, emcy))
+        if not emcy.is_reset:
+            self._active[emcy.code] = None
+            if len(self._active) > MAX_ACTIVE:
+                del self._active[next(iter(self._active))]
+        elif not emcy.register:
+            self._active.clear()
+
+    def restarted(self) -> None:
+        """The node booted: what is wrong with it now, it will say again. The history stays."""
+        self._active.clear()
+
+    @property
+    def forgotten(self) -> int:
+        return self.total - len(self._entries)
+
+    @property
+    def entries(self) -> tuple[EmcyEntry, ...]:
+        """Newest first, as in 1003h."""
+        return tuple(reversed(self._entries))
+
+    @property
+    def active(self) -> tuple[int, ...]:
+        """Codes of the errors that are there, in the order in which they came."""
+        return tuple(self._active)

@@ -1,0 +1,241 @@
+"""SDO block transfers, both ways (CiA 301, 7.2.4.3.9 to 7.2.4.3.16): up to 127 segments for one acknowledgement.
+
+Pure, as `sdo`. Segments carry a sequence number and nothing else, so that a lost one is asked for again: the receiver
+acknowledges the last good one, and the rest is resent, renumbered from 1 (CO-016). Two things follow for what must never
+happen, a wrong object:
+
+- An acknowledgement is repeated only while it cannot be taken for that of another sub-block: after something of the
+  present one has come.
+- We ask for at most 63 segments a block. Their first bytes then differ from those of a reply to an upload or of an
+  abort (01h to 3Fh and 81h to BFh against 40h to 7Fh and 80h), so that segments that come late, after the transfer was
+  given up, pass for no reply to a later request.
+
+Size and CRC settle the rest in the end.
+"""
+
+from __future__ import annotations
+
+from binascii import crc_hqx
+
+from gateway.core.errors import UsageError
+from gateway.protocols.canopen import abort_codes
+from gateway.protocols.canopen.sdo import MAX_BYTES, Done, SdoDownload, SdoUpload, Send, Step, Wait
+
+UPLOAD_BLOCK = 63
+BLOCK_MAX = 127
+MAX_REPEATS = 8
+"""So often in a row a sub-block may bring nothing before the transfer is given up."""
+
+_LAST = 0x80
+_UPLOAD_REPLY, _DOWNLOAD_REPLY = 6, 5
+_INITIATE, _END, _ACKNOWLEDGE = 0, 1, 2
+_WITH_CRC = 0x04
+_SEGMENT = 7
+
+
+def crc16(data: bytes) -> int:
+    """The CRC of a block transfer (7.2.4.3.16): x^16 + x^12 + x^5 + 1, from 0. 31C3h for ``123456789``."""
+    return crc_hqx(data, 0)
+
+
+class SdoBlockUpload(SdoUpload):
+    """Read an object in blocks. A node that answers with a plain upload instead is followed (CO-021).
+
+    `block` segments a block (1 to 127; more than 63 gives up what the module says of late segments). `switch_bytes`
+    is the protocol switch threshold, 0 where the node shall not switch.
+    """
+
+    def __init__(
+        self,
+        node: int,
+        index: int,
+        subindex: int,
+        timeout_ns: int,
+        *,
+        length: int | None = None,
+        max_bytes: int = MAX_BYTES,
+        block: int = UPLOAD_BLOCK,
+        switch_bytes: int = 0,
+    ) -> None:
+        super().__init__(node, index, subindex, timeout_ns, length=length, max_bytes=max_bytes)
+        if not 1 <= block <= BLOCK_MAX or not 0 <= switch_bytes <= 0xFF:
+            raise UsageError(f"{self.name}: block size or switch threshold", expected="1 to 127, 0 to 255")
+        self._block = block
+        self._switch_bytes = switch_bytes
+        self._in_blocks = False
+        self._crc = False
+        self._good = 0  # of the present sub-block
+        self._surplus = 0  # segments in a row that were not the one due
+        self._repeats = 0
+        self._last_seen = False
+        self._free = 0
+
+    @property
+    def to_abort(self) -> bool:
+        return self.started and not self.over
+
+    @property
+    def unmarked(self) -> bool:
+        return self._in_blocks and not self.over
+
+    def _request(self) -> bytes:
+        return bytes([0xA0 | _WITH_CRC]) + self._multiplexor + bytes([self._block, self._switch_bytes])
+
+    def _is_reply(self, data: bytes) -> bool:
+        return (data[0] >> 5 == _UPLOAD_REPLY and data[0] & 1 == _INITIATE) or super()._is_reply(data)
+
+    def _is_abort(self, data: bytes) -> bool:
+        return data[0] == 0x80 if self._in_blocks else super()._is_abort(data)
+
+    def _on_reply(self, data: bytes) -> Step:
+        if data[0] >> 5 != _UPLOAD_REPLY:
+            return super()._on_reply(data)
+        self._in_blocks, self._crc = True, bool(data[0] & _WITH_CRC)
+        self._indicated = int.from_bytes(data[4:8], "little") if data[0] & 0x02 else None
+        if self._indicated is not None and self._indicated > self._max_bytes:
+            return self._break(abort_codes.OUT_OF_MEMORY, f"{self._indicated} bytes announced", data)
+        return Send(self._frame(b"\xa3"))
+
+    def _on_next(self, data: bytes) -> Step:
+        if not self._in_blocks:
+            return super()._on_next(data)
+        return self._on_end(data) if self._last_seen else self._on_segment(data)
+
+    def _on_segment(self, data: bytes) -> Step:
+        number, last = data[0] & 0x7F, bool(data[0] & _LAST)
+        if not 1 <= number <= self._block:
+            return self._break(abort_codes.INVALID_SEQUENCE, f"segment {number} of {self._block}", data)
+        if number != self._good + 1:  # one was lost, or an old one comes again: nothing is taken before the one due
+            self._surplus += 1
+            if self._surplus > 2 * BLOCK_MAX:
+                return self._break(abort_codes.INVALID_SEQUENCE, "segments, and never the one that is due", data)
+            return self._again(data) if last or number == self._block else Wait()
+        self._good, self._surplus, self._repeats = number, 0, 0
+        self._received += data[1:]
+        if len(self._received) > self._max_bytes + _SEGMENT:
+            return self._break(abort_codes.OUT_OF_MEMORY, f"more than {self._max_bytes} bytes", data)
+        self._last_seen = last
+        return self._acknowledge() if last or number == self._block else Wait()
+
+    def _again(self, data: bytes) -> Step:
+        """The sub-block is at its end and something of it is missing."""
+        self._repeats += not self._good
+        if self._repeats > MAX_REPEATS:
+            return self._break(abort_codes.INVALID_SEQUENCE, "blocks that bring nothing", data)
+        return self._acknowledge()
+
+    def _acknowledge(self) -> Send:
+        acknowledged, self._good = self._good, 0
+        return Send(self._frame(bytes([0xA0 | _ACKNOWLEDGE, acknowledged, self._block])))
+
+    def _on_end(self, data: bytes) -> Step:
+        if data[0] >> 5 != _UPLOAD_REPLY or data[0] & 3 != _END:
+            return self._stray("not the end of a block upload")
+        unused = (data[0] >> 2) & 7
+        value, indicated = bytes(self._received[: len(self._received) - unused]), self._indicated
+        if indicated is not None and len(value) != indicated:
+            code = abort_codes.LENGTH_TOO_HIGH if len(value) > indicated else abort_codes.LENGTH_TOO_LOW
+            return self._break(code, f"{indicated} bytes announced, {len(value)} sent", data)
+        if len(value) > self._max_bytes:
+            return self._break(abort_codes.OUT_OF_MEMORY, f"more than {self._max_bytes} bytes", data)
+        if self._crc and crc16(value) != int.from_bytes(data[1:3], "little"):
+            return self._break(abort_codes.CRC_ERROR, f"the CRC is {crc16(value):04X}h", data)
+        return Done(value, self._frame(bytes([0xA0 | _END])))
+
+    def _patience_ns(self) -> int:
+        """Amid a sub-block half the time: what was lost at its end is asked for before the node gives up on us."""
+        return self.timeout_ns // 2 if self._good else self.timeout_ns
+
+    def _recover(self, now_ns: int) -> Send | None:
+        """The last segments of a sub-block were lost (CO-017): acknowledge what there is."""
+        if not self._in_blocks or not self._good:
+            return None
+        step = self._acknowledge()
+        self._go_on(step, now_ns)
+        return step
+
+
+class SdoBlockDownload(SdoDownload):
+    """Write an object in blocks, of the size that the node asks for. An early acknowledgement is taken (CO-018)."""
+
+    def __init__(self, node: int, index: int, subindex: int, timeout_ns: int, data: bytes) -> None:
+        super().__init__(node, index, subindex, timeout_ns, data)
+        self._segments = max(1, -(-len(self._data) // _SEGMENT))
+        self._block = 0
+        self._done = 0  # segments of sub-blocks before this one
+        self._in_block = 0  # segments of this sub-block that were sent
+        self._crc = False
+        self._repeats = 0
+        self._resent = False
+
+    @property
+    def to_abort(self) -> bool:
+        return self.started and not self.over
+
+    @property
+    def _expedited(self) -> bool:
+        return False
+
+    def _request(self) -> bytes:
+        return bytes([0xC0 | _WITH_CRC | 0x02]) + self._multiplexor + len(self._data).to_bytes(4, "little")
+
+    def _is_reply(self, data: bytes) -> bool:
+        return data[0] >> 5 == _DOWNLOAD_REPLY and data[0] & 3 == _INITIATE
+
+    def _on_reply(self, data: bytes) -> Step:
+        self._crc = bool(data[0] & _WITH_CRC)
+        return self._next_block(data[4], data)
+
+    def _on_next(self, data: bytes) -> Step:
+        ended = self._done == self._segments
+        kind = data[0] & 3 if data[0] >> 5 == _DOWNLOAD_REPLY else None
+        if ended and kind == _END:
+            return Done(b"")
+        if ended or kind != _ACKNOWLEDGE:
+            return self._stray("no acknowledgement")
+        acknowledged = data[1]
+        if acknowledged > self._in_block:
+            return self._break(
+                abort_codes.INVALID_SEQUENCE, f"segment {acknowledged} acknowledged, {self._in_block} sent", data
+            )
+        self._repeats = 0 if acknowledged else self._repeats + 1
+        if self._repeats > MAX_REPEATS:
+            return self._break(abort_codes.INVALID_SEQUENCE, "blocks of which nothing arrives", data)
+        self._done += acknowledged
+        return self._end() if self._done == self._segments else self._next_block(data[2], data)
+
+    def _next_block(self, size: int, data: bytes) -> Step:
+        if not 1 <= size <= BLOCK_MAX:
+            return self._break(abort_codes.INVALID_BLOCK_SIZE, f"{size} segments a block", data)
+        self._block, self._in_block, self._resent = size, 0, False
+        return self._segment()
+
+    def _segment(self) -> Send:
+        position = self._done + self._in_block
+        part = self._data[position * _SEGMENT : (position + 1) * _SEGMENT]
+        self._in_block += 1
+        last = position + 1 == self._segments
+        command = self._in_block | (_LAST if last else 0)
+        return Send(self._frame(bytes([command]) + part), more=not last and self._in_block < self._block)
+
+    def more(self, now_ns: int) -> Send | None:
+        if self.over or self._in_block >= self._block or self._done + self._in_block >= self._segments:
+            return None
+        step = self._segment()
+        self._go_on(step, now_ns)
+        return step
+
+    def _end(self) -> Send:
+        unused = self._segments * _SEGMENT - len(self._data)
+        crc = crc16(self._data) if self._crc else 0
+        return Send(self._frame(bytes([0xC0 | unused << 2 | _END]) + crc.to_bytes(2, "little")))
+
+    def _recover(self, now_ns: int) -> Send | None:
+        """The last segment of the sub-block may be lost, and the node waits for it (CO-017): once more, once."""
+        if not self.answered or self._done == self._segments or self._resent:
+            return None
+        self._resent = True
+        self._in_block -= 1
+        step = self._segment()
+        self._go_on(step, now_ns)
+        return step

@@ -151,7 +151,7 @@ def _usual_type(tag: Tag) -> str:
         return "uint16"
     if not tag.is_integer:
         return "float64" if tag.type == "float64" else "float32"
-    return {"bcd16": "uint16", "bcd32": "uint32"}.get(tag.type, tag.type)
+    return {"int8": "int16", "uint8": "uint16", "bcd16": "uint16", "bcd32": "uint32"}.get(tag.type, tag.type)
 
 
 def _check_writable(

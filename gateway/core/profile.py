@@ -27,9 +27,9 @@ REGISTERS_OF = {
     "bcd16": 1, "bcd32": 2,
 }  # fmt: skip
 INTEGER_RANGES = {
-    "bool": (0, 1), "int16": (-0x8000, 0x7FFF), "uint16": (0, 0xFFFF), "int32": (-0x80000000, 0x7FFFFFFF),
-    "uint32": (0, 0xFFFFFFFF), "int64": (-(1 << 63), (1 << 63) - 1), "uint64": (0, (1 << 64) - 1),
-    "bcd16": (0, 9999), "bcd32": (0, 99_999_999),
+    "bool": (0, 1), "int8": (-0x80, 0x7F), "uint8": (0, 0xFF), "int16": (-0x8000, 0x7FFF), "uint16": (0, 0xFFFF),
+    "int32": (-0x80000000, 0x7FFFFFFF), "uint32": (0, 0xFFFFFFFF), "int64": (-(1 << 63), (1 << 63) - 1),
+    "uint64": (0, (1 << 64) - 1), "bcd16": (0, 9999), "bcd32": (0, 99_999_999),
 }  # fmt: skip
 
 
@@ -156,6 +156,7 @@ class DeviceProfile:
     sampled: Sampled | None
     inbox: Box | None
     outbox: Box | None
+    gaps: tuple[RegisterRange, ...] = ()
 
     @property
     def name(self) -> str:
@@ -226,6 +227,21 @@ def resolve_address(text: int | str, numbering: str, count: int = 1) -> Register
     return RegisterRange(found, address, count)
 
 
+def resolve_gap(text: str, numbering: str) -> RegisterRange:
+    """Read a range of registers, both ends included: ``30001..30010`` as printed, ``input:0..9`` or ``input:5`` as sent.
+
+    Raises ValueError with a sentence that says what would have been right.
+    """
+    first, dots, last = text.partition("..")
+    start = resolve_address(first, numbering)
+    if not dots:
+        return start
+    end = resolve_address(f"{start.table}:{last}" if ":" in first else last, numbering)
+    if end.table != start.table or end.address < start.address:
+        raise ValueError(f"range {text!r}: from the lower to the higher address of one table")
+    return RegisterRange(start.table, start.address, end.end - start.address)
+
+
 def load_profile(path: Path) -> DeviceProfile:
     """Read a profile; raises `FileInvalid` with line and column for anything wrong."""
     return resolve(load(path))
@@ -249,6 +265,7 @@ def resolve(file: YamlFile) -> DeviceProfile:
         sampled=Sampled(**form.sampled.model_dump()) if form.sampled else None,
         inbox=_box(file, form, "inbox", form.mailbox.inbox) if form.mailbox else None,
         outbox=_box(file, form, "outbox", form.mailbox.outbox) if form.mailbox else None,
+        gaps=tuple(_gap(file, form, i, text) for i, text in enumerate(form.gaps)),
     )
     _check_references(file, profile)
     return profile
@@ -266,6 +283,8 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
     else:
         if t.at is None or t.object is not None:
             raise file.error(loc, f"the tag {name!r} of a Modbus device", expected="`at: 30001`, and no `object`")
+        if kind in ("int8", "uint8"):
+            raise file.error((*loc, "type"), f"the tag {name!r} is an {kind}", expected="16 bits at least: a register")
         if kind in ("string", "bytes") and t.registers is None:
             raise file.error(loc, f"the tag {name!r} is a {kind}", expected="`registers: N`, its length")
         first = _address(file, (*loc, "at"), form, t.at, t.registers or REGISTERS_OF[kind])
@@ -311,6 +330,13 @@ def _address(file: YamlFile, loc: tuple[Key, ...], form: ProfileForm, at: int | 
         raise file.error(loc, str(e)) from e
 
 
+def _gap(file: YamlFile, form: ProfileForm, i: int, text: str) -> RegisterRange:
+    try:
+        return resolve_gap(text, form.numbering)
+    except ValueError as e:
+        raise file.error(("gaps", i), str(e)) from e
+
+
 def _message(file: YamlFile, form: ProfileForm, name: str, m: MessageForm) -> Message:
     return Message(name, _address(file, ("messages", name, "at"), form, m.at, m.registers), m.when)
 
@@ -324,6 +350,18 @@ def _box(file: YamlFile, form: ProfileForm, name: str, box: BoxForm) -> Box:
 def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
     """What is one value, message or sample must come in one read, and a sample's counter must be able to count."""
     most = p.form.limits.read_registers
+    for tag in p.tags.values():
+        if tag.at is not None and tag.readable and tag.at.count > most:
+            raise file.error(
+                ("tags", tag.name),
+                f"the value {tag.name!r} cannot be read at once",
+                expected=f"at most {most} registers (`limits: read_registers`)",
+                got=str(tag.at.count),
+            )
+        for i, gap in enumerate(p.gaps):
+            at = tag.at
+            if at is not None and at.table == gap.table and at.address < gap.end and gap.address < at.end:
+                raise file.error(("gaps", i), f"the gap {p.form.gaps[i]!r} is where the tag {tag.name!r} stands")
     for message in p.messages.values():
         if message.at.count > most:
             raise file.error(

@@ -11,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 ValueType = Literal[
     "bool",
+    "int8",
+    "uint8",
     "int16",
     "uint16",
     "int32",
@@ -52,6 +54,14 @@ class Limits(Strict):
     read_registers: int = Field(default=125, ge=1, le=125)
     even_only: bool = False
     max_gap: int = Field(default=8, ge=0, le=125, description="registers read over to merge two reads into one")
+
+
+class TimingForm(Strict):
+    """What pace the device needs of whoever asks it; a system file may say otherwise. Milliseconds."""
+
+    timeout_ms: int | None = Field(default=None, ge=1, le=3_600_000, description="how long a reply may take")
+    spacing_ms: int = Field(default=0, ge=0, le=60_000, description="pause between a reply and the next request")
+    connect_pause_ms: int = Field(default=0, ge=0, le=60_000, description="pause behind connecting")
 
 
 class Defaults(Strict):
@@ -148,6 +158,8 @@ class ProfileForm(Strict):
     factory: Factory = Factory()
     numbering: Literal["printed", "sent"] = "printed"
     limits: Limits = Limits()
+    timing: TimingForm = TimingForm()
+    gaps: list[str] = Field(default=[], description='registers that no read may go over, such as "holding:10..19"')
     defaults: Defaults = Defaults()
     eds: str | None = None
     identify: list[IdentifyForm] = []

@@ -21,7 +21,7 @@ from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
 from gateway.protocols.canopen.pdo import PdoLengthMismatch, PdoMapping
 
 BITS = {
-    "bool": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
+    "bool": 8, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
     "float32": 32, "float64": 64,
 }  # fmt: skip
 
@@ -187,4 +187,4 @@ class CanopenDriver(DeviceDriver):
         if tag is None or not tag.writable:
             raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
         big = reorder(encode(tag, value), tag.order)
-        return COMMAND(big[::-1], self.profile.command_for(tag_name))
+        return COMMAND(big[::-1][: BITS.get(tag.type, 64) // 8], self.profile.command_for(tag_name))

@@ -16,8 +16,8 @@ from gateway.core.profile import REGISTERS_OF, Tag
 from gateway.core.values import Quality, Reason, Scalar, TagValue
 
 _FORMATS = {
-    "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q", "uint64": ">Q",
-    "float32": ">f", "float64": ">d",
+    "int8": ">b", "uint8": ">B", "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q",
+    "uint64": ">Q", "float32": ">f", "float64": ">d",
 }  # fmt: skip
 
 

@@ -97,6 +97,7 @@ tags:
         ("protocol: modbus\ntags:\n  a1..2: {at: 40001}\n  a2: {at: 40009}\n", 6, "'a2' stands twice"),
         ("protocol: modbus\ntags:\n  a: {at: 40001, typ: int16}\n", 5, "did you mean 'type'?"),
         ("protocol: modbus\ntags:\n  a: {at: 40001, type: int12}\n", 5, "int16"),
+        ("protocol: modbus\ntags:\n  a: {at: 40001, type: uint8}\n", 5, "16 bits at least"),
         ("protocol: canopen\neds: x.eds\ntags:\n  a: {at: 40001}\n", 6, "`object:"),
         ("protocol: canopen\ntags: {}\n", 1, "names its EDS"),
         (TAGS + "commands: {set_b: b}\n", 8, "no tag 'b'"),

@@ -1,8 +1,8 @@
-"""The server side of SDO: expedited and segmented transfers (CiA 301 v4.2, 7.2.4.3).
+"""The server side of SDO: expedited, segmented and block transfers (CiA 301 v4.2, 7.2.4.3).
 
 A pure object: one request's 8 bytes and `now` in, the replies' bytes out (a list, since a sub-block of a block transfer
 answers one request with many frames). It must never know objects, NMT states or the bus: what may be read and written is
-asked of an `ObjectAccess`. Block transfers are answered as by a server without them, 05040001.
+asked of an `ObjectAccess`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,15 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.aborts import Abort, abort, abort_frame
+from emulators.canopen.sdo_block import MAX_BLOCK, BlockDownload, BlockUpload
 from gateway.core.errors import SdoAborted
 
 MAX_TRANSFER_BYTES = 1 << 20
 """The longest value a client may write; more is refused with 05040005."""
 
 _MUX = struct.Struct("<HB")
+_ABORT = 0x80
 
 
 class ObjectAccess(Protocol):
@@ -43,6 +45,7 @@ class _Download:
     subindex: int
     announced: int | None
     limit: int
+    overflow: Abort
     toggle: int = 0
     data: bytearray = field(default_factory=bytearray)
 
@@ -56,70 +59,92 @@ class _Upload:
     toggle: int = 0
 
 
+_Transfer = _Download | _Upload | BlockDownload | BlockUpload
+
+
 class SdoServer:
-    """One SDO channel. One transfer at a time; a new initiate replaces a running one."""
+    """One SDO channel. One transfer at a time; a new initiate replaces a running one.
+
+    While a sub-block of a block download comes in, every frame but an abort is one of its segments: the standard leaves
+    no other way to tell them apart.
+    """
 
     def __init__(self, access: ObjectAccess, timeout_ns: int) -> None:
         self._access = access
         self._timeout_ns = timeout_ns
-        self._transfer: _Download | _Upload | None = None
+        self._transfer: _Transfer | None = None
         self._deadline_ns: int | None = None
-        self._handlers: dict[int, Callable[[bytes, int], bytes]] = {
+        self._prompt_ns: int | None = None
+        self._handlers: dict[int, Callable[[bytes, int], list[bytes]]] = {
             0: self._download_segment,
             1: self._initiate_download,
             2: self._initiate_upload,
             3: self._upload_segment,
+            5: self._block_upload,
+            6: self._block_download,
         }
 
     @property
     def busy(self) -> bool:
-        """Whether a segmented transfer is under way."""
+        """Whether a segmented or block transfer is under way."""
         return self._transfer is not None
 
     @property
     def deadline_ns(self) -> int | None:
-        """When a running transfer is given up, None when there is none."""
-        return self._deadline_ns
+        """When `tick` has something to do for the running transfer, None when there is none."""
+        return self._deadline_ns if self._prompt_ns is None else self._prompt_ns
 
     def reset(self) -> None:
         """Forget a running transfer silently (NMT reset, STOPPED)."""
         self._transfer = None
         self._deadline_ns = None
+        self._prompt_ns = None
 
     def request(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Answer one request of exactly 8 bytes; no reply to a client's abort."""
-        command = data[0] >> 5
-        if command == 4:
-            self.reset()
-            return []
-        handler = self._handlers.get(command)
+        """Answer one request of exactly 8 bytes; no reply to a client's abort nor inside a sub-block."""
         try:
-            if handler is None:
-                index, subindex = self._mux_of(data, command)
-                raise abort(index, subindex, Abort.COMMAND)
-            reply = handler(data, now_ns)
+            replies = self._dispatch(data, now_ns)
         except SdoAborted as e:
             self.reset()
             return [abort_frame(e)]
-        self._deadline_ns = now_ns + self._timeout_ns if self._transfer else None
-        return [reply]
+        transfer = self._transfer
+        receiving = isinstance(transfer, BlockDownload) and transfer.receiving
+        self._deadline_ns = now_ns + self._timeout_ns if transfer else None
+        self._prompt_ns = now_ns + self._timeout_ns // 2 if receiving else None
+        return replies
 
     def tick(self, now_ns: int) -> list[bytes]:
-        """Give up a transfer whose client fell silent: one abort, 05040000."""
+        """Time passed. A transfer whose client fell silent is given up: one abort, 05040000.
+
+        Inside a sub-block half that silence means that its end got lost: what is good is acknowledged, and the client sends
+        the rest again.
+        """
         transfer = self._transfer
-        if transfer is None or self._deadline_ns is None or now_ns < self._deadline_ns:
+        if transfer is None or self._deadline_ns is None:
             return []
-        self.reset()
-        return [abort_frame(abort(transfer.index, transfer.subindex, Abort.TIMEOUT))]
+        if now_ns >= self._deadline_ns:
+            self.reset()
+            return [abort_frame(abort(transfer.index, transfer.subindex, Abort.TIMEOUT))]
+        if self._prompt_ns is None or now_ns < self._prompt_ns or not isinstance(transfer, BlockDownload):
+            return []
+        self._prompt_ns = None
+        return [transfer.acknowledge()]
 
-    def _mux_of(self, data: bytes, command: int) -> tuple[int, int]:
-        """What an unknown command is about: its own multiplexer if it has one, else the running transfer's, else 0."""
-        if command in (5, 6):
-            index, subindex = _MUX.unpack_from(data, 1)
-            return index, subindex
-        return (self._transfer.index, self._transfer.subindex) if self._transfer else (0, 0)
+    def _dispatch(self, data: bytes, now_ns: int) -> list[bytes]:
+        transfer = self._transfer
+        if isinstance(transfer, BlockDownload) and transfer.receiving and data[0] != _ABORT:
+            reply = transfer.segment(data)
+            return [] if reply is None else [reply]
+        command = data[0] >> 5
+        if command == _ABORT >> 5:
+            self.reset()
+            return []
+        handler = self._handlers.get(command)
+        if handler is None:
+            raise self._out_of_turn()
+        return handler(data, now_ns)
 
-    def _initiate_download(self, data: bytes, now_ns: int) -> bytes:
+    def _initiate_download(self, data: bytes, now_ns: int) -> list[bytes]:
         self.reset()
         index, subindex = _MUX.unpack_from(data, 1)
         expedited, sized = data[0] & 0x02, data[0] & 0x01
@@ -130,23 +155,29 @@ class SdoServer:
                 size = min(own, 4) if own is not None else 4
             self._access.write(index, subindex, data[4 : 4 + size], now_ns)
         else:
-            announced = int.from_bytes(data[4:8], "little") if sized else None
-            own = self._access.begin_write(index, subindex, announced)
-            if announced is not None and announced > MAX_TRANSFER_BYTES:
-                raise abort(index, subindex, Abort.OUT_OF_MEMORY)
-            limit = announced if announced is not None else own
-            self._transfer = _Download(index, subindex, announced, MAX_TRANSFER_BYTES if limit is None else limit)
-        return b"\x60" + data[1:4] + bytes(4)
+            announced, limit, overflow = self._room(index, subindex, data[4:8] if sized else b"")
+            self._transfer = _Download(index, subindex, announced, limit, overflow)
+        return [b"\x60" + data[1:4] + bytes(4)]
 
-    def _download_segment(self, data: bytes, now_ns: int) -> bytes:
+    def _room(self, index: int, subindex: int, size: bytes) -> tuple[int | None, int, Abort]:
+        """What the client announces, what may come at most, and how more is refused. Raises `SdoAborted` before any data come."""
+        announced = int.from_bytes(size, "little") if size else None
+        own = self._access.begin_write(index, subindex, announced)
+        if announced is not None and announced > MAX_TRANSFER_BYTES:
+            raise abort(index, subindex, Abort.OUT_OF_MEMORY)
+        limit = announced if announced is not None else own
+        if limit is None:
+            return None, MAX_TRANSFER_BYTES, Abort.OUT_OF_MEMORY
+        return announced, limit, Abort.TOO_LONG
+
+    def _download_segment(self, data: bytes, now_ns: int) -> list[bytes]:
         transfer = self._transfer
         if not isinstance(transfer, _Download):
             raise self._out_of_turn()
         self._check_toggle(transfer, data)
         transfer.data += data[1 : 8 - (data[0] >> 1 & 0x07)]
         if len(transfer.data) > transfer.limit:
-            unbounded = transfer.announced is None and transfer.limit == MAX_TRANSFER_BYTES
-            raise abort(transfer.index, transfer.subindex, Abort.OUT_OF_MEMORY if unbounded else Abort.TOO_LONG)
+            raise abort(transfer.index, transfer.subindex, transfer.overflow)
         reply = bytes([0x20 | transfer.toggle << 4]) + bytes(7)
         transfer.toggle ^= 1
         if data[0] & 0x01:
@@ -154,19 +185,22 @@ class SdoServer:
                 raise abort(transfer.index, transfer.subindex, Abort.TOO_SHORT)
             self._access.write(transfer.index, transfer.subindex, bytes(transfer.data), now_ns)
             self.reset()
-        return reply
+        return [reply]
 
-    def _initiate_upload(self, data: bytes, now_ns: int) -> bytes:
+    def _initiate_upload(self, data: bytes, now_ns: int) -> list[bytes]:
         self.reset()
         index, subindex = _MUX.unpack_from(data, 1)
-        raw = self._access.read(index, subindex, now_ns)
-        if 1 <= len(raw) <= 4:
-            return bytes([0x43 | (4 - len(raw)) << 2]) + data[1:4] + raw.ljust(4, b"\0")
-        # An empty value cannot be expedited: n counts at most three unused bytes.
-        self._transfer = _Upload(index, subindex, raw)
-        return b"\x41" + data[1:4] + len(raw).to_bytes(4, "little")
+        return self._begin_upload(data, self._access.read(index, subindex, now_ns))
 
-    def _upload_segment(self, data: bytes, now_ns: int) -> bytes:
+    def _begin_upload(self, data: bytes, raw: bytes) -> list[bytes]:
+        if 1 <= len(raw) <= 4:
+            return [bytes([0x43 | (4 - len(raw)) << 2]) + data[1:4] + raw.ljust(4, b"\0")]
+        # An empty value cannot be expedited: n counts at most three unused bytes.
+        index, subindex = _MUX.unpack_from(data, 1)
+        self._transfer = _Upload(index, subindex, raw)
+        return [b"\x41" + data[1:4] + len(raw).to_bytes(4, "little")]
+
+    def _upload_segment(self, data: bytes, now_ns: int) -> list[bytes]:
         transfer = self._transfer
         if not isinstance(transfer, _Upload):
             raise self._out_of_turn()
@@ -178,18 +212,56 @@ class SdoServer:
         transfer.toggle ^= 1
         if last:
             self.reset()
-        return reply
+        return [reply]
+
+    def _block_download(self, data: bytes, now_ns: int) -> list[bytes]:
+        transfer = self._transfer
+        if not data[0] & 0x01:
+            self.reset()
+            index, subindex = _MUX.unpack_from(data, 1)
+            announced, limit, overflow = self._room(index, subindex, data[4:8] if data[0] & 0x02 else b"")
+            self._transfer = BlockDownload(index, subindex, announced, limit, bool(data[0] & 0x04), overflow)
+            return [b"\xa4" + data[1:4] + bytes([MAX_BLOCK, 0, 0, 0])]
+        if not isinstance(transfer, BlockDownload):
+            raise self._out_of_turn()
+        self._access.write(transfer.index, transfer.subindex, transfer.end(data), now_ns)
+        self.reset()
+        return [b"\xa1" + bytes(7)]
+
+    def _block_upload(self, data: bytes, now_ns: int) -> list[bytes]:
+        step, transfer = data[0] & 0x03, self._transfer
+        if step == 0:
+            return self._initiate_block_upload(data, now_ns)
+        if not isinstance(transfer, BlockUpload):
+            raise self._out_of_turn()
+        if step == 3:
+            return transfer.start()
+        if step == 2:
+            return transfer.acknowledged(data)
+        if not transfer.ending:
+            raise self._out_of_turn()
+        self.reset()
+        return []
+
+    def _initiate_block_upload(self, data: bytes, now_ns: int) -> list[bytes]:
+        """A value that is no longer than the client's threshold (pst) is given by an ordinary upload."""
+        self.reset()
+        index, subindex = _MUX.unpack_from(data, 1)
+        raw = self._access.read(index, subindex, now_ns)
+        block, threshold = data[4], data[5]
+        if not 1 <= block <= MAX_BLOCK:
+            raise abort(index, subindex, Abort.BLOCK_SIZE)
+        if threshold and len(raw) <= threshold:
+            return self._begin_upload(data, raw)
+        self._transfer = BlockUpload(index, subindex, raw, block, crc=bool(data[0] & 0x04))
+        return [b"\xc6" + data[1:4] + len(raw).to_bytes(4, "little")]
 
     def _check_toggle(self, transfer: _Download | _Upload, data: bytes) -> None:
         if data[0] >> 4 & 1 != transfer.toggle:
             raise abort(transfer.index, transfer.subindex, Abort.TOGGLE)
 
     def _out_of_turn(self) -> SdoAborted:
-        """A segment of a transfer that is not under way."""
-        index, subindex = self._mux_of(b"", -1)
+        """A command that is unknown, or of a transfer that is not under way: named after the transfer that there is."""
+        transfer = self._transfer
+        index, subindex = (transfer.index, transfer.subindex) if transfer else (0, 0)
         return abort(index, subindex, Abort.COMMAND)
-
-
-def abort_frame(error: SdoAborted) -> bytes:
-    """The 8 bytes that abort a transfer."""
-    return b"\x80" + _MUX.pack(error.index, error.subindex) + error.code.to_bytes(4, "little")

@@ -66,8 +66,8 @@ def test_co_003_segment_of_the_other_direction_ends_the_transfer(rig: Rig) -> No
     assert code(rig.sdo("60")) == "05040001"
 
 
-@pytest.mark.parametrize("command", ["A0", "C0", "E0"])
-def test_co_004_unknown_command_and_no_block_transfer(rig: Rig, command: str) -> None:
+@pytest.mark.parametrize("command", ["E0", "A1", "A2", "A3", "C1"])
+def test_co_004_unknown_command_and_a_block_s_without_initiate(rig: Rig, command: str) -> None:
     assert code(rig.sdo(command + "0620 00")) == "05040001"
 
 
@@ -244,7 +244,7 @@ class AnyClient(RuleBasedStateMachine):
         self.exchange(data)
 
     @rule(
-        command=st.sampled_from([0x40, 0x20, 0x21, 0x22, 0x23, 0x2B, 0x2F, 0xA0, 0xC6]),
+        command=st.sampled_from([0x40, 0x20, 0x21, 0x22, 0x23, 0x2B, 0x2F, 0xE0]),
         key=st.sampled_from(
             [(0x1008, 0), (0x2004, 0), (0x2005, 0), (0x2006, 0), (0x2009, 0), (0x1003, 1), (0x3000, 0)]
         ),

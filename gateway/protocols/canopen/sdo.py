@@ -27,7 +27,10 @@ MAX_STRAYS = 64
 """A node that floods its SDO channel with something else is given up on (CO-025)."""
 
 _DOWNLOAD_SEGMENT_REPLY, _UPLOAD_SEGMENT_REPLY = 1, 0
-_UPLOAD_REPLY, _DOWNLOAD_REPLY, _ABORT = 2, 3, 4
+_UPLOAD_REPLY, _DOWNLOAD_REPLY = 2, 3
+
+ABORT = 0x80
+"""The whole first byte of an abort: its other bits are always 0 (7.2.4.3.17). 81h and more are last segments of blocks."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +176,7 @@ class SdoTransfer(ABC):
     def _on_segment_reply(self, data: bytes) -> Step: ...
 
     def _is_abort(self, data: bytes) -> bool:
-        return data[0] >> 5 == _ABORT
+        return data[0] == ABORT
 
     def _is_reply(self, data: bytes) -> bool:
         """Whether it is the reply to the initiate request, by its specifier; its multiplexor is ours."""

@@ -4,8 +4,9 @@ Pure, as `sdo`. Segments carry a sequence number and nothing else, so that a los
 acknowledges the last good one, and the rest is resent, renumbered from 1 (CO-016). Two things follow for what must never
 happen, a wrong object:
 
-- An acknowledgement is repeated only while it cannot be taken for that of another sub-block: after something of the
-  present one has come.
+- When nothing more comes, what there is of a sub-block is acknowledged. Where that is nothing, the node may take it for
+  the answer to the sub-block before and send that again: only done once, and where the size that was announced
+  settles in the end whether it did.
 - We ask for at most 63 segments a block. Their first bytes then differ from those of a reply to an upload or of an
   abort (01h to 3Fh and 81h to BFh against 40h to 7Fh and 80h), so that segments that come late, after the transfer was
   given up, pass for no reply to a later request.
@@ -67,8 +68,8 @@ class SdoBlockUpload(SdoUpload):
         self._good = 0  # of the present sub-block
         self._surplus = 0  # segments in a row that were not the one due
         self._repeats = 0
+        self._nudged = False
         self._last_seen = False
-        self._free = 0
 
     @property
     def to_abort(self) -> bool:
@@ -83,9 +84,6 @@ class SdoBlockUpload(SdoUpload):
 
     def _is_reply(self, data: bytes) -> bool:
         return (data[0] >> 5 == _UPLOAD_REPLY and data[0] & 1 == _INITIATE) or super()._is_reply(data)
-
-    def _is_abort(self, data: bytes) -> bool:
-        return data[0] == 0x80 if self._in_blocks else super()._is_abort(data)
 
     def _on_reply(self, data: bytes) -> Step:
         if data[0] >> 5 != _UPLOAD_REPLY:
@@ -110,7 +108,7 @@ class SdoBlockUpload(SdoUpload):
             if self._surplus > 2 * BLOCK_MAX:
                 return self._break(abort_codes.INVALID_SEQUENCE, "segments, and never the one that is due", data)
             return self._again(data) if last or number == self._block else Wait()
-        self._good, self._surplus, self._repeats = number, 0, 0
+        self._good, self._surplus, self._repeats, self._nudged = number, 0, 0, False
         self._received += data[1:]
         if len(self._received) > self._max_bytes + _SEGMENT:
             return self._break(abort_codes.OUT_OF_MEMORY, f"more than {self._max_bytes} bytes", data)
@@ -143,13 +141,18 @@ class SdoBlockUpload(SdoUpload):
         return Done(value, self._frame(bytes([0xA0 | _END])))
 
     def _patience_ns(self) -> int:
-        """Amid a sub-block half the time: what was lost at its end is asked for before the node gives up on us."""
-        return self.timeout_ns // 2 if self._good else self.timeout_ns
+        """Among segments half the time: what was lost is asked for before the node gives up on us."""
+        return self.timeout_ns // 2 if self._may_recover() else self.timeout_ns
+
+    def _may_recover(self) -> bool:
+        safe = self._good > 0 or (self._indicated is not None and not self._nudged)
+        return self._in_blocks and not self._last_seen and safe
 
     def _recover(self, now_ns: int) -> Send | None:
         """The last segments of a sub-block were lost (CO-017): acknowledge what there is."""
-        if not self._in_blocks or not self._good:
+        if not self._may_recover():
             return None
+        self._nudged = not self._good
         step = self._acknowledge()
         self._go_on(step, now_ns)
         return step

@@ -17,7 +17,7 @@ from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted
 from gateway.protocols.canopen import abort_codes
 from gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
-from gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
+from gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
 
 MAX_INBOX = 128
 """Frames that wait for the transfer's task; a flood beyond that is dropped and counted."""
@@ -49,12 +49,12 @@ class Counters:
 
 def is_final(data: bytes) -> bool:
     """Whether an SDO reply leaves no transfer open in the node: an abort, or an expedited upload's reply."""
-    return len(data) == 8 and (data[0] >> 5 == 4 or (data[0] >> 5 == 2 and bool(data[0] & 0x02)))
+    return len(data) == 8 and (data[0] == ABORT or (data[0] >> 5 == 2 and bool(data[0] & 0x02)))
 
 
 def has_multiplexor(data: bytes) -> bool:
     """Whether an SDO reply carries one: replies to initiate requests and aborts. Segments look like anything."""
-    return data[0] >> 5 in (2, 3, 4) or (data[0] >> 5 in (5, 6) and not data[0] & 3)
+    return data[0] == ABORT or data[0] >> 5 in (2, 3) or (data[0] >> 5 in (5, 6) and not data[0] & 3)
 
 
 def multiplexor_of(data: bytes) -> Multiplexor:

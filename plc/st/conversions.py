@@ -1,0 +1,145 @@
+"""Type conversions by name: INT_TO_REAL, TO_DINT, TRUNC, REAL_TRUNC_INT... (IEC 61131-3, 6.6.2.5.2).
+
+Real to integer rounds to the nearest, ties to even; TRUNC cuts. A number that the target cannot hold is an error at run
+time, but from one integer or bit string type to another only the bits that fit are kept, as the standard says. TIME counts
+ms as a number, LTIME ns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from plc.st import tree as t
+from plc.st import types as ty
+from plc.st.scope import Value
+
+if TYPE_CHECKING:
+    from plc.st.expressions import Expressions
+
+_NAMES: dict[str, ty.Type] = {**ty.ELEMENTARY, "STRING": ty.String(254), "WSTRING": ty.String(254, wide=True)}
+_DIGITS = {32: 7, 64: 15}
+
+
+def conversion(name: str) -> Callable[[Expressions, t.Call], Value] | None:
+    """The conversion of that name (in capitals), None if there is none."""
+    if name == "TRUNC":
+        return lambda x, call: _convert(x, call, None, ty.LINT, cut=True)
+    source, word, target = name.rpartition("_TRUNC_")
+    if word and target in _NAMES:
+        return _made(_NAMES.get(source), _NAMES[target], cut=True) if source in _NAMES else None
+    source, word, target = name.rpartition("_TO_")
+    if word and source in _NAMES and target in _NAMES:
+        return _made(_NAMES[source], _NAMES[target], cut=False)
+    if name.startswith("TO_") and name[3:] in _NAMES:
+        return _made(None, _NAMES[name[3:]], cut=False)
+    return None
+
+
+def _made(source: ty.Type | None, target: ty.Type, cut: bool) -> Callable[[Expressions, t.Call], Value]:
+    return lambda x, call: _convert(x, call, source, target, cut)
+
+
+def _convert(x: Expressions, call: t.Call, source: ty.Type | None, target: ty.Type, cut: bool) -> Value:
+    (expr,) = x.positional(call, 1)
+    value = x.value(expr)
+    kind = ty.plain(value.type)
+    if source is not None and not isinstance(source, ty.String):
+        code: str | None = x.coerced(value, source, expr.pos, f"the argument of {call.ref.name}")
+        kind = source
+    else:
+        code = value.code
+        if isinstance(source, ty.String) and not isinstance(kind, ty.String):
+            x.env.fail(expr.pos, f"the argument of {call.ref.name}", expected="a string", got=str(kind))
+    if isinstance(kind, ty.AnyInt):
+        kind = ty.LINT
+    elif isinstance(kind, ty.AnyReal):
+        kind = ty.LREAL
+    elif isinstance(kind, ty.Enum):
+        kind = ty.DINT
+    assert code is not None
+    made = _of_string(code, target) if isinstance(kind, ty.String) else _of_value(code, kind, target, cut)
+    if made is None:
+        x.env.fail(call.pos, f"there is no conversion from {kind} to {target}")
+    return Value(made, target)
+
+
+def _of_string(code: str, target: ty.Type) -> str | None:
+    if isinstance(target, ty.String):
+        return code if target.wide else f"{code}.encode('latin-1', 'replace').decode('latin-1')"
+    assert isinstance(target, ty.Elementary)
+    if target.kind in ("int", "bits"):
+        return f"_v.number_of({code}, {target.low}, {target.high})"
+    if target.kind == "real":
+        return f"_v.real(_v.real_of({code}))" if target.bits == 32 else f"_v.real_of({code})"
+    return f"({code}.strip().upper() in ('TRUE', '1'))" if target.kind == "bool" else None
+
+
+def _of_value(code: str, kind: ty.Type, target: ty.Type, cut: bool) -> str | None:
+    if not isinstance(kind, ty.Elementary):
+        return None
+    if isinstance(target, ty.String):
+        return _text(code, kind)
+    assert isinstance(target, ty.Elementary)
+    whole = ("int", "bits", "bool")
+    if kind.kind in whole and target.kind in whole:
+        return _between_integers(code, kind, target)
+    if kind.kind in whole and target.kind == "real":
+        return f"_v.real({code})" if target.bits == 32 else f"float({code})"
+    if kind.kind == "real":
+        return _of_real(code, target, cut)
+    if kind.kind == "duration" or target.kind == "duration":
+        return _of_time(code, kind, target)
+    if kind.kind == "dt" and target.kind in ("date", "tod"):
+        day = 86_400_000_000_000
+        return f"({code} // {day} * {day})" if target.kind == "date" else f"({code} % {day})"
+    return code if kind.kind == target.kind or (kind.kind == "date" and target.kind == "dt") else None
+
+
+def _between_integers(code: str, kind: ty.Elementary, target: ty.Elementary) -> str:
+    if target.kind == "bool":
+        return f"({code} != 0)"
+    if target.low <= kind.low and kind.high <= target.high:
+        return f"int({code})" if kind.kind == "bool" else code
+    return f"_v.signed({code}, {target.bits})" if target.low < 0 else f"({code} & {target.high})"
+
+
+def _of_real(code: str, target: ty.Elementary, cut: bool) -> str | None:
+    if target.kind == "real":
+        return f"_v.real({code})" if target.bits == 32 else code
+    if target.kind in ("int", "bits"):
+        return f"_v.{'truncated' if cut else 'to_integer'}({code}, {target.low}, {target.high})"
+    if target.kind == "bool":
+        return f"({code} != 0.0)"
+    if target.kind == "duration":
+        return f"_v.to_integer({code} * {_unit(target)}, {target.low}, {target.high})"
+    return None
+
+
+def _unit(kind: ty.Elementary) -> int:
+    """What a duration counts as a number, in ns."""
+    return 1 if kind.name == "LTIME" else 1_000_000
+
+
+def _of_time(code: str, kind: ty.Elementary, target: ty.Elementary) -> str | None:
+    if kind.kind == target.kind:
+        return code
+    if kind.kind in ("int", "bits") and target.kind == "duration":
+        return f"_v.signed({code} * {_unit(target)}, 64)"
+    if target.kind in ("int", "bits"):
+        count = code if _unit(kind) == 1 else f"_v.divide({code}, {_unit(kind)})"
+        return _between_integers(f"({count})", ty.LINT, target)
+    if target.kind == "real":
+        return f"_v.real({code} / {_unit(kind)})" if target.bits == 32 else f"({code} / {_unit(kind)})"
+    return None
+
+
+def _text(code: str, kind: ty.Elementary) -> str | None:
+    if kind.kind == "bool":
+        return f"('TRUE' if {code} else 'FALSE')"
+    if kind.kind == "real":
+        return f"_v.real_text({code}, {_DIGITS[kind.bits]})"
+    if kind.kind == "duration":
+        return f"_v.duration_text({code}, {chr(39)}{'LT' if kind.name == 'LTIME' else 'T'}{chr(39)})"
+    name = {"date": "date_text", "tod": "tod_text", "dt": "moment_text"}.get(kind.kind)
+    return f"_v.{name}({code})" if name else f"str({code})"

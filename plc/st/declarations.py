@@ -1,0 +1,218 @@
+"""Declarations: type names to types, initial values to Python, structures to Python classes."""
+
+from __future__ import annotations
+
+from math import prod
+
+from plc.blocks import BLOCKS
+from plc.st import tree as t
+from plc.st import types as ty
+from plc.st.expressions import Expressions
+from plc.st.scope import Environment, Writer
+
+_STANDARD = ty.standard_blocks(BLOCKS)
+
+
+class Declarations:
+    """The types of a unit, each resolved when it is first asked for, in whatever order they are declared."""
+
+    def __init__(self, env: Environment, unit: t.Unit, out: Writer) -> None:
+        self.env = env
+        self.out = out
+        self._types: dict[str, t.TypeDecl] = {}
+        self._blocks = {p.name.lower(): p for p in unit.pous if p.kind == "FUNCTION_BLOCK"}
+        self._open: list[str] = []
+        for declared in unit.types:
+            if declared.name.lower() in self._types or declared.name.upper() in ty.ELEMENTARY:
+                env.fail(declared.pos, f"type {declared.name} is declared twice")
+            self._types[declared.name.lower()] = declared
+            if isinstance(declared, t.EnumDecl):
+                self._declare_enum(declared)
+        for declared in unit.types:
+            self.named(declared.name, declared.pos)
+
+    # -- types ----------------------------------------------------------------------------------------------------------
+
+    def type_of(self, spec: t.TypeSpec, role: str = "") -> ty.Type:
+        """The type that is written; `role` is VAR_INPUT... where MESSAGES may stand."""
+        if isinstance(spec, t.NamedType):
+            if spec.name.upper() == "MESSAGES" and role in ("VAR_INPUT", "VAR_OUTPUT"):
+                return ty.MessagesIn() if role == "VAR_INPUT" else ty.MessagesOut()
+            return self.named(spec.name, spec.pos)
+        if isinstance(spec, t.SubrangeType):
+            return self._subrange(spec)
+        if isinstance(spec, t.StringType):
+            length = ty.DEFAULT_STRING if spec.length is None else self._constant(spec.length, "the length of a string")
+            if not 1 <= length <= ty.MAX_STRING:
+                self.env.fail(spec.pos, "the length of a string", expected=f"1 to {ty.MAX_STRING}", got=str(length))
+            return ty.String(length, spec.wide)
+        ranges = tuple((self._constant(a, "an index"), self._constant(b, "an index")) for a, b in spec.ranges)
+        if any(low > high for low, high in ranges):
+            self.env.fail(spec.pos, "an empty range of indices")
+        if prod(high - low + 1 for low, high in ranges) > ty.MAX_ELEMENTS:
+            self.env.fail(spec.pos, "too large an array", expected=f"at most {ty.MAX_ELEMENTS} elements")
+        return ty.Array(ranges, self.type_of(spec.of))
+
+    def named(self, name: str, pos: t.Pos) -> ty.Type:
+        key = name.lower()
+        found = ty.ELEMENTARY.get(name.upper()) or self.env.types.get(key)
+        if found is not None:
+            return found
+        if key in self._open:
+            self.env.fail(pos, f"type {name} contains itself")
+        self._open.append(key)
+        if key in self._types:
+            found = self._declared(self._types[key])
+        elif key in self._blocks:
+            found = self._block(self._blocks[key])
+        elif key in _STANDARD:
+            found = _STANDARD[key]
+        else:
+            known = [*ty.ELEMENTARY, *(d.name for d in self._types.values()), *(b.name for b in self._blocks.values())]
+            self.env.unknown(pos, "a type", name, known + [b.name for b in _STANDARD.values()])
+        self._open.pop()
+        self.env.types[key] = found
+        return found
+
+    def _declared(self, declared: t.TypeDecl) -> ty.Type:
+        if isinstance(declared, t.StructDecl):
+            fields: dict[str, tuple[str, ty.Type]] = {}
+            for field in declared.fields:
+                if field.name.lower() in fields:
+                    self.env.fail(field.pos, f"{field.name} is declared twice")
+                fields[field.name.lower()] = (field.name, self.type_of(field.type))
+            struct = ty.Struct(declared.name, fields)
+            self._write_struct(struct, declared)
+            return struct
+        assert isinstance(declared, t.AliasDecl)
+        kind = self.type_of(declared.type)
+        if declared.initial is not None:
+            self.env.type_initials[declared.name.lower()] = self.initial(kind, declared.initial)
+        return kind
+
+    def _declare_enum(self, declared: t.EnumDecl) -> None:
+        values: dict[str, int] = {}
+        number = 0
+        for name, stated in declared.values:
+            number = number if stated is None else stated
+            if name.lower() in {v.lower() for v in values}:
+                self.env.fail(declared.pos, f"{declared.name} has the value {name} twice")
+            values[name] = number
+            number += 1
+        first = next(iter(values.values()))
+        enum = ty.Enum(declared.name, values, first)
+        if isinstance(declared.initial, t.Ref):
+            lower = {k.lower(): v for k, v in values.items()}
+            if declared.initial.name.lower() not in lower:
+                self.env.unknown(declared.pos, f"in {declared.name}, a value", declared.initial.name, list(values))
+            enum = ty.Enum(declared.name, values, lower[declared.initial.name.lower()])
+        self.env.types[declared.name.lower()] = enum
+        for name, value in values.items():
+            self.env.enum_values.setdefault(name.lower(), []).append((enum, value))
+
+    def _subrange(self, spec: t.SubrangeType) -> ty.Subrange:
+        base = self.named(spec.name, spec.pos)
+        low, high = self._constant(spec.low, "a limit"), self._constant(spec.high, "a limit")
+        if not (isinstance(base, ty.Elementary) and base.kind == "int" and base.low <= low <= high <= base.high):
+            self.env.fail(
+                spec.pos, "a subrange", expected="limits inside an integer type", got=f"{base}({low}..{high})"
+            )
+        return ty.Subrange(base, low, high)
+
+    def _block(self, pou: t.Pou) -> ty.Block:
+        members: dict[str, dict[str, tuple[str, ty.Type]]] = {"VAR_INPUT": {}, "VAR_OUTPUT": {}, "VAR_IN_OUT": {}}
+        for block in pou.blocks:
+            for v in block.variables:
+                if block.kind in members:
+                    members[block.kind][v.name.lower()] = (v.name, self.type_of(v.type))
+                elif block.kind == "VAR":
+                    self.type_of(v.type)  # finds a block that holds itself
+        return ty.Block(pou.name, members["VAR_INPUT"], members["VAR_OUTPUT"], members["VAR_IN_OUT"])
+
+    def _constant(self, expr: t.Expr, what: str) -> int:
+        return Expressions(self.env, {}, self.out).constant_integer(expr, what)
+
+    # -- initial values -------------------------------------------------------------------------------------------------
+
+    def initial(self, kind: ty.Type, init: t.Init | None, spec: t.TypeSpec | None = None) -> str:
+        """Python expression of a new variable's value."""
+        if init is None:
+            named = spec.name.lower() if isinstance(spec, t.NamedType) else ""
+            return self.env.type_initials.get(named) or self._default(kind)
+        if isinstance(init, t.InitArray):
+            return self._initial_array(kind, init)
+        if isinstance(init, t.InitStruct):
+            return self._initial_struct(kind, init)
+        compiler = Expressions(self.env, {}, self.out)
+        value = compiler.value(init)
+        return compiler.coerced(value, kind, init.pos, "an initial value")
+
+    def _default(self, kind: ty.Type) -> str:
+        if isinstance(kind, ty.Subrange):
+            return str(min(max(0, kind.low), kind.high))
+        if isinstance(kind, ty.Elementary):
+            return "False" if kind.kind == "bool" else "0.0" if kind.kind == "real" else "0"
+        if isinstance(kind, ty.String):
+            return "''"
+        if isinstance(kind, ty.Enum):
+            return str(kind.initial)
+        if isinstance(kind, ty.Struct):
+            return f"S_{kind.name.lower()}()"
+        if isinstance(kind, ty.Block):
+            return f"_blocks[{kind.name!r}]()" if kind.standard else f"B_{kind.name.lower()}()"
+        assert isinstance(kind, ty.Array)
+        code = self._default(kind.of)
+        for low, high in reversed(kind.ranges):
+            code = f"[{code} for _ in range({high - low + 1})]"
+        return code
+
+    def _initial_array(self, kind: ty.Type, init: t.InitArray) -> str:
+        if not isinstance(kind, ty.Array):
+            self.env.fail(init.pos, "an array's value for what is none", got=str(kind))
+        items: list[str] = []
+        total = prod(high - low + 1 for low, high in kind.ranges)
+        for count, item in init.items:
+            if len(items) + count > total:
+                self.env.fail(init.pos, "more values than elements", expected=f"at most {total}")
+            items += [self.initial(kind.of, item)] * count
+        items += [self._default(kind.of)] * (total - len(items))
+        for low, high in reversed(kind.ranges[1:]):  # the last index changes fastest
+            size = high - low + 1
+            items = [f"[{', '.join(items[i : i + size])}]" for i in range(0, len(items), size)]
+        return f"[{', '.join(items)}]"
+
+    def _initial_struct(self, kind: ty.Type, init: t.InitStruct) -> str:
+        members = kind.fields if isinstance(kind, ty.Struct) else kind.inputs if isinstance(kind, ty.Block) else None
+        if members is None:
+            self.env.fail(init.pos, "a structure's value for what is none", got=str(kind))
+        given = []
+        for name, item in init.members:
+            if name.lower() not in members:
+                self.env.unknown(init.pos, f"in {kind}, a member", name, [n for n, _ in members.values()])
+            member, of = members[name.lower()]
+            attribute = f"m_{name.lower()}" if isinstance(kind, ty.Struct) else f"v_{name.lower()}"
+            if isinstance(kind, ty.Block) and kind.standard:
+                attribute = member
+            given.append(f"{attribute}={self.initial(of, item)}")
+        return f"_v.with_members({', '.join([self._default(kind), *given])})"
+
+    def _write_struct(self, struct: ty.Struct, declared: t.StructDecl) -> None:
+        out, names = self.out, [f"m_{name}" for name in struct.fields]
+        with out.block(f"class S_{struct.name.lower()}:", declared.pos):
+            out.line(f"__slots__ = ({', '.join(map(repr, names))},)")
+            with out.block("def __init__(self):"):
+                for field in declared.fields:
+                    kind = struct.fields[field.name.lower()][1]
+                    out.line(
+                        f"self.m_{field.name.lower()} = {self.initial(kind, field.initial, field.type)}", field.pos
+                    )
+            with out.block("def copy(self):"):
+                out.line(f"new = S_{struct.name.lower()}.__new__(S_{struct.name.lower()})")
+                for name, (_, kind) in zip(names, struct.fields.values(), strict=True):
+                    code = f"self.{name}"
+                    if isinstance(kind, ty.Array):
+                        code = f"_v.copied({code})"
+                    elif isinstance(kind, ty.Struct):
+                        code += ".copy()"
+                    out.line(f"new.{name} = {code}")
+                out.line("return new")

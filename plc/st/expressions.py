@@ -1,0 +1,441 @@
+"""Expressions to Python, with their types checked. What has to happen before an expression (calls with outputs) is written
+to the `Writer` first, in order.
+"""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+from plc.st import tree as t
+from plc.st import types as ty
+from plc.st import values
+from plc.st.literals import Malformed, constant
+from plc.st.scope import Environment, Parameter, Signature, Symbol, Value, Writer, by_reference
+from plc.st.standard import FUNCTIONS
+
+_COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
+_LOGIC = {"AND": "&", "&": "&", "OR": "|", "XOR": "^", "AND_THEN": "and", "OR_ELSE": "or"}
+
+
+class Expressions:
+    """Compiles expressions in one POU's scope: `symbols` by name in lower case, then the environment's."""
+
+    def __init__(self, env: Environment, symbols: dict[str, Symbol], out: Writer, pou: str = "") -> None:
+        self.env = env
+        self.symbols = symbols
+        self.out = out
+        self.pou = pou
+        self.program_inputs: set[str] = set()
+        """Where a PROGRAM is compiled: the inputs whose quality can be asked for."""
+
+    # -- assignment compatibility ---------------------------------------------------------------------------------------
+
+    def coerced(self, value: Value, target: ty.Type, pos: t.Pos, what: str = "") -> str:
+        """Python expression of `value` as a `target`. Raises `FileInvalid` where it needs a named conversion."""
+        source = ty.plain(value.type)
+        if not ty.fits(value.type, target):
+            hint = f"{source}_TO_{ty.plain(target)}" if _convertible(source) and _convertible(ty.plain(target)) else ""
+            self.env.fail(pos, what or "types differ", expected=str(target), got=str(value.type), hint=hint)
+        if isinstance(target, ty.Subrange) and value.type != target and not isinstance(source, ty.AnyInt):
+            return f"_v.inside({value.code}, {target.low}, {target.high})"
+        sink = ty.plain(target)
+        if isinstance(source, ty.AnyInt | ty.AnyReal):
+            return _literal(source.value, sink)
+        if isinstance(source, ty.String) and isinstance(sink, ty.String):
+            return value.code if source.length <= sink.length else f"{value.code}[:{sink.length}]"
+        if isinstance(source, ty.Elementary) and isinstance(sink, ty.Elementary):
+            if source.kind in ("int", "bool") and sink.kind != source.kind:
+                return f"{'float' if sink.kind == 'real' else 'int'}({value.code})"
+            return value.code
+        if isinstance(source, ty.Array | ty.Struct):
+            if not value.place:
+                return value.code
+            return f"_v.copied({value.code})" if isinstance(source, ty.Array) else f"{value.code}.copy()"
+        if isinstance(source, ty.Block | ty.MessagesIn | ty.MessagesOut):
+            self.env.fail(pos, f"a {source} cannot be assigned")
+        return value.code
+
+    def condition(self, expr: t.Expr, what: str) -> str:
+        value = self.value(expr)
+        if not ty.is_kind(value.type, "bool"):
+            self.env.fail(expr.pos, f"the condition of {what}", expected="BOOL", got=str(value.type))
+        return value.code
+
+    def constant_integer(self, expr: t.Expr, what: str) -> int:
+        value = self.value(expr)
+        if value.constant is None or not ty.is_kind(value.type, "int", "bits"):
+            self.env.fail(expr.pos, what, expected="a constant whole number", got=str(value.type))
+        return int(value.constant)
+
+    # -- expressions ------------------------------------------------------------------------------------------------------
+
+    def value(self, expr: t.Expr) -> Value:
+        if isinstance(expr, t.Literal):
+            return self._literal(expr)
+        if isinstance(expr, t.Ref):
+            return self.reference(expr)
+        if isinstance(expr, t.Call):
+            return self.call(expr)
+        if isinstance(expr, t.Unary):
+            return self._unary(expr)
+        return self._binary(expr)
+
+    def _literal(self, literal: t.Literal) -> Value:
+        if literal.kind == "ENUM_REF":
+            return self._enum(literal)
+        try:
+            known = constant(literal)
+        except Malformed as e:
+            self.env.fail(literal.pos, str(e), got=literal.text)
+        return Value(repr(known.value), known.type, known.value)
+
+    def _enum(self, literal: t.Literal) -> Value:
+        type_name, _, name = literal.text.partition("#")
+        enum = self.env.types.get(type_name.lower())
+        if not isinstance(enum, ty.Enum):
+            self.env.unknown(literal.pos, "an enumeration", type_name, list(self.env.types))
+        number = {k.lower(): v for k, v in enum.values.items()}.get(name.lower())
+        if number is None:
+            self.env.unknown(literal.pos, f"in {enum}, a value", name, list(enum.values))
+        return Value(repr(number), enum, number)
+
+    def _unary(self, expr: t.Unary) -> Value:
+        value = self.value(expr.operand)
+        kind = ty.plain(value.type)
+        if expr.op == "NOT":
+            if ty.is_kind(kind, "bool"):
+                return Value(f"(not {value.code})", ty.BOOL, None if value.constant is None else not value.constant)
+            if isinstance(kind, ty.Elementary) and kind.kind == "bits":
+                return Value(f"({value.code} ^ {kind.high})", kind)
+            self.env.fail(expr.pos, "NOT", expected="BOOL or a bit string", got=str(kind))
+        if not ty.is_kind(kind, "int", "real", "duration"):
+            self.env.fail(expr.pos, f"the sign {expr.op}", expected="a number or a duration", got=str(kind))
+        if expr.op == "+":
+            return value
+        if isinstance(kind, ty.AnyInt):
+            return Value(repr(-kind.value), ty.AnyInt(-kind.value), -kind.value)
+        if isinstance(kind, ty.AnyReal):
+            return Value(repr(-kind.value), ty.AnyReal(-kind.value), -kind.value)
+        assert isinstance(kind, ty.Elementary)
+        return Value(wrapped(f"-{value.code}", kind), kind)
+
+    def _binary(self, expr: t.Binary) -> Value:
+        left, right = self.value(expr.left), self.value(expr.right)
+        if expr.op in _LOGIC:
+            return self._logic(expr, left, right)
+        if expr.op in _COMPARISONS:
+            return self._comparison(expr, left, right)
+        timed = self._with_time(expr.op, left, right)
+        if timed is not None:
+            return timed
+        kind = ty.common(left.type, right.type)
+        if kind is None or not ty.is_kind(kind, "int", "real"):
+            self._mismatch(expr, left, right, "numbers of types that meet")
+        if isinstance(kind, ty.AnyInt | ty.AnyReal):
+            return self._folded(expr, left, right)
+        assert isinstance(kind, ty.Elementary)
+        if expr.op == "**":
+            kind = kind if kind.kind == "real" else ty.LREAL
+            power = f"_v.power({left.code}, {right.code})"
+            return Value(f"_v.real({power})" if kind.bits == 32 else power, kind)
+        a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
+        if expr.op == "MOD":
+            if kind.kind != "int":
+                self._mismatch(expr, left, right, "integers")
+            return Value(f"_v.modulo({a}, {b})", kind)
+        if expr.op == "/":
+            return Value(wrapped(f"_v.{'divide' if kind.kind == 'int' else 'divide_real'}({a}, {b})", kind), kind)
+        return Value(wrapped(f"{a} {expr.op} {b}", kind), kind)
+
+    def _logic(self, expr: t.Binary, left: Value, right: Value) -> Value:
+        kind = ty.common(left.type, right.type)
+        if kind is None or not ty.is_kind(kind, "bool", "bits"):
+            self._mismatch(expr, left, right, "BOOL, or bit strings of types that meet")
+        a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
+        if expr.op in ("AND_THEN", "OR_ELSE") and not ty.is_kind(kind, "bool"):
+            self._mismatch(expr, left, right, "BOOL")
+        return Value(f"({a} {_LOGIC[expr.op]} {b})", kind)
+
+    def _comparison(self, expr: t.Binary, left: Value, right: Value) -> Value:
+        kind = ty.common(left.type, right.type)
+        if kind is None or not isinstance(kind, ty.Elementary | ty.AnyInt | ty.AnyReal | ty.String | ty.Enum):
+            self._mismatch(expr, left, right, "two values of types that meet")
+        if isinstance(kind, ty.AnyInt | ty.AnyReal | ty.String):
+            a, b = left.code, right.code
+        else:
+            a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
+        return Value(f"({a} {_COMPARISONS[expr.op]} {b})", ty.BOOL)
+
+    def _with_time(self, op: str, left: Value, right: Value) -> Value | None:
+        """Durations, dates and times of day (IEC 61131-3, Table 35); None where neither side is one."""
+        a, b = ty.plain(left.type), ty.plain(right.type)
+        ka = a.kind if isinstance(a, ty.Elementary) else "int" if isinstance(a, ty.AnyInt) else "real"
+        kb = b.kind if isinstance(b, ty.Elementary) else "int" if isinstance(b, ty.AnyInt) else "real"
+        x, y = left.code, right.code
+        moments = ("dt", "tod", "date")
+        result: ty.Type | None = None
+        code = f"{x} {op} {y}"
+        if op in "+-" and ka == kb == "duration":
+            result = ty.common(a, b)
+        elif op in "+-" and ka in ("dt", "tod") and kb == "duration":
+            result = a
+        elif op == "-" and ka == kb and ka in moments:
+            result = ty.TIME
+        elif op in "*/" and ka == "duration" and kb in ("int", "real"):
+            result = a
+            if kb == "real":
+                code = f"round({x} * {y})" if op == "*" else f"round(_v.divide_real({x}, {y}))"
+            elif op == "/":
+                code = f"_v.divide({x}, {y})"
+        elif op == "*" and kb == "duration" and ka in ("int", "real"):
+            result = b
+            code = f"round({code})" if ka == "real" else code
+        if result is None:
+            return None
+        assert isinstance(result, ty.Elementary)
+        return Value(wrapped(code, result), result)
+
+    def _folded(self, expr: t.Binary, left: Value, right: Value) -> Value:
+        a, b = left.constant, right.constant
+        whole = isinstance(a, int) and isinstance(b, int)
+        try:
+            if expr.op == "/":
+                result = values.divide(a, b) if whole else values.divide_real(a, b)
+            elif expr.op == "MOD" and whole:
+                result = values.modulo(a, b)
+            elif expr.op == "**":
+                result = values.power(a, b)
+            elif expr.op in ("+", "-", "*"):
+                result = a + b if expr.op == "+" else a - b if expr.op == "-" else a * b
+            else:
+                self._mismatch(expr, left, right, "integers")
+        except values.LogicError as e:
+            self.env.fail(expr.pos, e.message)
+        kind: ty.Type = ty.AnyInt(result) if isinstance(result, int) else ty.AnyReal(result)
+        return Value(repr(result), kind, result)
+
+    def _mismatch(self, expr: t.Binary, left: Value, right: Value, expected: str) -> NoReturn:
+        self.env.fail(expr.pos, f"operands of {expr.op}", expected=expected, got=f"{left.type} and {right.type}")
+
+    # -- variables --------------------------------------------------------------------------------------------------------
+
+    def reference(self, ref: t.Ref) -> Value:
+        symbol = self.symbols.get(ref.name.lower()) or self.env.globals.get(ref.name.lower())
+        if symbol is None:
+            return self._enum_value(ref)
+        value = Value(symbol.code, symbol.type, symbol.constant, place=True, writable=symbol.writable)
+        for selector in ref.selectors:
+            if isinstance(selector, t.Member):
+                value = self._member(value, selector)
+            elif isinstance(selector, t.Index):
+                value = self._index(value, selector)
+            else:
+                value = self._bit(value, selector)
+        return value
+
+    def _enum_value(self, ref: t.Ref) -> Value:
+        found = self.env.enum_values.get(ref.name.lower(), [])
+        if not found or ref.selectors:
+            known = [s.name for s in (*self.symbols.values(), *self.env.globals.values())]
+            self.env.unknown(ref.pos, "a variable", ref.name, known)
+        if len(found) > 1:
+            names = ", ".join(f"{enum}#{ref.name}" for enum, _ in found)
+            self.env.fail(ref.pos, f"{ref.name} is a value of several types", expected=names)
+        enum, number = found[0]
+        return Value(repr(number), enum, number)
+
+    def _member(self, value: Value, member: t.Member) -> Value:
+        kind, name = value.type, member.name.lower()
+        if isinstance(kind, ty.Struct) and name in kind.fields:
+            return Value(f"{value.code}.m_{name}", kind.fields[name][1], place=True, writable=value.writable)
+        if isinstance(kind, ty.Block):
+            for members, writable in ((kind.inputs, True), (kind.outputs, False), (kind.in_outs, True)):
+                if name in members:
+                    attribute = members[name][0] if kind.standard else f"v_{name}"
+                    return Value(f"{value.code}.{attribute}", members[name][1], place=True, writable=writable)
+        known: list[str] = []
+        if isinstance(kind, ty.Struct):
+            known = [f for f, _ in kind.fields.values()]
+        elif isinstance(kind, ty.Block):
+            known = [f for f, _ in (*kind.inputs.values(), *kind.outputs.values(), *kind.in_outs.values())]
+        raise self.env.unknown(member.pos, f"in {kind}, a member", member.name, known)
+
+    def _index(self, value: Value, selector: t.Index) -> Value:
+        kind = value.type
+        if not isinstance(kind, ty.Array):
+            self.env.fail(selector.pos, "an index into what is no array", got=str(kind))
+        if len(selector.indices) != len(kind.ranges):
+            self.env.fail(
+                selector.pos, "indices", expected=f"{len(kind.ranges)} for {kind}", got=str(len(selector.indices))
+            )
+        code = value.code
+        for expr, (low, high) in zip(selector.indices, kind.ranges, strict=True):
+            index = self.value(expr)
+            if not ty.is_kind(index.type, "int", "bits"):
+                self.env.fail(expr.pos, "an index", expected="a whole number", got=str(index.type))
+            if isinstance(index.constant, int):
+                if not low <= index.constant <= high:
+                    self.env.fail(expr.pos, "an index outside its array", expected=f"{low} to {high}", got=index.code)
+                code += f"[{index.constant - low}]"
+            else:
+                code += f"[_v.index({index.code}, {low}, {high})]"
+        return Value(code, kind.of, place=True, writable=value.writable)
+
+    def _bit(self, value: Value, selector: t.Bit) -> Value:
+        kind = ty.plain(value.type)
+        if not (isinstance(kind, ty.Elementary) and kind.kind in ("int", "bits")):
+            self.env.fail(selector.pos, "a bit of what has none", expected="an integer or a bit string", got=str(kind))
+        if selector.number >= kind.bits:
+            self.env.fail(selector.pos, f"{kind} has bits 0 to {kind.bits - 1}", got=str(selector.number))
+        return Value(f"bool({value.code} >> {selector.number} & 1)", ty.BOOL)
+
+    # -- calls ------------------------------------------------------------------------------------------------------------
+
+    def call(self, call: t.Call) -> Value:
+        name = call.ref.name.lower()
+        if not call.ref.selectors and name in self.env.functions:
+            return self._user_function(call, self.env.functions[name])
+        if not call.ref.selectors and name not in self.symbols:
+            standard = FUNCTIONS.find(name.upper())
+            if standard is not None:
+                return standard(self, call)
+            known = (
+                [s.name for s in self.env.functions.values()]
+                + FUNCTIONS.names()
+                + [s.name for s in self.symbols.values()]
+            )
+            self.env.unknown(call.pos, "a function", call.ref.name, known)
+        raise self.env.error(call.pos, "a function block is called in a statement of its own", got=call.ref.name)
+
+    def positional(self, call: t.Call, least: int, most: int | None = None) -> list[t.Expr]:
+        """The arguments of a standard function, which has no names for them here."""
+        found = [a.value for a in call.arguments if a.value is not None]
+        limit = least if most is None else most
+        if len(found) != len(call.arguments) or not least <= len(found) <= limit:
+            number = str(least) if limit == least else f"{least} or more" if limit > 99 else f"{least} to {limit}"
+            self.env.fail(call.pos, f"arguments of {call.ref.name}", expected=number, got=str(len(call.arguments)))
+        return found
+
+    def _user_function(self, call: t.Call, signature: Signature) -> Value:
+        self.env.calls.setdefault(self.pou, {}).setdefault(signature.name.lower(), call.pos)
+        given = self._named(call, [*signature.inputs, *signature.in_outs], signature)
+        codes, write_back = [], []
+        for p in signature.inputs:
+            expr = given.pop(p.name.lower(), None)
+            codes.append(
+                p.initial if expr is None else self.coerced(self.value(expr), p.type, expr.pos, _into(p, signature))
+            )
+        for p in signature.in_outs:
+            expr = given.pop(p.name.lower(), None)
+            target = self._in_out(expr, p, call, signature.name)
+            codes.append(target.code)
+            if not by_reference(p.type):
+                write_back.append((p, target.code))
+        code = f"f_{signature.name.lower()}({', '.join(codes)})"
+        outputs = [a for a in call.arguments if a.target is not None]
+        if not outputs and not write_back:
+            return Value(f"{code}[0]" if signature.more else code, signature.returns)
+        result = self.out.temporary()
+        self.out.line(f"{result} = {code}", call.pos)
+        places = {p.name.lower(): n for n, p in enumerate(signature.more, 1)}
+        for p, target_code in write_back:
+            self.out.line(f"{target_code} = {result}[{places[p.name.lower()]}]", call.pos)
+        types = {p.name.lower(): p.type for p in signature.outputs}
+        for argument in outputs:
+            key = argument.name.lower()
+            if key not in types:
+                self.env.unknown(
+                    argument.pos, f"in {signature.name}, an output", argument.name, [p.name for p in signature.outputs]
+                )
+            self.take(argument, Value(f"{result}[{places[key]}]", types[key]))
+        return Value(f"{result}[0]", signature.returns)
+
+    def take(self, argument: t.Argument, value: Value) -> None:
+        """``name => target``."""
+        assert argument.target is not None
+        if argument.inverted:
+            value = Value(f"(not {value.code})", value.type)
+        self.assign(argument.target, value, argument.pos)
+
+    def assign(self, ref: t.Ref, value: Value, pos: t.Pos) -> None:
+        """Write an assignment. A bit of a variable is put in with the others kept."""
+        if ref.selectors and isinstance(ref.selectors[-1], t.Bit):
+            whole = self.writable(t.Ref(ref.pos, ref.name, ref.selectors[:-1]))
+            self._bit(whole, ref.selectors[-1])
+            code = f"_v.set_bit({whole.code}, {ref.selectors[-1].number}, {self.coerced(value, ty.BOOL, pos)})"
+            kind = ty.plain(whole.type)
+            self.out.line(f"{whole.code} = {wrapped(code, kind) if isinstance(kind, ty.Elementary) else code}", pos)
+            return
+        target = self.writable(ref)
+        self.out.line(f"{target.code} = {self.coerced(value, target.type, pos, f'assigned to {ref.name}')}", pos)
+
+    def writable(self, ref: t.Ref) -> Value:
+        target = self.reference(ref)
+        if not target.writable:
+            self.env.fail(
+                ref.pos, f"{ref.name} cannot be assigned to", hint="it is a constant, an input, or a block's output"
+            )
+        return target
+
+    def _in_out(self, expr: t.Expr | None, p: Parameter, call: t.Call, of: str) -> Value:
+        if not isinstance(expr, t.Ref):
+            self.env.fail(call.pos, f"VAR_IN_OUT {p.name} of {of} needs a variable")
+        target = self.writable(expr)
+        if ty.plain(target.type) != ty.plain(p.type) and not (
+            isinstance(p.type, ty.String) and isinstance(target.type, ty.String)
+        ):
+            self.env.fail(expr.pos, f"VAR_IN_OUT {p.name} of {of}", expected=str(p.type), got=str(target.type))
+        return target
+
+    def _named(self, call: t.Call, parameters: list[Parameter], signature: Signature) -> dict[str, t.Expr]:
+        """Arguments by parameter in lower case, whether given by name or in order."""
+        given: dict[str, t.Expr] = {}
+        order = [p.name.lower() for p in parameters]
+        position = 0
+        for argument in call.arguments:
+            if argument.value is None:
+                continue
+            if argument.name:
+                key = argument.name.lower()
+                if key not in order:
+                    self.env.unknown(
+                        argument.pos, f"in {signature.name}, a parameter", argument.name, [p.name for p in parameters]
+                    )
+            elif position < len(order):
+                key = order[position]
+                position += 1
+            else:
+                self.env.fail(argument.pos, f"too many arguments for {signature.name}", expected=str(len(order)))
+            if key in given:
+                self.env.fail(argument.pos, f"{key} of {signature.name} is given twice")
+            given[key] = argument.value
+        return given
+
+
+def _into(p: Parameter, signature: Signature) -> str:
+    return f"{p.name} of {signature.name}"
+
+
+def wrapped(code: str, kind: ty.Elementary) -> str:
+    """`code` brought back into the width of `kind`."""
+    if kind.kind == "real":
+        return f"_v.real({code})" if kind.bits == 32 else f"({code})"
+    if kind.low < 0:
+        return f"(({code} + {-kind.low} & {kind.high - kind.low}) - {-kind.low})"
+    return f"({code} & {kind.high})"
+
+
+def _literal(value: float, kind: ty.Type) -> str:
+    """A constant without a type of its own, as one of `kind`, which it fits."""
+    if not isinstance(kind, ty.Elementary):
+        return repr(value)
+    if kind.kind == "bool":
+        return repr(bool(value))
+    if kind.kind == "real":
+        number = values.real(float(value)) if kind.bits == 32 else float(value)
+        return repr(number) if abs(number) != float("inf") else f"float({str(number)!r})"
+    return repr(int(value))
+
+
+def _convertible(kind: ty.Type) -> bool:
+    return isinstance(kind, ty.Elementary)

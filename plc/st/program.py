@@ -1,0 +1,203 @@
+"""A PROGRAM in Structured Text as a `Program` of the soft PLC.
+
+Variables that can be tags (BOOL, numbers, times, enumerations) are declared under the names of the source; what is local
+and no tag (strings, arrays, structures, blocks) stays inside. An input that never had a value keeps its initial one; IS_GOOD
+tells. Times are tags in ns, enumerations their numbers, ULINT and LWORD their two's complement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gateway.core.errors import FileInvalid
+from gateway.core.image import Message, TagKind
+from gateway.core.values import Quality, TagValue
+from plc.blocks import BLOCKS
+from plc.program import Program, Role, ScanInfo, Variable, message_input, message_output
+from plc.st import types as ty
+from plc.st import values
+from plc.st.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
+
+_ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
+
+
+class Context:
+    """What compiled code knows of the scan that runs."""
+
+    __slots__ = ("_lookup", "first_scan", "now_ns")
+
+    def __init__(self, lookup: Callable[[str], TagValue]) -> None:
+        self.now_ns = 0
+        self.first_scan = False
+        self._lookup = lookup
+
+    def is_good(self, name: str) -> bool:
+        return self._lookup(name).quality is Quality.GOOD
+
+    @staticmethod
+    def message(messages: tuple[Message, ...], number: int) -> Message:
+        """`number` counts from 1."""
+        return messages[values.index(number, 1, len(messages))]
+
+
+class StProgram(Program):
+    """Base of the classes that `program_class` makes."""
+
+    unit: CompiledUnit
+    declared: CompiledProgram
+    source_path: str
+
+    def __init__(self) -> None:
+        self.context = Context(lambda name: self.tag(name))
+        space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS}
+        exec(self.unit.code, space)
+        self.body: Any = space[f"P_{self.declared.name.lower()}"]()
+        """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
+        self._inputs = [_Input(v) for v in self.declared.variables if v.role == "input"]
+        self._outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
+        for v in self.declared.variables:
+            if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
+                setattr(self.body, _attribute(v), self.__dict__[v.name])
+            elif v.role != "input" and _tag_kind(v.kind) is not None:
+                self._outputs.append((v.name, _attribute(v), _to_tag(v.kind)))
+        self._show()
+
+    def execute(self, scan: ScanInfo) -> None:
+        self.context.now_ns, self.context.first_scan = scan.now_ns, scan.first_scan
+        body, namespace = self.body, self.__dict__
+        for item in self._inputs:
+            value = namespace[item.name]
+            if value is not None:
+                setattr(body, item.attribute, item.convert(value) if item.convert else value)
+        body.execute()
+        self._show()
+
+    def _show(self) -> None:
+        body, namespace = self.body, self.__dict__
+        for name, attribute, convert in self._outputs:
+            value = getattr(body, attribute)
+            namespace[name] = convert(value) if convert else value
+
+    # -- what is kept over a restart --------------------------------------------------------------------------------------
+
+    def retained(self) -> dict[str, Any]:
+        """Every VAR RETAIN by name, as JSON-able data, also what is no tag."""
+        return {v.name: _dump(getattr(self.body, _attribute(v))) for v in self.declared.variables if v.retain}
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """The inverse: variables that are in `kept` take its values."""
+        for v in self.declared.variables:
+            if v.retain and v.name in kept:
+                attribute = _attribute(v)
+                setattr(self.body, attribute, _load(getattr(self.body, attribute), kept[v.name]))
+        self._show()
+
+
+class _Input:
+    """An input: how what the image holds becomes what the program computes with."""
+
+    __slots__ = ("attribute", "convert", "name")
+
+    def __init__(self, variable: ProgramVariable) -> None:
+        self.name = variable.name
+        self.attribute = _attribute(variable)
+        self.convert: Callable[[Any], Any] | None = None
+        kind = variable.kind
+        limits = ty.plain(kind)
+        if isinstance(kind, ty.Subrange):
+            self.convert = lambda x: values.inside(x, kind.low, kind.high)
+        elif isinstance(limits, ty.Elementary) and limits.kind in ("int", "bits") and limits.bits < 64:
+            self.convert = lambda x: values.inside(x, limits.low, limits.high)
+        elif kind == ty.REAL:
+            self.convert = values.real
+
+
+def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
+    """The class of program `name` of a unit; without a name, of its only one. Raises `FileInvalid`."""
+    names = [p.name for p in unit.programs]
+    found = next((p for p in unit.programs if p.name.lower() == name.lower()), None) if name else None
+    if not name and len(unit.programs) == 1:
+        found = unit.programs[0]
+    if found is None:
+        raise FileInvalid(
+            f"no PROGRAM {name}" if name else "which PROGRAM is meant",
+            path=unit.path,
+            expected=", ".join(names) or "a PROGRAM in the file",
+            hint="write FILE.st:NAME where a file has several" if len(names) > 1 else "",
+        )
+    body: dict[str, Any] = {"unit": unit, "declared": found, "source_path": unit.path, "__module__": __name__}
+    for v in found.variables:
+        kind = _tag_kind(v.kind)
+        if isinstance(v.kind, ty.MessagesIn):
+            body[v.name] = message_input()
+        elif isinstance(v.kind, ty.MessagesOut):
+            body[v.name] = message_output()
+        elif kind is not None:
+            if hasattr(StProgram, v.name) or v.name in _RESERVED:
+                raise FileInvalid(f"variable {v.name} of {found.name} needs another name", path=unit.path, got=v.name)
+            unit_of = "ns" if ty.is_kind(v.kind, "duration") else ""
+            body[v.name] = Variable(v.name, _ROLES[v.role], kind, unit=unit_of)
+    return type(found.name, (StProgram,), body)
+
+
+_RESERVED = frozenset({"context", "body", "declared", "unit", "source_path", "_inputs", "_outputs"})
+
+
+def load_file(path: Path, name: str = "") -> type[StProgram]:
+    """Read and compile a file. Raises `FileInvalid`."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as e:
+        raise FileInvalid("not UTF-8 text", path=str(path), got=f"byte {e.start}: {e.object[e.start]:02x}h") from e
+    except OSError as e:
+        raise FileInvalid(f"cannot read: {e.strerror or e}", path=str(path)) from e
+    return program_class(compile_text(text, str(path)), name)
+
+
+def _attribute(variable: ProgramVariable) -> str:
+    return f"v_{variable.name.lower()}"
+
+
+def _tag_kind(kind: ty.Type) -> TagKind | None:
+    """What a variable of this type is as a tag; None where it is none."""
+    if isinstance(kind, ty.MessagesIn | ty.MessagesOut):
+        return TagKind.MESSAGE
+    if isinstance(kind, ty.Enum):
+        return TagKind.INT
+    kind = ty.plain(kind)
+    if not isinstance(kind, ty.Elementary):
+        return None
+    return {"bool": TagKind.BOOL, "real": TagKind.REAL}.get(kind.kind, TagKind.INT)
+
+
+def _to_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
+    kind = ty.plain(kind)
+    unsigned = isinstance(kind, ty.Elementary) and kind.bits == 64 and kind.low == 0 and kind.high > 0
+    return (lambda x: values.signed(x, 64)) if unsigned else None
+
+
+def _dump(value: Any) -> Any:
+    """Plain data of a value: objects by their slots, but for moments, which mean nothing after a restart."""
+    if isinstance(value, list):
+        return [_dump(v) for v in value]
+    slots = getattr(value, "__slots__", None)
+    if slots is None or isinstance(value, str | int | float):
+        return value
+    return {name: _dump(getattr(value, name)) for name in slots if not name.endswith("_ns")}
+
+
+def _load(into: Any, kept: Any) -> Any:
+    """`kept` in the form of `into`; raises `FileInvalid` where the forms differ."""
+    if isinstance(into, list) and isinstance(kept, list) and len(into) == len(kept):
+        return [_load(a, b) for a, b in zip(into, kept, strict=True)]
+    slots = getattr(into, "__slots__", None)
+    if slots is not None and isinstance(kept, dict):
+        for name in slots:
+            if name in kept:
+                setattr(into, name, _load(getattr(into, name), kept[name]))
+        return into
+    if type(into) is type(kept) or (isinstance(into, float) and isinstance(kept, int)):
+        return float(kept) if isinstance(into, float) else kept
+    raise FileInvalid("a retained value of another form", expected=type(into).__name__, got=type(kept).__name__)

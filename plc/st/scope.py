@@ -1,0 +1,117 @@
+"""Names and what they stand for while a unit is compiled, the errors that compiling raises, and the code that it writes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from typing import Any, NoReturn
+
+from gateway.core.errors import FileInvalid
+from plc.st import types as ty
+from plc.st.tree import Pos
+
+
+@dataclass(frozen=True, slots=True)
+class Symbol:
+    """A variable: its Python expression, and its value if it is a constant."""
+
+    name: str
+    type: ty.Type
+    code: str
+    writable: bool = True
+    constant: Any = None
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A compiled expression. `place`: it is a variable or a part of one; `constant`: its value where that is known."""
+
+    code: str
+    type: ty.Type
+    constant: Any = None
+    place: bool = False
+    writable: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    name: str
+    type: ty.Type
+    initial: str
+    """Python expression of the initial value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Signature:
+    """How a user's function is called. It returns a tuple if `more` (outputs and in-outs that are no references)."""
+
+    name: str
+    returns: ty.Type
+    inputs: tuple[Parameter, ...]
+    in_outs: tuple[Parameter, ...]
+    outputs: tuple[Parameter, ...]
+
+    @property
+    def more(self) -> tuple[Parameter, ...]:
+        return self.outputs + tuple(p for p in self.in_outs if not by_reference(p.type))
+
+
+def by_reference(kind: ty.Type) -> bool:
+    """Whether a VAR_IN_OUT of this type is handed over as the object itself."""
+    return isinstance(kind, ty.Array | ty.Struct | ty.Block)
+
+
+@dataclass
+class Environment:
+    """What a whole unit declares, by names in lower case."""
+
+    path: str = ""
+    types: dict[str, ty.Type] = field(default_factory=dict)
+    type_initials: dict[str, str] = field(default_factory=dict)
+    functions: dict[str, Signature] = field(default_factory=dict)
+    globals: dict[str, Symbol] = field(default_factory=dict)
+    enum_values: dict[str, list[tuple[ty.Enum, int]]] = field(default_factory=dict)
+    calls: dict[str, dict[str, Pos]] = field(default_factory=dict)
+    """POU to the POUs that it calls or holds, with the first place where."""
+
+    def error(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
+        return FileInvalid(
+            message, path=self.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint
+        )
+
+    def fail(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> NoReturn:
+        raise self.error(pos, message, expected=expected, got=got, hint=hint)
+
+    def unknown(self, pos: Pos, what: str, name: str, known: list[str]) -> NoReturn:
+        near = get_close_matches(name.lower(), [k.lower() for k in known], 1)
+        nearest = next((k for k in known if near and k.lower() == near[0]), "")
+        self.fail(pos, f"{what} {name!r} is not declared", hint=f"did you mean {nearest}?" if nearest else "")
+
+
+class Writer:
+    """Lines of Python with the line of the source that each comes from."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, int]] = []
+        self._depth = 0
+        self._temporaries = 0
+
+    def line(self, code: str, pos: Pos | None = None) -> None:
+        self.lines.append(("    " * self._depth + code, pos.line if pos else 0))
+
+    @contextmanager
+    def block(self, head: str, pos: Pos | None = None) -> Iterator[None]:
+        """`head` and an indented body, ``pass`` if nothing is written into it."""
+        self.line(head, pos)
+        self._depth += 1
+        before = len(self.lines)
+        yield
+        if len(self.lines) == before:
+            self.line("pass", pos)
+        self._depth -= 1
+
+    def temporary(self) -> str:
+        self._temporaries += 1
+        return f"_{self._temporaries}"

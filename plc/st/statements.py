@@ -1,0 +1,204 @@
+"""Statements to Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from plc.st import tree as t
+from plc.st import types as ty
+from plc.st.expressions import Expressions
+from plc.st.scope import Environment, Symbol, Value, Writer, by_reference
+
+
+class Statements(Expressions):
+    """Compiles a body. `leave` is the Python statement that RETURN becomes."""
+
+    leave = "return"
+
+    def __init__(self, env: Environment, symbols: dict[str, Symbol], out: Writer, pou: str = "") -> None:
+        super().__init__(env, symbols, out, pou)
+        self._loops: list[t.Expr | None] = []  # those around the statement; a REPEAT's with its condition
+
+    def body(self, statements: tuple[t.Statement, ...]) -> None:
+        for statement in statements:
+            getattr(self, f"_{type(statement).__name__.lower()}")(statement)
+
+    # -- assignment and calls -----------------------------------------------------------------------------------------
+
+    def _assign(self, s: t.Assign) -> None:
+        self.assign(s.target, self.value(s.value), s.pos)
+
+    def _callstatement(self, s: t.CallStatement) -> None:
+        call = s.call
+        known = call.ref.name.lower() in self.symbols or call.ref.name.lower() in self.env.globals
+        if call.ref.selectors or known:
+            instance = self.reference(call.ref)
+            if not isinstance(instance.type, ty.Block):
+                self.env.fail(
+                    call.pos, f"{call.ref.name} cannot be called", expected="a function block", got=str(instance.type)
+                )
+            self._block_call(call, instance.code, instance.type)
+        else:
+            self.out.line(self.value(call).code, s.pos)
+
+    def _block_call(self, call: t.Call, code: str, block: ty.Block) -> None:
+        if "[" in code:  # the place is worked out once
+            place = self.out.temporary()
+            self.out.line(f"{place} = {code}", call.pos)
+            code = place
+        order, outputs, write_back = list(block.inputs), [], []
+        for argument in call.arguments:
+            if argument.target is not None:
+                outputs.append(argument)
+                continue
+            assert argument.value is not None
+            name = argument.name.lower() if argument.name else order.pop(0) if order else ""
+            if name in block.inputs:
+                member, kind = block.inputs[name]
+                value = self.coerced(self.value(argument.value), kind, argument.pos, f"{member} of {block}")
+                self.out.line(f"{code}.{_attribute(block, name, member)} = {value}", call.pos)
+            elif name in block.in_outs:
+                member, kind = block.in_outs[name]
+                target = self._in_out_of(argument, member, kind, block)
+                self.out.line(f"{code}.v_{name} = {target}", call.pos)
+                if not by_reference(kind):
+                    write_back.append(f"{target} = {code}.v_{name}")
+            else:
+                known = [m for m, _ in (*block.inputs.values(), *block.in_outs.values())]
+                self.env.unknown(argument.pos, f"in {block}, an input", argument.name or "(one more)", known)
+        given = {a.name.lower() for a in call.arguments if a.name}
+        for name, (member, _) in block.in_outs.items():
+            if name not in given:
+                self.env.fail(call.pos, f"VAR_IN_OUT {member} of {block} needs a variable")
+        self.out.line(f"{code}.execute(_c.now_ns)", call.pos)
+        for line in write_back:
+            self.out.line(line, call.pos)
+        for argument in outputs:
+            name = argument.name.lower()
+            if name not in block.outputs:
+                self.env.unknown(
+                    argument.pos, f"in {block}, an output", argument.name, [m for m, _ in block.outputs.values()]
+                )
+            member, kind = block.outputs[name]
+            self.take(argument, Value(f"{code}.{_attribute(block, name, member)}", kind))
+
+    def _in_out_of(self, argument: t.Argument, member: str, kind: ty.Type, block: ty.Block) -> str:
+        if not isinstance(argument.value, t.Ref):
+            self.env.fail(argument.pos, f"VAR_IN_OUT {member} of {block} needs a variable")
+        target = self.writable(argument.value)
+        if ty.plain(target.type) != ty.plain(kind):
+            self.env.fail(argument.pos, f"VAR_IN_OUT {member} of {block}", expected=str(kind), got=str(target.type))
+        return target.code
+
+    # -- selection ----------------------------------------------------------------------------------------------------
+
+    def _if(self, s: t.If) -> None:
+        self._branches(list(s.branches), s.otherwise, s.pos)
+
+    def _branches(
+        self, branches: list[tuple[t.Expr, tuple[t.Statement, ...]]], otherwise: tuple[t.Statement, ...], pos: t.Pos
+    ) -> None:
+        (condition, body), *rest = branches
+        code = self.condition(condition, "IF")
+        with self.out.block(f"if {code}:", condition.pos):
+            self.body(body)
+        if rest:  # nested, since a condition may have to be prepared
+            with self.out.block("else:", pos):
+                self._branches(rest, otherwise, pos)
+        elif otherwise:
+            with self.out.block("else:", pos):
+                self.body(otherwise)
+
+    def _case(self, s: t.Case) -> None:
+        selector = self.value(s.selector)
+        kind = ty.plain(selector.type)
+        if not (ty.is_kind(kind, "int", "bits") or isinstance(kind, ty.Enum)):
+            self.env.fail(
+                s.selector.pos, "the selector of CASE", expected="a whole number or an enumeration", got=str(kind)
+            )
+        name = self.out.temporary()
+        self.out.line(f"{name} = {selector.code}", s.pos)
+        taken: list[tuple[int, int]] = []
+        word = "if"
+        for labels, body in s.branches:
+            tests = [self._label(label, kind, name, taken) for label in labels]
+            with self.out.block(f"{word} {' or '.join(tests)}:", labels[0].pos):
+                self.body(body)
+            word = "elif"
+        if s.otherwise:
+            with self.out.block("else:" if word == "elif" else "if True:", s.pos):
+                self.body(s.otherwise)
+
+    def _label(self, label: t.CaseLabel, kind: ty.Type, name: str, taken: list[tuple[int, int]]) -> str:
+        ends = []
+        for expr in (label.low, label.high or label.low):
+            value = self.value(expr)
+            if value.constant is None or ty.common(value.type, kind) is None:
+                self.env.fail(expr.pos, "a label of CASE", expected=f"a constant of {kind}", got=str(value.type))
+            ends.append(int(value.constant))
+        low, high = ends
+        if low > high:
+            self.env.fail(label.pos, "an empty range", got=f"{low}..{high}")
+        if any(low <= b and a <= high for a, b in taken):
+            self.env.fail(
+                label.pos, "a label that another branch has too", got=str(low) if low == high else f"{low}..{high}"
+            )
+        taken.append((low, high))
+        return f"{name} == {low}" if low == high else f"{low} <= {name} <= {high}"
+
+    # -- iteration ----------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _loop(self, head: str, pos: t.Pos, until: t.Expr | None = None) -> Iterator[None]:
+        self._loops.append(until)
+        with self.out.block(head, pos):
+            yield
+        self._loops.pop()
+
+    def _for(self, s: t.For) -> None:
+        target = self.writable(s.variable)
+        kind = target.type
+        if not ty.is_kind(kind, "int") or isinstance(kind, ty.Subrange):
+            self.env.fail(s.variable.pos, "the variable of FOR", expected="an integer", got=str(kind))
+        first, last = (self.coerced(self.value(e), kind, e.pos, "a limit of FOR") for e in (s.first, s.last))
+        if s.step is None:
+            head = f"range({first}, {last} + 1)"
+        else:
+            head = f"_v.steps({first}, {last}, {self.coerced(self.value(s.step), kind, s.step.pos, 'the step of FOR')})"
+        with self._loop(f"for {target.code} in {head}:", s.pos):
+            self.body(s.body)
+
+    def _while(self, s: t.While) -> None:
+        with self._loop("while True:", s.pos):
+            code = self.condition(s.condition, "WHILE")
+            with self.out.block(f"if not {code}:", s.condition.pos):
+                self.out.line("break", s.condition.pos)
+            self.body(s.body)
+
+    def _repeat(self, s: t.Repeat) -> None:
+        with self._loop("while True:", s.pos, s.until):
+            self.body(s.body)
+            self._until(s.until)
+
+    def _until(self, condition: t.Expr) -> None:
+        code = self.condition(condition, "REPEAT")
+        with self.out.block(f"if {code}:", condition.pos):
+            self.out.line("break", condition.pos)
+
+    def _jump(self, s: t.Jump) -> None:
+        if s.word == "RETURN":
+            self.out.line(self.leave, s.pos)
+            return
+        if not self._loops:
+            self.env.fail(s.pos, f"{s.word} outside a loop")
+        if s.word == "EXIT":
+            self.out.line("break", s.pos)
+            return
+        if self._loops[-1] is not None:  # CONTINUE in REPEAT goes to its condition
+            self._until(self._loops[-1])
+        self.out.line("continue", s.pos)
+
+
+def _attribute(block: ty.Block, name: str, member: str) -> str:
+    return member if block.standard else f"v_{name}"

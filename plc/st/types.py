@@ -1,0 +1,237 @@
+"""The data types of Structured Text: what there is, what fits into what without a conversion, and how values are held.
+
+How values are held at run time: BOOL as bool; integers, bit strings, enumerated values as int; REAL as a float rounded to
+32 bits, LREAL as float; TIME and LTIME as int of ns, TIME_OF_DAY ns since midnight, DATE and DATE_AND_TIME ns since
+1970-01-01; strings as str (a STRING's characters are 0 to 255, one byte each); arrays as lists; structures and function
+blocks as objects. Source: IEC 61131-3:2013, 6.4 (types) and 6.6.1.6 (implicit conversions). Pure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from plc.blocks import FunctionBlock
+
+DEFAULT_STRING = 80
+MAX_STRING = 65_535
+MAX_ELEMENTS = 1_000_000
+"""Elements of an array, over all its dimensions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Elementary:
+    """`kind` is int, bits, real, bool, duration, date, tod, dt; `low`..`high` for integers and bit strings."""
+
+    name: str
+    kind: str
+    bits: int
+    low: int = 0
+    high: int = 0
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def _integers() -> dict[str, Elementary]:
+    found = {}
+    for bits, name in ((8, "SINT"), (16, "INT"), (32, "DINT"), (64, "LINT")):
+        found[name] = Elementary(name, "int", bits, -(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        found["U" + name] = Elementary("U" + name, "int", bits, 0, 2**bits - 1)
+    for bits, name in ((8, "BYTE"), (16, "WORD"), (32, "DWORD"), (64, "LWORD")):
+        found[name] = Elementary(name, "bits", bits, 0, 2**bits - 1)
+    return found
+
+
+BOOL = Elementary("BOOL", "bool", 1, 0, 1)
+REAL = Elementary("REAL", "real", 32)
+LREAL = Elementary("LREAL", "real", 64)
+TIME = Elementary("TIME", "duration", 64, -(2**63), 2**63 - 1)
+LTIME = Elementary("LTIME", "duration", 64, -(2**63), 2**63 - 1)
+DATE = Elementary("DATE", "date", 64, -(2**63), 2**63 - 1)
+TOD = Elementary("TIME_OF_DAY", "tod", 64, -(2**63), 2**63 - 1)
+DT = Elementary("DATE_AND_TIME", "dt", 64, -(2**63), 2**63 - 1)
+
+ELEMENTARY: dict[str, Elementary] = _integers() | {
+    "BOOL": BOOL, "REAL": REAL, "LREAL": LREAL, "TIME": TIME, "LTIME": LTIME, "DATE": DATE, "LDATE": DATE,
+    "TOD": TOD, "TIME_OF_DAY": TOD, "LTOD": TOD, "LTIME_OF_DAY": TOD, "DT": DT, "DATE_AND_TIME": DT, "LDT": DT,
+    "LDATE_AND_TIME": DT,
+}  # fmt: skip
+INT, DINT, LINT, ULINT = (ELEMENTARY[name] for name in ("INT", "DINT", "LINT", "ULINT"))
+
+
+@dataclass(frozen=True, slots=True)
+class AnyInt:
+    """An integer constant without a type of its own: it fits wherever its value does."""
+
+    value: int
+
+    def __str__(self) -> str:
+        return f"{self.value}"
+
+
+@dataclass(frozen=True, slots=True)
+class AnyReal:
+    """A real constant without a type of its own."""
+
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.value}"
+
+
+@dataclass(frozen=True, slots=True)
+class Subrange:
+    """An integer type with narrower limits, checked at each assignment."""
+
+    base: Elementary
+    low: int
+    high: int
+
+    def __str__(self) -> str:
+        return f"{self.base}({self.low}..{self.high})"
+
+
+@dataclass(frozen=True, slots=True)
+class String:
+    """At most `length` characters; what is longer is cut when it is assigned."""
+
+    length: int = DEFAULT_STRING
+    wide: bool = False
+
+    def __str__(self) -> str:
+        return f"{'W' if self.wide else ''}STRING[{self.length}]"
+
+
+@dataclass(frozen=True, slots=True)
+class Enum:
+    name: str
+    values: Mapping[str, int] = field(hash=False)
+    initial: int = 0
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Array:
+    """`ranges`: first and last index of each dimension."""
+
+    ranges: tuple[tuple[int, int], ...]
+    of: Type
+
+    def __str__(self) -> str:
+        return f"ARRAY[{', '.join(f'{low}..{high}' for low, high in self.ranges)}] OF {self.of}"
+
+
+@dataclass(frozen=True, slots=True)
+class Struct:
+    """`fields`: name as declared and type, by the name in lower case; `python`: the class that holds it."""
+
+    name: str
+    fields: Mapping[str, tuple[str, Type]] = field(hash=False)
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A function block: the standard's (`standard` set) or the user's. Members by name in lower case: name, type."""
+
+    name: str
+    inputs: Mapping[str, tuple[str, Type]] = field(hash=False)
+    outputs: Mapping[str, tuple[str, Type]] = field(hash=False)
+    in_outs: Mapping[str, tuple[str, Type]] = field(hash=False, default_factory=dict)
+    standard: type[FunctionBlock] | None = None
+
+    def __str__(self) -> str:
+        return self.name
+
+
+@dataclass(frozen=True, slots=True)
+class MessagesIn:
+    """A program's input of messages (VAR_INPUT name : MESSAGES): those that are new in this scan."""
+
+    def __str__(self) -> str:
+        return "MESSAGES"
+
+
+@dataclass(frozen=True, slots=True)
+class MessagesOut:
+    """A program's output of messages (VAR_OUTPUT name : MESSAGES)."""
+
+    def __str__(self) -> str:
+        return "MESSAGES"
+
+
+Type = (
+    Elementary | AnyInt | AnyReal | Subrange | String | Enum | Array | Struct | Block | MessagesIn | MessagesOut
+)  # fmt: skip
+
+
+def plain(kind: Type) -> Type:
+    """The type that a value has once it is read: a subrange's is its base."""
+    return kind.base if isinstance(kind, Subrange) else kind
+
+
+def is_kind(kind: Type, *names: str) -> bool:
+    """Whether it is elementary of one of these kinds; constants without a type count as int or real."""
+    kind = plain(kind)
+    if isinstance(kind, AnyInt):
+        return "int" in names
+    if isinstance(kind, AnyReal):
+        return "real" in names
+    return isinstance(kind, Elementary) and kind.kind in names
+
+
+def fits(source: Type, target: Type) -> bool:
+    """Whether a value of `source` may be assigned to `target` without naming a conversion."""
+    source, sink = plain(source), plain(target)
+    if isinstance(source, AnyInt):
+        if isinstance(target, Subrange):
+            return target.low <= source.value <= target.high
+        return isinstance(sink, Elementary) and (
+            sink.kind == "real" or (sink.kind in ("int", "bits", "bool") and sink.low <= source.value <= sink.high)
+        )
+    if isinstance(source, AnyReal):
+        return is_kind(sink, "real")
+    if isinstance(source, Elementary) and isinstance(sink, Elementary):
+        return _widens(source, sink)
+    if isinstance(source, String) and isinstance(sink, String):
+        return source.wide == sink.wide
+    return source == sink
+
+
+def _widens(source: Elementary, target: Elementary) -> bool:
+    if source.kind == target.kind:
+        if source.kind == "int":
+            return target.low <= source.low and source.high <= target.high
+        return source.bits <= target.bits
+    if source.kind == "int" and target.kind == "real":
+        return source.bits <= (16 if target.bits == 32 else 32)
+    return source.kind == "bool" and target.kind == "bits"
+
+
+def common(a: Type, b: Type) -> Type | None:
+    """The type in which two operands meet, None if there is none."""
+    a, b = plain(a), plain(b)
+    if isinstance(a, AnyInt) and isinstance(b, AnyInt):
+        return AnyInt(0)
+    if isinstance(a, AnyInt | AnyReal) and isinstance(b, AnyInt | AnyReal):
+        return AnyReal(0.0)
+    if fits(a, b):
+        return b
+    return a if fits(b, a) else None
+
+
+def standard_blocks(blocks: Mapping[str, type[FunctionBlock]]) -> dict[str, Block]:
+    """The function blocks of the standard library as types, by their name in lower case."""
+
+    def members(declared: Mapping[str, str]) -> dict[str, tuple[str, Type]]:
+        return {name.lower(): (name, ELEMENTARY[kind]) for name, kind in declared.items()}
+
+    return {
+        name.lower(): Block(name, members(block.inputs), members(block.outputs), standard=block)
+        for name, block in blocks.items()
+    }

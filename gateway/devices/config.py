@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from gateway.core.endpoint import Endpoint
 from gateway.core.profile import DeviceProfile
+from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,7 @@ class BusConfig:
     timeout_s: float = 1.0
     retries: int = 1
     bitrate: int = 125_000
+    canopen: CanopenBusConfig = CanopenBusConfig()
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,7 @@ class DeviceConfig:
     heartbeat: Heartbeat | None = None
     tpdo1: Tpdo | None = None
     start: bool = False
+    canopen: CanopenNodeConfig = CanopenNodeConfig()
 
     @property
     def where(self) -> str:

@@ -242,6 +242,12 @@ def resolve_gap(text: str, numbering: str) -> RegisterRange:
     return RegisterRange(start.table, start.address, end.end - start.address)
 
 
+def gap_text(gap: RegisterRange) -> str:
+    """A range as a profile's `gaps` has it, as sent; what `resolve_gap` reads."""
+    last = f"..{gap.end - 1}" if gap.count > 1 else ""
+    return f"{gap.table}:{gap.address}{last}"
+
+
 def load_profile(path: Path) -> DeviceProfile:
     """Read a profile; raises `FileInvalid` with line and column for anything wrong."""
     return resolve(load(path))

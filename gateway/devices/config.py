@@ -11,7 +11,12 @@ from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
 
 @dataclass(frozen=True)
 class BusConfig:
-    """A bus and the plant's endpoint of it. `bitrate` (bit/s) is for CAN only."""
+    """A bus and the plant's endpoint of it. `bitrate` (bit/s) is for CAN only; what follows it is for Modbus.
+
+    `spacing_s` is a pause behind every exchange, `turnaround_s` that behind a broadcast, `connect_pause_s` the one after
+    the connection was opened. `echo`: what is sent comes back first. `strict`: RTU silences as SL 2.5.1.1 has them.
+    `probe_share` of the bus's time, at most, goes to devices that do not answer while others do.
+    """
 
     name: str
     endpoint: Endpoint
@@ -19,6 +24,12 @@ class BusConfig:
     retries: int = 1
     bitrate: int = 125_000
     canopen: CanopenBusConfig = CanopenBusConfig()
+    spacing_s: float = 0.0
+    turnaround_s: float = 0.1
+    connect_pause_s: float = 0.0
+    echo: bool = False
+    strict: bool = False
+    probe_share: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -41,8 +52,11 @@ class Tpdo:
 class DeviceConfig:
     """A device of the system. `address` is the Modbus unit id (1 to 255) or the CANopen node id (1 to 127).
 
-    `poll` gives each group's period in milliseconds; a group without one is read once after connecting. `writable`
-    and `safe` are what the system file allows to be written, and what is written when the controller is lost.
+    `poll` gives each group's period in milliseconds; a group without one is read once after connecting. `phase` is where
+    in its period a group is read, in milliseconds; the others are spread. `timeout_s` and `retries` None: as the bus.
+    `spacing_s` is the device's pause behind each exchange with it. While it does not answer it is left alone for
+    `backoff_first_s`, then twice as long, up to `backoff_limit_s`.
+    `writable` and `safe` are what the system file allows to be written, and what is written when the controller is lost.
     """
 
     name: str
@@ -58,6 +72,12 @@ class DeviceConfig:
     tpdo1: Tpdo | None = None
     start: bool = False
     canopen: CanopenNodeConfig = CanopenNodeConfig()
+    phase: dict[str, int] = field(default_factory=dict)
+    timeout_s: float | None = None
+    retries: int | None = None
+    spacing_s: float = 0.0
+    backoff_first_s: float = 0.25
+    backoff_limit_s: float = 10.0
 
     @property
     def where(self) -> str:

@@ -1,15 +1,22 @@
-"""How a poll group is read: the fewest transactions, and what a device taught about its holes.
+"""How a poll group is read: the fewest transactions, and what a device taught about its gaps.
 
 Neighbouring registers are read together, over gaps up to a profile's `max_gap`. A device that refuses such a read with exception
-02 (address) or 03 (too many) has a hole in it or a limit of its own: the read is halved until both sides are taken, the hole is
-remembered and offered for the profile (catalogue case 25). A value or a message is never split over two transactions.
+02 (address) or 03 (too many) has a gap in it or a limit of its own: the read is halved until all parts are taken or single, and
+what was proved on the way is kept and offered for the profile (catalogue case 25). Proved means: both sides of a gap are taken
+and the two together are not. A value or a message is never split over two transactions.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 from gateway.core.profile import DeviceProfile, Message, RegisterRange, Tag
+
+ILLEGAL_ADDRESS, TOO_LONG = 0x02, 0x03
+"""Exceptions (AP 7) that say that a read went over a gap, and that it was too long."""
+
+Member = tuple[RegisterRange, Tag | Message]
 
 
 @dataclass(frozen=True)
@@ -21,82 +28,179 @@ class Read:
     messages: tuple[Message, ...]
 
     @property
-    def members(self) -> list[tuple[RegisterRange, Tag | Message]]:
+    def members(self) -> list[Member]:
         """What is read, by address; the longer first where two start at one address."""
-        both: list[tuple[RegisterRange, Tag | Message]] = [(t.registers, t) for t in self.tags]
+        both: list[Member] = [(t.registers, t) for t in self.tags]
         both += [(m.at, m) for m in self.messages]
         return sorted(both, key=lambda m: (m[0].address, -m[0].count))
 
 
-def plan_reads(profile: DeviceProfile, group: str) -> tuple[Read, ...]:
+@dataclass
+class Learnt:
+    """What a device taught, over all its poll groups.
+
+    `gaps` are ranges between two values that no read may go over; one of 0 registers is a border, behind which
+    another read begins (a device that takes fewer registers at once than the profile says). `missing` are tags that it refuses by
+    themselves. `changes` counts what was learnt or unlearnt.
+    """
+
+    gaps: list[RegisterRange] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    changes: int = 0
+
+    def learn_gap(self, gap: RegisterRange) -> None:
+        if gap not in self.gaps:
+            self.gaps.append(gap)
+            self.changes += 1
+
+    def learn_missing(self, tags: Sequence[str]) -> None:
+        new = [t for t in tags if t not in self.missing]
+        self.missing += new
+        self.changes += bool(new)
+
+    def found(self, tags: Sequence[str]) -> bool:
+        """Tags that were read; True when one of them was missing."""
+        back = [t for t in tags if t in self.missing]
+        self.missing = [t for t in self.missing if t not in back]
+        self.changes += bool(back)
+        return bool(back)
+
+    @property
+    def profile_gaps(self) -> tuple[RegisterRange, ...]:
+        """The gaps as a profile states them, by address: borders are none of it."""
+        return tuple(sorted((g for g in self.gaps if g.count), key=lambda g: (g.table, g.address)))
+
+
+def plan_reads(profile: DeviceProfile, group: str, learnt: Learnt | None = None) -> tuple[Read, ...]:
     """The fewest transactions that read `group`, in address order: gaps up to `max_gap` are read over, none is longer
-    than `read_registers`. Messages come along with the tag that announces them."""
-    limits = profile.form.limits
-    members: list[tuple[RegisterRange, Tag | Message]] = [(t.registers, t) for t in profile.group(group)]
+    than `read_registers`, none goes over a gap that the profile states or that was learnt; a missing tag is read by
+    itself. Messages come along with the tag that announces them. Devices that know pairs of registers only
+    (`even_only`) are asked for whole pairs."""
+    members: list[Member] = [(t.registers, t) for t in profile.group(group)]
     members += [(m.at, m) for m in profile.messages.values() if profile.tags[m.when].poll == group]
     members.sort(key=lambda m: (m[0].table, m[0].address, -m[0].count))
-    reads: list[tuple[RegisterRange, list[Tag | Message]]] = []
+    avoid = list(profile.gaps)
+    if learnt is not None:
+        avoid += learnt.gaps
+        avoid += [profile.tags[name].registers for name in learnt.missing if name in profile.tags]
+    limits = profile.form.limits
+    reads: list[tuple[RegisterRange, list[Member]]] = []
     for at, member in members:
         if reads:
             last, items = reads[-1]
-            end = max(last.end, at.end)
-            fits = end - last.address <= limits.read_registers and at.address - last.end <= limits.max_gap
-            if last.table == at.table and fits:
-                reads[-1] = (replace(last, count=end - last.address), [*items, member])
+            both = replace(last, count=max(last.end, at.end) - last.address)
+            near = last.table == at.table and at.address - last.end <= limits.max_gap
+            fits = _paired(profile, both).count <= limits.read_registers
+            if near and (at.end <= last.end or (fits and not any(_crosses(both, gap) for gap in avoid))):
+                reads[-1] = (both, [*items, (at, member)])
                 continue
-        reads.append((at, [member]))
-    return tuple(_read(at, items) for at, items in reads)
+        reads.append((at, [(at, member)]))
+    return tuple(_read(profile, items) for _, items in reads)
 
 
-def _read(at: RegisterRange, items: list[Tag | Message]) -> Read:
-    tags = tuple(i for i in items if isinstance(i, Tag))
-    return Read(at, tags, tuple(i for i in items if isinstance(i, Message)))
+def _crosses(span: RegisterRange, gap: RegisterRange) -> bool:
+    """Whether `span` goes over `gap`; over a border, when registers of it stand on both sides."""
+    if span.table != gap.table:
+        return False
+    if not gap.count:
+        return span.address < gap.address < span.end
+    return span.address < gap.end and gap.address < span.end
 
 
-def split(read: Read) -> tuple[Read, Read] | None:
-    """`read` in two, at the border nearest to its middle that cuts no value; None where there is no such border."""
+def _paired(profile: DeviceProfile, at: RegisterRange) -> RegisterRange:
+    """`at`, widened to whole pairs of registers where the device knows nothing else."""
+    if not profile.form.limits.even_only or at.table in ("coil", "discrete"):
+        return at
+    first = at.address - at.address % 2
+    return replace(at, address=first, count=at.end + at.end % 2 - first)
+
+
+def _read(profile: DeviceProfile, members: Sequence[Member]) -> Read:
+    first = members[0][0]
+    span = replace(first, count=max(at.end for at, _ in members) - first.address)
+    tags = tuple(i for _, i in members if isinstance(i, Tag))
+    return Read(_paired(profile, span), tags, tuple(i for _, i in members if isinstance(i, Message)))
+
+
+def split(profile: DeviceProfile, read: Read) -> tuple[Read, Read] | None:
+    """`read` in two, at the border nearest to its middle that cuts no value (nor pair, where the device knows pairs);
+    None where there is no such border."""
     members = read.members
     borders: list[tuple[int, int]] = []
-    end = members[0][0].end
+    end = _paired(profile, members[0][0]).end
     for i, (at, _) in enumerate(members[1:], 1):
-        if at.address >= end:
+        paired = _paired(profile, at)
+        if paired.address >= end:
             borders.append((abs(2 * at.address - read.range.address - read.range.end), i))
-        end = max(end, at.end)
+        end = max(end, paired.end)
     if not borders:
         return None
     cut = min(borders)[1]
-    return _joined(members[:cut]), _joined(members[cut:])
+    return _read(profile, members[:cut]), _read(profile, members[cut:])
 
 
-def _joined(members: list[tuple[RegisterRange, Tag | Message]]) -> Read:
-    first = members[0][0]
-    end = max(at.end for at, _ in members)
-    return _read(replace(first, count=end - first.address), [item for _, item in members])
+@dataclass
+class _Split:
+    """A refused read and its two parts. `taken` are the parts that the device took; with both, the gap is proved."""
+
+    first: Read
+    second: Read
+    code: int
+    taken: set[Read] = field(default_factory=set)
 
 
 class GroupPlan:
-    """A poll group's reads, as planned and as learnt.
+    """A poll group's reads, as planned and as learnt. `learnt` is shared by all groups of a device."""
 
-    `holes` are ranges between values that the device refuses to be read over; `missing` are tags that it refuses by
-    themselves. Both are for the profile's author to see.
-    """
+    def __init__(self, profile: DeviceProfile, group: str, learnt: Learnt | None = None) -> None:
+        self.learnt = learnt if learnt is not None else Learnt()
+        self._profile = profile
+        self._group = group
+        self._splits: dict[Read, _Split] = {}
+        self._refused_any = self._found_any = False
+        self.reads: list[Read] = []
+        self.plan_again()
 
-    def __init__(self, profile: DeviceProfile, group: str) -> None:
-        self.reads = list(plan_reads(profile, group))
-        self.holes: list[RegisterRange] = []
-        self.missing: list[str] = []
+    def plan_again(self) -> None:
+        """Make the plan from the profile and what is learnt by now. What is missing is asked for again."""
+        self.reads = list(plan_reads(self._profile, self._group, self.learnt))
+        self._splits.clear()
+        self._refused_any = self._found_any = False
 
-    def refused(self, read: Read) -> tuple[Read, ...]:
-        """The device refused `read`: what to read instead, from now on. Empty when a single value is refused."""
-        parts = split(read)
-        place = self.reads.index(read)
-        if parts is None:
-            self.reads.pop(place)
-            self.missing += [t.name for t in read.tags]
+    def refused(self, read: Read, code: int = ILLEGAL_ADDRESS) -> tuple[Read, ...]:
+        """The device refused `read` with exception `code`: what to read instead. Empty when a single value is
+        refused: it is left out."""
+        self._refused_any = True
+        self._splits.pop(read, None)  # the gap beside it is not proved: this refusal explains the one of the whole
+        parts = split(self._profile, read) or ()
+        self.reads = [r for known in self.reads for r in (parts if known == read else (known,))]
+        if not parts:
+            self.learnt.learn_missing([t.name for t in read.tags])
             return ()
-        self.reads[place : place + 1] = parts
-        first, second = parts
-        gap = second.range.address - first.range.end
-        if gap:
-            self.holes.append(RegisterRange(read.range.table, first.range.end, gap))
+        self._splits |= dict.fromkeys(parts, _Split(*parts, code))
         return parts
+
+    def taken(self, read: Read) -> None:
+        """The device answered `read`."""
+        if self.learnt.missing:
+            self._found_any |= self.learnt.found([t.name for t in read.tags])
+        if not self._splits or (whole := self._splits.get(read)) is None:
+            return
+        whole.taken.add(read)
+        first, second = whole.first, whole.second
+        if len(whole.taken) == 2 and first in self._splits and second in self._splits:
+            gap = second.range.address - first.range.end if whole.code == ILLEGAL_ADDRESS else 0
+            self.learnt.learn_gap(RegisterRange(first.range.table, first.range.end, gap))
+            del self._splits[first], self._splits[second]
+
+    def pass_ended(self) -> None:
+        """Every read was answered or refused. After a refusal what was halved for nothing is joined again, and what is
+        missing stays out. Where nothing is left, one value is still asked for: when it is there, so may be the others."""
+        if self._found_any:
+            self.plan_again()
+        elif self._refused_any or not self.reads:
+            missing = set(self.learnt.missing)
+            self.plan_again()
+            planned = self.reads
+            self.reads = [r for r in planned if not r.tags or not missing.issuperset(t.name for t in r.tags)]
+            self.reads = self.reads or planned[:1]

@@ -8,7 +8,7 @@ are as old as the sample and not as the poll: a sensor that answers and does not
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 from gateway.core.connection import PROTOCOL, ByteConnection
 from gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
@@ -17,24 +17,37 @@ from gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, Tag
 from gateway.devices.codec import apply_scale, decode, encode
 from gateway.devices.config import DeviceConfig
 from gateway.devices.driver import DeviceDriver, TagSink
-from gateway.devices.read_plan import GroupPlan, Read
-from gateway.protocols.modbus.client import ModbusClient
-
-TOO_MUCH = (0x02, 0x03)
-"""Exceptions that say that a read went over a hole (illegal address) or was too long (illegal value)."""
+from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read
+from gateway.protocols.modbus.client import ModbusClient, UnitPace
 
 SAMPLED_STEPS = 0x80000000
 """A sample counter that moved by more than this went backwards: the device restarted."""
 
 
+@dataclass(eq=False)
+class Reading:
+    """A group that is being read, transaction by transaction. `items` are what occurred, once it is complete."""
+
+    what: str
+    todo: deque[Read] = field(default_factory=deque)
+    blocks: list[tuple[Read, bytes]] = field(default_factory=list)
+    values: dict[str, TagValue] = field(default_factory=dict)
+    items: list[DATA] = field(default_factory=list)
+
+
 class RegisterDriver(DeviceDriver):
-    """A driver of a Modbus device, made from its profile."""
+    """A driver of a Modbus device, made from its profile.
+
+    `receive` reads a group at one go. Where others wait for the line, `begin` and then `read_next` until that returns True do
+    the same with one transaction each, and `finish` emits what occurred.
+    """
 
     wire_types = frozenset({PROTOCOL.RS232, PROTOCOL.TCP})
 
     def __init__(self, config: DeviceConfig, sink: TagSink) -> None:
         super().__init__(config, sink)
-        self.plans = {group: GroupPlan(self.profile, group) for group in self.profile.groups}
+        self.learnt = Learnt()
+        self.plans = {group: GroupPlan(self.profile, group, self.learnt) for group in self.profile.groups}
         self.samples_missed = 0
         self.may_trigger = False
         """Whether this driver may write what makes its device measure: the gateway says so."""
@@ -59,6 +72,18 @@ class RegisterDriver(DeviceDriver):
         """Use `client`, which talks over `connection`, from now on."""
         self.attach(connection)
         self._client = client
+        client.set_pace(self.config.address, UnitPace(self.config.timeout_s, self.config.spacing_s))
+
+    def know(self, learnt: Learnt) -> None:
+        """Take over what was learnt in an earlier run, before anything is read. What is missing is asked for once."""
+        self.learnt.gaps = list(learnt.gaps)
+        self.learnt.missing = list(learnt.missing)
+        self.ask_again()
+
+    def ask_again(self) -> None:
+        """The device was away: what it did not have it may have now."""
+        for plan in self.plans.values():
+            plan.plan_again()
 
     def command(self, tag_name: str, value: float) -> COMMAND:
         """The command that writes `value` (engineering units) to a tag. Raises `NotAllowed` outside its limits."""
@@ -86,22 +111,55 @@ class RegisterDriver(DeviceDriver):
                 "another device answers", expected=expected, got=self.identity_error, where=self.config.where
             )
 
+    def begin(self, what: str) -> Reading:
+        """Start to read `what`, a poll group. Nothing is sent yet."""
+        return Reading(what, deque(self.plans[what].reads))
+
+    async def read_next(self, reading: Reading) -> bool:
+        """One transaction of `reading`; True when it was the last one, and all values are published.
+
+        When it raises, the same transaction is next: it may be tried again.
+        """
+        if reading.todo:
+            await self._read_block(reading)
+        if reading.todo:
+            return False
+        self.plans[reading.what].pass_ended()
+        reading.items = self._complete(reading)
+        return True
+
+    def finish(self, reading: Reading) -> None:
+        """Emit what occurred."""
+        for item in reading.items:
+            self.emitter.emit(item)
+
     async def _read(self, what: str) -> list[DATA]:
-        values: dict[str, TagValue] = {}
-        blocks: list[tuple[Read, bytes]] = []
-        todo = deque(self.plans[what].reads)
-        while todo:
-            read = todo.popleft()
-            try:
-                raw, t_ns = await self._transaction(read.range)
-            except ModbusExceptionReply as e:
-                if e.code not in TOO_MUCH:
-                    raise
-                todo.extendleft(reversed(self.plans[what].refused(read)))
+        reading = self.begin(what)
+        while not await self.read_next(reading):
+            pass
+        return reading.items
+
+    async def _read_block(self, reading: Reading) -> None:
+        plan, read = self.plans[reading.what], reading.todo[0]
+        try:
+            raw, t_ns = await self._transaction(read.range)
+        except ModbusExceptionReply as e:
+            if e.code not in (ILLEGAL_ADDRESS, TOO_LONG):
+                raise
+            reading.todo.popleft()
+            parts = plan.refused(read, e.code)
+            reading.todo.extendleft(reversed(parts))
+            if not parts:
                 self.sink.put_bad([f"{self.config.name}.{t.name}" for t in read.tags], Reason.REFUSED)
-                continue
-            blocks.append((read, raw))
-            values |= {t.name: decode(t, _slice(read.range, t.registers, raw), t_ns) for t in read.tags}
+            return
+        reading.todo.popleft()
+        plan.taken(read)
+        reading.blocks.append((read, raw))
+        reading.values |= {t.name: decode(t, _slice(read.range, t.registers, raw), t_ns) for t in read.tags}
+
+    def _complete(self, reading: Reading) -> list[DATA]:
+        """Publish the values of a group that was read; what occurred."""
+        values, what = reading.values, reading.what
         for name, value in values.items():
             tag = self.profile.tags[name]
             if tag.scale_by is not None:
@@ -112,7 +170,7 @@ class RegisterDriver(DeviceDriver):
             self._publish(name, value)
         if not fresh:
             return []
-        return [MEASUREMENT(_slice(read.range, m.at, raw)) for read, raw in blocks for m in read.messages]
+        return [MEASUREMENT(_slice(read.range, m.at, raw)) for read, raw in reading.blocks for m in read.messages]
 
     async def _transaction(self, at: RegisterRange) -> tuple[bytes, int]:
         """Read a range; the bytes as on the wire (bits one a byte) and when the reply was complete."""

@@ -16,7 +16,7 @@ from gateway.core.profile import Box
 from gateway.core.values import COMMAND, DATA
 from gateway.devices.config import DeviceConfig
 from gateway.devices.driver import TagSink
-from gateway.devices.register_device import RegisterDriver
+from gateway.devices.register_device import Reading, RegisterDriver
 
 LAST_SEQUENCE = 0xFFFF
 
@@ -86,9 +86,16 @@ class TransmitterDriver(RegisterDriver):
         reply = await self.client.read_registers(self.config.address, "holding", address, 1)
         return reply.registers[0]
 
-    async def _read(self, what: str) -> list[DATA]:
-        if what != "inbox":
-            return await super()._read(what)
+    def begin(self, what: str) -> Reading:
+        return Reading(what) if what == "inbox" else super().begin(what)
+
+    async def read_next(self, reading: Reading) -> bool:
+        if reading.what != "inbox":
+            return await super().read_next(reading)
+        reading.items = await self._read_inbox()
+        return True
+
+    async def _read_inbox(self) -> list[DATA]:
         box = self._inbox
         reply = await self.client.read_registers(self.config.address, "holding", box.at.address, box.at.count)
         sequence, length = reply.registers[0], reply.registers[1]

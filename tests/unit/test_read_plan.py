@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+import json
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.profile import DeviceProfile, resolve
+from gateway.core.errors import FileInvalid
+from gateway.core.profile import DeviceProfile, RegisterRange, Table, gap_text, resolve, resolve_gap
 from gateway.core.yaml_file import parse
-from gateway.devices.read_plan import GroupPlan, plan_reads, split
+from gateway.devices.read_plan import GroupPlan, Learnt, Read, plan_reads, split
 
 TYPES = {"uint16": 1, "float32": 2, "float64": 4}
 
 
-def profile_of(layout: list[tuple[int, str]], *, read_registers: int = 20, max_gap: int = 4) -> DeviceProfile:
+def span(at: RegisterRange) -> range:
+    return range(at.address, at.end)
+
+
+def profile_of(
+    layout: list[tuple[int, str]], *, read_registers: int = 20, max_gap: int = 4, gaps: Sequence[str] = ()
+) -> DeviceProfile:
     """Holding registers: gaps before each value, and its type."""
     lines = [
         "device: test/planned",
         'source: "a test"',
         "protocol: modbus",
         f"limits: {{read_registers: {read_registers}, max_gap: {max_gap}}}",
+        f"gaps: {json.dumps(list(gaps))}",
         "tags:",
     ]
     address = 0
@@ -49,35 +62,134 @@ def test_every_value_is_read_once_and_whole_within_the_limits(
             end = max(end, at.end)
 
 
-@given(layout=layouts, holes=st.sets(st.integers(0, 200)))
-def test_a_device_with_holes_is_read_whole_but_for_what_it_does_not_have(
-    layout: list[tuple[int, str]], holes: set[int]
+def taught(plan: GroupPlan, refuses: Callable[[Read], int]) -> list[int]:
+    """Read the group until nothing more is learnt, as a driver does; how many requests each pass took."""
+    passes: list[int] = []
+    changes = -1
+    while changes != plan.learnt.changes:
+        todo, changes = deque(plan.reads), plan.learnt.changes
+        passes.append(0)
+        while todo:
+            read = todo.popleft()
+            passes[-1] += 1
+            code = refuses(read)
+            if code:
+                todo.extendleft(reversed(plan.refused(read, code)))
+            else:
+                plan.taken(read)
+        plan.pass_ended()
+        assert len(passes) < 100, "never settles"
+    return passes
+
+
+def without(holes: set[int]) -> Callable[[Read], int]:
+    """A device that does not have these registers."""
+    return lambda read: 2 if any(read.range.address <= h < read.range.end for h in holes) else 0
+
+
+@given(layout=layouts, holes=st.sets(st.integers(0, 200), max_size=12), gap=st.integers(0, 30))
+def test_a_device_with_holes_is_read_whole_with_the_fewest_requests(
+    layout: list[tuple[int, str]], holes: set[int], gap: int
 ) -> None:
-    profile = profile_of(layout, read_registers=125, max_gap=125)
+    """Nothing that was halved on the way stays halved: what is learnt is what a profile could have said."""
+    profile = profile_of(layout, read_registers=60, max_gap=gap)
     plan = GroupPlan(profile, "values")
+    refuses = without(holes)
+    taught(plan, refuses)
+    there = {t.name for t in profile.tags.values() if not any(h in span(t.registers) for h in holes)}
+    if there:
+        assert {t.name for r in plan.reads for t in r.tags} == there
+    else:
+        assert len(plan.reads) == 1  # one is still asked for
+    assert set(plan.learnt.missing) == set(profile.tags) - there
+    assert all(any(h in span(g) for h in holes) for g in plan.learnt.profile_gaps)
+    assert plan.learnt.gaps == [g for g in plan.learnt.gaps if g.count]
+    stated = profile_of(layout, read_registers=60, max_gap=gap, gaps=[gap_text(g) for g in plan.learnt.profile_gaps])
+    told = GroupPlan(stated, "values", Learnt(missing=list(plan.learnt.missing)))
+    assert [r.range for r in told.reads if {t.name for t in r.tags} & there] == [
+        r.range for r in plan.reads if {t.name for t in r.tags} & there
+    ]
 
-    def accepts(first: int, count: int) -> bool:
-        return not any(first <= h < first + count for h in holes)
 
-    for _ in range(200):
-        refused = [r for r in plan.reads if not accepts(r.range.address, r.range.count)]
-        if not refused:
-            break
-        plan.refused(refused[0])
-    got = {t.name for r in plan.reads for t in r.tags}
-    there = {t.name for t in profile.tags.values() if accepts(t.registers.address, t.registers.count)}
-    assert got == there
-    assert set(plan.missing) == set(profile.tags) - there
+@given(layout=layouts, most=st.integers(4, 60))
+def test_a_device_that_takes_less_than_its_profile_says_has_borders_and_no_gaps(
+    layout: list[tuple[int, str]], most: int
+) -> None:
+    profile = profile_of(layout, read_registers=125, max_gap=4)
+    plan = GroupPlan(profile, "values")
+    taught(plan, lambda read: 3 if read.range.count > most else 0)
+    assert {t.name for r in plan.reads for t in r.tags} == set(profile.tags)
+    assert plan.learnt.profile_gaps == ()
+    assert plan.learnt.missing == []
 
 
 def test_mb_025_the_hole_between_two_values_is_learnt() -> None:
-    plan = GroupPlan(profile_of([(0, "float32"), (3, "float32")]), "values")
-    assert [str(r.range) for r in plan.reads] == ["40001 (holding:0) x 7"]
-    assert len(plan.refused(plan.reads[0])) == 2
-    assert [str(r.range) for r in plan.reads] == ["40001 (holding:0) x 2", "40006 (holding:5) x 2"]
-    assert [str(h) for h in plan.holes] == ["40003 (holding:2) x 3"]
+    plan = GroupPlan(profile_of([(0, "float32"), (3, "float32"), (2, "uint16")]), "values")
+    assert [str(r.range) for r in plan.reads] == ["40001 (holding:0) x 10"]
+    assert taught(plan, without({8})) == [5, 2]  # whole, its halves, the halves of one half; then two
+    assert [str(r.range) for r in plan.reads] == ["40001 (holding:0) x 7", "40010 (holding:9)"]
+    assert [gap_text(g) for g in plan.learnt.profile_gaps] == ["holding:7..8"]
+
+
+def test_mb_025_a_profile_that_states_its_gap_is_never_asked_for_it() -> None:
+    profile = profile_of([(0, "float32"), (3, "float32")], gaps=["40003..40005"])
+    assert [str(r.range) for r in GroupPlan(profile, "values").reads] == [
+        "40001 (holding:0) x 2",
+        "40006 (holding:5) x 2",
+    ]
+
+
+def test_a_value_that_was_missing_and_comes_is_read_with_the_others_again() -> None:
+    plan = GroupPlan(profile_of([(0, "uint16"), (0, "uint16"), (0, "uint16")]), "values")
+    taught(plan, without({1}))
+    assert plan.learnt.missing == ["t1"]
+    assert [r.range.address for r in plan.reads] == [0, 2]
+    plan.plan_again()  # the device was away
+    assert [r.range.address for r in plan.reads] == [0, 1, 2]
+    taught(plan, without(set()))
+    assert plan.learnt.missing == []
+    assert [(r.range.address, r.range.count) for r in plan.reads] == [(0, 3)]
+
+
+def test_a_device_that_has_nothing_yet_is_asked_for_one_value_until_it_has_all() -> None:
+    """Some answer 02 to everything while they start."""
+    plan = GroupPlan(profile_of([(0, "uint16")] * 8), "values")
+    assert taught(plan, lambda read: 2) == [15, 1]
+    assert taught(plan, lambda read: 0) == [1, 8, 1]  # one is there, each is, all at once
+    assert plan.learnt.missing == []
+    assert [(r.range.address, r.range.count) for r in plan.reads] == [(0, 8)]
+
+
+def test_pairs_are_asked_for_whole_where_the_device_knows_nothing_else() -> None:
+    """Eastron: an odd count is refused with 03, an odd address with 02."""
+    text = 'device: test/pairs\nsource: "a test"\nprotocol: modbus\nlimits: {even_only: true, max_gap: 0, read_registers: 6}\n'
+    tags = 'tags: {a: {at: "holding:1"}, b: {at: "holding:2"}, c: {at: "holding:4"}, d: {at: "holding:7"}}\n'
+    reads = plan_reads(resolve(parse(text + tags, "test.yaml")), "values")
+    assert [(r.range.address, r.range.count) for r in reads] == [(0, 4), (4, 2), (6, 2)]
 
 
 def test_a_single_value_cannot_be_split() -> None:
-    (read,) = plan_reads(profile_of([(0, "float64")]), "values")
-    assert split(read) is None
+    profile = profile_of([(0, "float64")])
+    (read,) = plan_reads(profile, "values")
+    assert split(profile, read) is None
+
+
+@given(
+    table=st.sampled_from(["coil", "discrete", "input", "holding"]),
+    first=st.integers(0, 65535),
+    more=st.integers(0, 99),
+)
+def test_a_gap_is_written_as_it_is_read(table: Table, first: int, more: int) -> None:
+    gap = RegisterRange(table, first, min(more, 65535 - first) + 1)
+    assert resolve_gap(gap_text(gap), "sent") == gap
+
+
+@pytest.mark.parametrize("text", ["holding:9..5", "30001..40001", "holding:5..", "..5", "30001..", "coil:1..65536", ""])
+def test_a_range_that_is_none_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        resolve_gap(text, "printed")
+
+
+def test_a_gap_where_a_value_stands_is_refused() -> None:
+    with pytest.raises(FileInvalid, match=r"holding:2\.\.5.*where the tag 't1' stands"):
+        profile_of([(0, "uint16"), (4, "uint16")], gaps=["holding:1", "holding:2..5"])

@@ -46,6 +46,20 @@ from gateway.protocols.modbus.transaction import Transaction
 R = TypeVar("R", bound=Reply)
 
 
+@dataclass(frozen=True, slots=True)
+class UnitPace:
+    """What one unit is granted, whoever asks it: how long it may take to answer (None: as every unit) and the pause from
+    the end of an exchange with it to the next request for it, both in seconds. Others may have the line meanwhile."""
+
+    timeout_s: float | None = None
+    spacing_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.timeout_s is not None:
+            _checked_timeout(self.timeout_s)
+        _checked_pause(self.spacing_s)
+
+
 @dataclass(slots=True)
 class ClientCounters:
     """What happened on this connection since it was opened.
@@ -75,8 +89,8 @@ class ModbusClient:
 
     `serial` gives a line its character time: silences, and deadlines that leave out the time on the wire. Without it
     (RTU inside TCP) frames need no silence. `timeout_s` is how long a unit may take to answer, `turnaround_s` what all
-    units get to execute a broadcast. `echo` and `strict` are as in `RtuFramer`, `accepts_zero_id` as in `MbapFramer`;
-    where the framing has no such thing, `UsageError`.
+    units get to execute a broadcast, `spacing_s` a pause behind every exchange. `echo` and `strict` are as in `RtuFramer`,
+    `accepts_zero_id` as in `MbapFramer`; where the framing has no such thing, `UsageError`.
     """
 
     def __init__(
@@ -91,6 +105,7 @@ class ModbusClient:
         strict: bool = False,
         accepts_zero_id: bool = False,
         turnaround_s: float = TURNAROUND_S,
+        spacing_s: float = 0.0,
     ) -> None:
         self._connection = connection
         self._clock = clock
@@ -107,7 +122,10 @@ class ModbusClient:
             settle_ns=self._framer.rest_ns,
             quarantines=not self._framer.confirms_transmission,
             turnaround_ns=round(_checked_timeout(turnaround_s) * NS_PER_S),
+            spacing_ns=round(_checked_pause(spacing_s) * NS_PER_S),
         )
+        self._paces: dict[int, UnitPace] = {}
+        self._spaced_ns: dict[int, int] = {}
         self._timeout_s = _checked_timeout(timeout_s)
         self._turn = asyncio.Lock()
         self._closed = False
@@ -125,6 +143,7 @@ class ModbusClient:
         strict: bool = False,
         accepts_zero_id: bool = False,
         turnaround_s: float = TURNAROUND_S,
+        spacing_s: float = 0.0,
     ) -> Self:
         """A client with the framing and the character time that `endpoint`, which `connection` was opened for, says."""
         return cls(
@@ -137,7 +156,23 @@ class ModbusClient:
             strict=strict,
             accepts_zero_id=accepts_zero_id,
             turnaround_s=turnaround_s,
+            spacing_s=spacing_s,
         )
+
+    def set_pace(self, unit: int, pace: UnitPace) -> None:
+        """From now on `unit` (0 to 255) is asked at this pace."""
+        self._paces[unit] = pace
+
+    def spaced_ns(self, unit: int) -> int:
+        """From when on `unit` has had its pause; a broadcast (unit 0) waits for all units. 0 where nobody waits."""
+        if unit == 0 and self._framer.has_broadcast:
+            return max(self._spaced_ns.values(), default=0)
+        return self._spaced_ns.get(unit, 0)
+
+    @property
+    def clear_ns(self) -> int:
+        """When the line can be used again if nothing arrives: now, or later behind an exchange that ended badly."""
+        return self._line.clear_ns(self._clock.monotonic_ns())
 
     @property
     def closed(self) -> bool:
@@ -224,7 +259,7 @@ class ModbusClient:
         sent; `ConnectionLost` when the client has become useless. Cancelling it is safe: its reply is never taken for
         another's.
         """
-        timeout_ns = round(_checked_timeout(self._timeout_s if timeout_s is None else timeout_s) * NS_PER_S)
+        timeout_ns = round(_checked_timeout(self._timeout_of(unit) if timeout_s is None else timeout_s) * NS_PER_S)
         if not 0 <= unit <= 255:
             raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
         unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)
@@ -233,13 +268,17 @@ class ModbusClient:
         async with self._turn:
             if self._closed:
                 raise closed_here(self._connection.endpoint)
+            await self._await_spacing(unit)
             await self._await_silence()
             transaction = Transaction(
                 self._framer, unit, request, timeout_ns=timeout_ns, char_time_ns=self._char_time_ns
             )
-            if unanswered:
-                return await self._send_only(transaction, request)
-            return await self._exchange(transaction, timeout_ns)
+            try:
+                if unanswered:
+                    return await self._send_only(transaction, request)
+                return await self._exchange(transaction, timeout_ns)
+            finally:
+                self._space(unit)
 
     # -- one exchange --------------------------------------------------------------------------------------------
 
@@ -308,6 +347,20 @@ class ModbusClient:
 
     # -- the line between exchanges ------------------------------------------------------------------------------
 
+    async def _await_spacing(self, unit: int) -> None:
+        """Give `unit` its pause. What arrives meanwhile is nobody's."""
+        while (until_ns := self.spaced_ns(unit)) > self._clock.monotonic_ns() and self._connection.lost is None:
+            data = await self._read_until(until_ns)
+            self._drain(data, self._clock.monotonic_ns(), live=True)
+
+    def _space(self, unit: int) -> None:
+        now_ns = self._clock.monotonic_ns()
+        everybody = unit == 0 and self._framer.has_broadcast
+        for one in self._paces if everybody else (unit,):
+            pace = self._paces.get(one)
+            if pace is not None and pace.spacing_s:
+                self._spaced_ns[one] = now_ns + round(pace.spacing_s * NS_PER_S)
+
     async def _await_silence(self) -> None:
         """Return when a request may be sent; what arrives before that is nobody's and is drained.
 
@@ -355,6 +408,10 @@ class ModbusClient:
 
     # -- small things --------------------------------------------------------------------------------------------
 
+    def _timeout_of(self, unit: int) -> float:
+        pace = self._paces.get(unit)
+        return self._timeout_s if pace is None or pace.timeout_s is None else pace.timeout_s
+
     def _count(self, error: FieldtwinError) -> None:
         if isinstance(error, Desync):
             self.counters.desyncs += 1
@@ -371,3 +428,9 @@ def _checked_timeout(timeout_s: float) -> float:
     if not 0.0 < timeout_s <= 3600.0:
         raise UsageError("Modbus timeout out of range", expected="over 0 to 3600 s", got=f"{timeout_s} s")
     return timeout_s
+
+
+def _checked_pause(pause_s: float) -> float:
+    if not 0.0 <= pause_s <= 3600.0:
+        raise UsageError("Modbus pause out of range", expected="0 to 3600 s", got=f"{pause_s} s")
+    return pause_s

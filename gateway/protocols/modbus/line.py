@@ -23,13 +23,20 @@ _BABBLE_GRACE_NS = 500 * NS_PER_MS
 class LineSilence:
     """`t35_ns`: the silence between frames (SL 2.5.1.1), 0 where there is none. `settle_ns`: how late the rest of a
     damaged frame may come. `quarantines`: whether replies cannot be told apart. `turnaround_ns`: the pause behind a
-    request that nobody answers.
+    request that nobody answers. `spacing_ns`: the pause behind every other exchange, for devices that need one.
     """
 
     def __init__(
-        self, *, t35_ns: int, settle_ns: int, quarantines: bool, turnaround_ns: int = round(TURNAROUND_S * NS_PER_S)
+        self,
+        *,
+        t35_ns: int,
+        settle_ns: int,
+        quarantines: bool,
+        turnaround_ns: int = round(TURNAROUND_S * NS_PER_S),
+        spacing_ns: int = 0,
     ) -> None:
         self._turnaround_ns = turnaround_ns
+        self._spacing_ns = spacing_ns
         self._t35_ns = t35_ns
         self._settle_ns = settle_ns
         self._quarantines = quarantines
@@ -93,11 +100,12 @@ class LineSilence:
     def broadcast(self, sent_ns: int) -> None:
         """Nobody answers; the units get time to execute."""
         self._end(sent_ns, self._t35_ns)
-        self._not_before_ns = sent_ns + self._turnaround_ns
+        self._not_before_ns = sent_ns + max(self._turnaround_ns, self._spacing_ns)
 
     def _end(self, now_ns: int, required_ns: int) -> None:
         self._active_ns = now_ns
         self._required_ns = required_ns
+        self._not_before_ns = now_ns + self._spacing_ns
 
     def _note_latency(self, now_ns: int) -> None:
         self.longest_latency_ns = min(max(self.longest_latency_ns, now_ns - self._sent_ns), _LONGEST_LATENCY_NS)

@@ -39,6 +39,16 @@ def is_number(data_type: int) -> bool:
     return data_type == BOOLEAN or data_type in _SIGNED or data_type in _UNSIGNED or data_type in _REAL
 
 
+def integer_range(data_type: int) -> tuple[int, int] | None:
+    """The smallest and largest value of an integer type or BOOLEAN; None for others."""
+    if data_type == BOOLEAN:
+        return 0, 1
+    if data_type in _SIGNED:
+        half = 1 << (_SIGNED[data_type] - 1)
+        return -half, half - 1
+    return (0, (1 << _UNSIGNED[data_type]) - 1) if data_type in _UNSIGNED else None
+
+
 def decode(data_type: int, raw: bytes) -> int | float:
     """The number in `raw`, which must have the type's size. Little endian, two's complement."""
     if data_type in _REAL:

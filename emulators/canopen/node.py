@@ -20,6 +20,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.behaviour import Behaviour, DeviceModel
 from emulators.canopen.dictionary import Dictionary, Key
 from emulators.canopen.emcy import GENERIC, Emergency
 from emulators.canopen.error_control import ERROR_CONTROL, HeartbeatConsumer, HeartbeatProducer
@@ -49,12 +50,13 @@ _TARGET = {
 class NodeContext:
     """What the node is given besides its data sheet.
 
-    `source` plays values; `factory` replaces defaults (a serial number). `tolerate_short_sdo` takes SDO requests of
-    fewer than 8 bytes as padded with zeros, as for old PLCs; by default they are ignored. `journal_size` bounds both
-    journals: older lines fall off.
+    `source` plays values; `model` makes of them, and of what clients write, what the device does. `factory` replaces
+    defaults (a serial number). `tolerate_short_sdo` takes SDO requests of fewer than 8 bytes as padded with zeros, as for
+    old PLCs; by default they are ignored. `journal_size` bounds both journals: older lines fall off.
     """
 
     source: Source | None = None
+    model: DeviceModel | None = None
     factory: Mapping[Key, bytes] = field(default_factory=dict)
     tolerate_short_sdo: bool = False
     sdo_timeout_ms: int = 1000
@@ -73,16 +75,19 @@ class CanopenNode:
         self.context = context or NodeContext()
         self.node_id = node_id
         data = NodeData(dictionary, node_id, self.context.factory)
-        self._core = core = Core(data, node_id, self.context.source, self.context.journal_size)
+        source, model = self.context.source, self.context.model
+        self._behaviour = None if model is None else Behaviour(model, source, data)
+        self._core = core = Core(data, node_id, self._behaviour or source, self.context.journal_size)
         self._emergency = Emergency(core)
         self._heartbeat = HeartbeatProducer(core)
         self._consumer = HeartbeatConsumer(core, self._emergency, self._enter)
         self._tpdos = Tpdos(core)
-        self._rpdos = Rpdos(core, self._emergency, self._tpdos.changed)
+        self._rpdos = Rpdos(core, self._emergency, self._tpdos.changed, self._rpdo_wrote)
         self._sync = SyncConsumer(core, self._emergency, self._on_sync)
         self._services: tuple[Service, ...] = (
             self._emergency,
             self._consumer,
+            *([self._behaviour] if self._behaviour else []),
             self._heartbeat,
             self._sync,
             self._rpdos,
@@ -90,6 +95,8 @@ class CanopenNode:
             Storage(core),
         )
         self._sdo = SdoServer(_ClientView(core, self._services, self._tpdos), self.context.sdo_timeout_ms * NS_PER_MS)
+        if self._behaviour is not None:
+            self._behaviour.connect(core, self._emergency, self._tpdos.changed)
 
     # -- what can be asked ----------------------------------------------------------------------------------------
 
@@ -240,6 +247,10 @@ class CanopenNode:
         self._tpdos.on_sync(counter, now_ns)
         self._rpdos.on_sync(now_ns)
 
+    def _rpdo_wrote(self, keys: list[Key], now_ns: int) -> None:
+        if self._behaviour is not None:
+            self._behaviour.written(keys, now_ns)
+
     def _enter(self, state: NmtState, now_ns: int) -> None:
         if state is self.state:
             return
@@ -255,6 +266,8 @@ class CanopenNode:
         self._core.note(now_ns, "nmt", 0, 0, bytes([NmtState.INITIALISING]))
         self._core.data.reset(communication_only=communication_only)
         self._sdo.reset()
+        if self._behaviour is not None and not communication_only:
+            self._behaviour.power_on(now_ns)
         for service in self._services:
             service.reset(now_ns)
         self._core.send(ERROR_CONTROL + self.node_id, bytes([NmtState.INITIALISING]), now_ns)

@@ -59,6 +59,10 @@ class NodeData:
         """The live value. The entry must exist."""
         return self._live[index, subindex]
 
+    def factory(self, index: int, subindex: int = 0) -> bytes:
+        """The value that the device left the factory with. The entry must exist."""
+        return self._factory[index, subindex]
+
     def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """The live value as an unsigned integer, or `default` when the node has no such entry."""
         raw = self._live.get((index, subindex))

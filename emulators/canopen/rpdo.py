@@ -26,12 +26,19 @@ class _Rpdo:
 
 
 class Rpdos(Service):
-    """All RPDOs of a node. `changed` is told which values a PDO changed."""
+    """All RPDOs of a node. `changed` is told which values a PDO changed, `wrote` after it which ones it brought."""
 
-    def __init__(self, core: Core, emergency: emcy.Emergency, changed: Callable[[list[Key], int], None]) -> None:
+    def __init__(
+        self,
+        core: Core,
+        emergency: emcy.Emergency,
+        changed: Callable[[list[Key], int], None],
+        wrote: Callable[[list[Key], int], None],
+    ) -> None:
         self._core = core
         self._emergency = emergency
         self._changed = changed
+        self._wrote = wrote
         self._rpdos = [_Rpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
     def owns(self, index: int) -> bool:
@@ -106,3 +113,4 @@ class Rpdos(Service):
         for key, raw in values:
             self._core.note(now_ns, "rpdo", *key, raw)
         self._changed(changed, now_ns)
+        self._wrote([key for key, _ in values], now_ns)

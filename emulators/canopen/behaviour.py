@@ -1,0 +1,206 @@
+"""What a device does behind its objects: the seam between a node (bytes by index) and a device model (numbers).
+
+A `DeviceModel` is a function of time: given the moment, what was played and what clients wrote, it says what the device's
+objects hold and when it wants to be asked again. It must never know frames, SDO or PDOs; the node must never know drives.
+
+What a recording plays for an object is what the device gave **with its factory settings**. A model makes of it what the
+device gives with the live ones; an object that the model does not speak of passes through.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+from emulators.canopen import codec
+from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.dictionary import Entry, Key
+from emulators.canopen.emcy import Emergency
+from emulators.canopen.node_data import NodeData
+from emulators.canopen.service import Core, NmtState, Service, Source
+
+Number = int | float
+
+
+class Objects:
+    """A node's objects as numbers, to be read by a model."""
+
+    def __init__(self, data: NodeData) -> None:
+        self._data = data
+
+    def has(self, index: int, subindex: int = 0) -> bool:
+        return self._data.has(index, subindex)
+
+    def number(self, index: int, subindex: int = 0, default: Number = 0) -> Number:
+        """The live value; `default` where the node has no such object."""
+        entry = self._data.dictionary.entry(index, subindex)
+        return default if entry is None else codec.decode(entry.data_type, self._data.get(index, subindex))
+
+    def whole(self, index: int, subindex: int = 0, default: int = 0) -> int:
+        """The live value of an integer object."""
+        return int(self.number(index, subindex, default))
+
+    def factory(self, index: int, subindex: int = 0, default: Number = 0) -> Number:
+        """The value that the device left the factory with."""
+        entry = self._data.dictionary.entry(index, subindex)
+        return default if entry is None else codec.decode(entry.data_type, self._data.factory(index, subindex))
+
+    def channels(self, index: int) -> list[int]:
+        """The subindices of an array above 0."""
+        found = self._data.dictionary.objects.get(index)
+        return sorted(sub for sub in found.entries if sub) if found else []
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What a model is told. `written` are the objects that SDO clients or RPDOs wrote just now, changed or not; `errors` the
+    EMCY codes that are present in the node, whoever raised them."""
+
+    now_ns: int
+    objects: Objects
+    played: Mapping[Key, Number] = field(default_factory=dict)
+    written: Collection[Key] = ()
+    errors: tuple[int, ...] = ()
+    nmt: NmtState = NmtState.PRE_OPERATIONAL
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What a model answers. Objects that the node does not have are left out, numbers are rounded and held within their type.
+
+    A change of one of `states` is an event for the TPDOs that map it; `readings` change all the time and are none.
+    `clears` are EMCY codes whose errors are over. `wake_at_ns` is when to be asked next, None for not by itself.
+    """
+
+    states: Mapping[Key, Number] = field(default_factory=dict)
+    readings: Mapping[Key, Number] = field(default_factory=dict)
+    clears: tuple[int, ...] = ()
+    wake_at_ns: int | None = None
+
+
+class DeviceModel(ABC):
+    """A device behind its objects. Pure: whatever it needs is in the `Situation`."""
+
+    @abstractmethod
+    def power_on(self, situation: Situation) -> None:
+        """The device starts: power-on, or NMT reset node. Objects have their power-on values."""
+
+    def refuse(self, key: Key, value: Number, objects: Objects) -> Abort | None:
+        """Whether an SDO client may write `value`: the abort code if not. Length and limits of the data sheet hold already."""
+        return None
+
+    @abstractmethod
+    def step(self, situation: Situation) -> Outcome:
+        """Bring the device to the moment. Asked when it wished, after writes, and before each reading; time never goes back."""
+
+
+class Behaviour(Service):
+    """Runs a model inside a node. It is the node's source of values as well (see `service.Source`)."""
+
+    def __init__(self, model: DeviceModel, source: Source | None, data: NodeData) -> None:
+        self._model = model
+        self._source = source
+        self._data = data
+        self._objects = Objects(data)
+        self._wake_at_ns: int | None = None
+        self._seen: tuple[int, ...] = ()
+
+    def connect(self, core: Core, emergency: Emergency, changed: Callable[[Iterable[Key], int], None]) -> None:
+        """What the model's answers move. Once, before anything else."""
+        self._core = core
+        self._emergency = emergency
+        self._changed = changed
+
+    def __call__(self, now_ns: int) -> dict[Key, bytes]:
+        """The values of this moment, by the recording and by the model."""
+        return self._step(now_ns)
+
+    def power_on(self, now_ns: int) -> None:
+        """Reset node: what was stored or left the factory is in the objects again."""
+        self._model.power_on(replace(self._situation(now_ns, (), self._played(now_ns)), errors=()))
+
+    def written(self, keys: Collection[Key], now_ns: int) -> None:
+        """An RPDO wrote these objects."""
+        self._step(now_ns, keys)
+
+    def owns(self, index: int) -> bool:
+        return index >= 0x2000
+
+    def check_write(self, index: int, subindex: int, raw: bytes) -> None:
+        entry = self._data.dictionary.entry(index, subindex)
+        if entry is not None and codec.is_number(entry.data_type):
+            code = self._model.refuse((index, subindex), codec.decode(entry.data_type, raw), self._objects)
+            if code is not None:
+                raise abort(index, subindex, code)
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        self._step(now_ns, ((index, subindex),))
+
+    def reset(self, now_ns: int) -> None:
+        self._step(now_ns)
+
+    def state_changed(self, now_ns: int) -> None:
+        self._step(now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        due = self._wake_at_ns is not None and now_ns >= self._wake_at_ns
+        if due or self._emergency.active != self._seen:
+            self._step(now_ns)
+
+    def wake_at_ns(self) -> int | None:
+        return self._wake_at_ns
+
+    # -- inside ---------------------------------------------------------------------------------------------------------
+
+    def _step(self, now_ns: int, written: Collection[Key] = ()) -> dict[Key, bytes]:
+        played = self._played(now_ns)
+        outcome = self._model.step(self._situation(now_ns, written, played))
+        self._wake_at_ns = outcome.wake_at_ns
+        for code in outcome.clears:
+            self._emergency.clear_error(code, now_ns)
+        self._seen = self._emergency.active
+        values = dict(played)
+        quiet = self._encoded(outcome.readings)
+        told = self._encoded(outcome.states)
+        events = [key for key, raw in told.items() if self._data.put(*key, raw)]
+        for key in events:
+            self._core.note(now_ns, "set", *key, told[key])
+        if events:
+            self._changed(events, now_ns)
+        return values | quiet | told
+
+    def _situation(self, now_ns: int, written: Collection[Key], played: Mapping[Key, bytes]) -> Situation:
+        numbers = {key: codec.decode(self._type(key), raw) for key, raw in played.items() if self._is_number(key)}
+        return Situation(now_ns, self._objects, numbers, written, self._emergency.active, self._core.state)
+
+    def _played(self, now_ns: int) -> dict[Key, bytes]:
+        return {} if self._source is None else self._source(now_ns)
+
+    def _is_number(self, key: Key) -> bool:
+        entry = self._data.dictionary.entry(*key)
+        return entry is not None and codec.is_number(entry.data_type)
+
+    def _type(self, key: Key) -> int:
+        entry = self._data.dictionary.entry(*key)
+        assert entry is not None  # asked for what `_is_number` found
+        return entry.data_type
+
+    def _encoded(self, numbers: Mapping[Key, Number]) -> dict[Key, bytes]:
+        out: dict[Key, bytes] = {}
+        for key, number in numbers.items():
+            entry = self._data.dictionary.entry(*key)
+            if entry is not None:
+                out[key] = codec.encode(entry.data_type, _held(entry, number))
+        return out
+
+
+def _held(entry: Entry, number: Number) -> Number:
+    """The number within its type; a device's registers saturate. What is no number is 0 in an integer."""
+    bounds = codec.integer_range(entry.data_type)
+    if bounds is None:
+        return number
+    if isinstance(number, float) and not math.isfinite(number):
+        return 0 if math.isnan(number) else bounds[number > 0]
+    return min(max(round(number), bounds[0]), bounds[1])

@@ -17,9 +17,10 @@ from gateway.core.errors import UsageError
 from gateway.core.profile import DeviceProfile, Tag, load_profile
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
+from twin.canopen_keys import canopen_bus, canopen_node
 from twin.data_files import find
 from twin.serving import Serving, resolve_serving
-from twin.system_schema import DeviceForm, PlcForm, SystemForm
+from twin.system_schema import BusForm, DeviceForm, PlcForm, SystemForm
 
 SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
 """What the gateway can talk over so far."""
@@ -49,7 +50,7 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
     path = find("systems", name, extra=profiles)
     file = load(path)
     form = validate(file, SystemForm)
-    buses = {n: _bus(file, n, b.url, b.timeout_ms, b.retries, b.bitrate) for n, b in form.buses.items()}
+    buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
     devices = {n: _device(file, n, d, buses, path, profiles) for n, d in form.devices.items()}
     _check_addresses(file, devices)
     system = System(
@@ -71,16 +72,17 @@ def _outputs(plc: PlcForm) -> list[str]:
     return [tag for program in plc.programs.values() for tag in program.outputs.values()]
 
 
-def _bus(file: YamlFile, name: str, url: str, timeout_ms: int, retries: int, bitrate: int) -> BusConfig:
+def _bus(file: YamlFile, name: str, form: BusForm) -> BusConfig:
     try:
-        endpoint = Endpoint.parse(url)
+        endpoint = Endpoint.parse(form.url)
         if endpoint.scheme == "pty":
             raise UsageError("a pty is made by an emulator", expected="the plant's endpoint, such as rtu:/dev/ttyS0")
         if endpoint.scheme not in SCHEMES:
             raise UsageError(f"this version does not speak {endpoint.scheme}", expected=", ".join(SCHEMES))
     except UsageError as e:
         raise file.error(("buses", name, "url"), e.message, expected=e.expected, got=e.got) from e
-    return BusConfig(name, endpoint, timeout_ms / 1000, retries, bitrate)
+    canopen = canopen_bus(file, name, form, is_can=endpoint.is_can)
+    return BusConfig(name, endpoint, form.timeout_ms / 1000, form.retries, form.bitrate, canopen=canopen)
 
 
 def _device(
@@ -116,6 +118,7 @@ def _device(
         heartbeat=Heartbeat(d.heartbeat.producer_ms, d.heartbeat.consumer_ms) if d.heartbeat else None,
         tpdo1=Tpdo(tuple(d.tpdo1.map), d.tpdo1.event_ms) if d.tpdo1 else None,
         start=d.start,
+        canopen=canopen_node(file, loc, d, path, profiles, is_can=is_can),
     )
     _check_device(file, loc, d, config)
     return config

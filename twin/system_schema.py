@@ -21,6 +21,13 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
+class SyncForm(Strict):
+    """The SYNC producer of a CANopen bus (CiA 301: 1006h and 1019h in us)."""
+
+    period_ms: Milliseconds
+    counter: int = Field(default=0, ge=0, le=240, description="highest value of the counter, 2 to 240; 0: no counter")
+
+
 class BusForm(Strict):
     """A bus or line and the endpoint at which the plant has it."""
 
@@ -28,6 +35,9 @@ class BusForm(Strict):
     timeout_ms: Milliseconds = 1000
     retries: int = Field(default=1, ge=0, le=10)
     bitrate: int = Field(default=125_000, ge=10_000, le=1_000_000, description="CAN only; checked, not set")
+    sync: SyncForm | None = None
+    time_ms: Milliseconds | None = Field(default=None, description="CANopen: how often TIME is sent")
+    short_sdo: bool = Field(default=False, description="CANopen: take SDO replies of fewer than 8 bytes")
 
 
 class PollForm(Strict):
@@ -50,6 +60,16 @@ class TpdoForm(Strict):
     event_ms: Milliseconds
 
 
+class IdentityForm(Strict):
+    """What a CANopen node has to hold in 1000h and 1018h (CiA 302: 1F84h to 1F88h in us)."""
+
+    device_type: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
+    vendor: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
+    product: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
+    revision: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
+    serial: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
+
+
 class DeviceForm(Strict):
     """A device of the system."""
 
@@ -64,6 +84,11 @@ class DeviceForm(Strict):
     safe: dict[Name, int | float] = {}
     heartbeat: HeartbeatForm | None = None
     tpdo1: TpdoForm | None = None
+    identity: IdentityForm | None = None
+    dcf: str | None = Field(default=None, description="CANopen: what the node shall hold, written unless it does")
+    store: bool = Field(default=False, description="CANopen: let the node keep its DCF over a restart")
+    lss: bool = Field(default=False, description="CANopen: give the node id over LSS to the one with this identity")
+    tpdos: Literal["node", "dcf"] | None = Field(default=None, description="CANopen: where TPDO mappings are from")
     start: bool = False
 
 

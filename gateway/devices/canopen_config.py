@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
 from gateway.protocols.canopen.configure import TpdoConfig
@@ -30,7 +30,7 @@ class CanopenNodeConfig:
     its DCF has them; None where `adopt_tpdos` says to read them from the node, or where nothing is said.
     """
 
-    identity: ExpectedIdentity = ExpectedIdentity()
+    identity: ExpectedIdentity = field(default_factory=ExpectedIdentity)
     dcf: str = ""
     configuration: Configuration | None = None
     lss: LssAddress | None = None

@@ -1,10 +1,13 @@
 """The driver of a CANopen node: identity, configuration over SDO, values from TPDO1, state from the heartbeat.
 
 The node's values are good while its TPDOs come and it is OPERATIONAL; a lost heartbeat makes them bad at once. Without
-leave to write, nothing is configured and nothing is started: the mapping is read from the node and listened to.
+leave to write, nothing is configured and nothing is started: the mapping is read from the node and listened to. Nothing
+at all is written to a node that is another than the one expected.
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 from gateway.core.clock import Clock
 from gateway.core.connection import PROTOCOL, CanConnection
@@ -14,9 +17,10 @@ from gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
 from gateway.devices.codec import decode_little, encode, reorder
 from gateway.devices.config import DeviceConfig
 from gateway.devices.driver import DeviceDriver, TagSink
+from gateway.protocols.canopen.boot import download_configuration, holds_configuration, identity_differences
 from gateway.protocols.canopen.cob_id import TPDO_BASES
-from gateway.protocols.canopen.configure import configure_tpdo, read_tpdo, set_heartbeat_producer
-from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.canopen.configure import configure_tpdo, read_tpdo, read_tpdos, set_heartbeat_producer
+from gateway.protocols.canopen.master import CanopenMaster, PdoCallback
 from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
 from gateway.protocols.canopen.pdo import PdoLengthMismatch, PdoMapping
 
@@ -46,8 +50,8 @@ class CanopenDriver(DeviceDriver):
         self.malformed_pdos = 0
         self._master: CanopenMaster | None = None
         self._by_object = {t.object: t for t in self.profile.tags.values()}
-        self._mapping: PdoMapping | None = None
-        self._cob_id = 0
+        self._mappings: dict[int, PdoMapping] = {}
+        self._listening: dict[int, PdoCallback] = {}
 
     @property
     def message_tag(self) -> str | None:
@@ -63,21 +67,28 @@ class CanopenDriver(DeviceDriver):
 
     @property
     def pdo_tags(self) -> list[str]:
-        """The full names of the tags that TPDO1 brings."""
-        return [f"{self.config.name}.{t}" for t in (self.config.tpdo1.tags if self.config.tpdo1 else ())]
+        """The full names of the tags that TPDOs bring."""
+        names = list(self.config.tpdo1.tags) if self.config.tpdo1 else []
+        mapped = [(e.index, e.subindex) for mapping in self._mappings.values() for e in mapping.entries]
+        names += [self._by_object[o].name for o in mapped if o in self._by_object]
+        return [f"{self.config.name}.{name}" for name in dict.fromkeys(names)]
 
     def attach_master(self, connection: CanConnection, master: CanopenMaster) -> None:
         """Use `master`, which talks over `connection`, from now on."""
         self.attach(connection)
         self._master = master
-        self._mapping, self._cob_id = None, 0
+        self._mappings, self._listening = {}, {}
         consumer_ms = self.config.heartbeat.consumer_ms if self.config.heartbeat else 0
         master.add_node(self.node, heartbeat_consumer_ms=consumer_ms)
 
     # -- bringing the node up (CiA 302-2, boot slave) ---------------------------------------------------------------
 
     async def identify(self) -> None:
-        """Read what `expect` names over SDO; raises `WrongDevice` on a difference."""
+        """Read what the system file says of the node's identity over SDO; raises `WrongDevice` on a difference."""
+        differences = await identity_differences(self.master, self.node, self.config.canopen.identity)
+        if differences:
+            self.identity_error = ", ".join(f"{name}: {difference}" for name, difference in differences.items())
+            raise WrongDevice("another node answers", got=self.identity_error, where=self.config.where)
         wrong: dict[str, object] = {}
         for name, expected in self.config.expect.items():
             tag = self.profile.tags[name]
@@ -102,7 +113,13 @@ class CanopenDriver(DeviceDriver):
                     self.sink.put_bad([f"{self.config.name}.{tag.name}"], Reason.REFUSED)
 
     async def configure(self) -> None:
-        """Set heartbeat and TPDO1 as the system file says. These are writes: the caller has leave to write."""
+        """Write the DCF, unless the node holds it, then heartbeat and TPDO1 as the system file says, and listen.
+
+        These are writes: the caller has leave to write.
+        """
+        if self.config.canopen.configuration is not None:
+            await self._stay_unconfigured()
+            await download_configuration(self.master, self.node, self.config.canopen.configuration)
         if self.config.heartbeat is not None:
             await set_heartbeat_producer(self.master, self.node, self.config.heartbeat.producer_ms)
         if self.config.tpdo1 is not None:
@@ -111,20 +128,40 @@ class CanopenDriver(DeviceDriver):
             mapping = await configure_tpdo(
                 self.master, self.node, 1, objects, cob_id, event_ms=self.config.tpdo1.event_ms
             )
-            self._listen(cob_id, mapping)
+            self._listen({cob_id: mapping} | await self._other_tpdos())
+        else:
+            await self.adopt()
 
     async def adopt(self) -> None:
-        """Take TPDO1 as the node has it, and listen. Reads only."""
+        """Take the TPDOs as the node or its DCF has them, and listen. Reads only."""
+        mappings = await self._other_tpdos()
         if self.config.tpdo1 is not None:
             held = await read_tpdo(self.master, self.node, 1)
-            if held.enabled:
-                self._listen(held.cob_id, held.mapping)
+            mappings |= {held.cob_id: held.mapping} if held.enabled else {}
+        self._listen(mappings)
 
-    def _listen(self, cob_id: int, mapping: PdoMapping) -> None:
-        if self._cob_id:
-            self.master.unsubscribe_pdo(self._cob_id, self._on_pdo)
-        self._cob_id, self._mapping = cob_id, mapping
-        self.master.subscribe_pdo(cob_id, self._on_pdo)
+    async def _stay_unconfigured(self) -> None:
+        """A node that runs is brought to PRE-OPERATIONAL before its configuration changes under it."""
+        configuration = self.config.canopen.configuration
+        running = self.master.node_state(self.node) is NmtState.OPERATIONAL
+        if running and configuration and not await holds_configuration(self.master, self.node, configuration.date):
+            await self.master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self.node)
+
+    async def _other_tpdos(self) -> dict[int, PdoMapping]:
+        """COB-IDs and mappings besides what `tpdo1` says of TPDO1: from the DCF, or read from the node."""
+        boot, first = self.config.canopen, 2 if self.config.tpdo1 else 1
+        held = boot.tpdos or ()
+        if boot.adopt_tpdos:
+            held = await read_tpdos(self.master, self.node)
+        return {t.cob_id: t.mapping for t in held if t.enabled and t.number >= first and t.mapping.entries}
+
+    def _listen(self, mappings: dict[int, PdoMapping]) -> None:
+        for cob_id, callback in self._listening.items():
+            self.master.unsubscribe_pdo(cob_id, callback)
+        self._mappings = mappings
+        self._listening = {cob_id: partial(self._on_pdo, mapping) for cob_id, mapping in mappings.items()}
+        for cob_id, callback in self._listening.items():
+            self.master.subscribe_pdo(cob_id, callback)
 
     def _entry(self, tag: Tag) -> tuple[int, int, int]:
         assert tag.object is not None
@@ -132,17 +169,17 @@ class CanopenDriver(DeviceDriver):
 
     # -- what the node sends --------------------------------------------------------------------------------------------
 
-    def _on_pdo(self, data: bytes, t_ns: int) -> None:
-        if self._mapping is None or self.identity_error:
+    def _on_pdo(self, mapping: PdoMapping, data: bytes, t_ns: int) -> None:
+        if self.identity_error:
             return
         if self.master.node_state(self.node) not in (NmtState.OPERATIONAL, None):
             return  # a TPDO that overtook its node's last heartbeat: the state decides
         try:
-            values = self._mapping.unpack(data)
+            values = mapping.unpack(data)
         except PdoLengthMismatch:
             self.malformed_pdos += 1
             return
-        for entry, raw in zip(self._mapping.entries, values, strict=True):
+        for entry, raw in zip(mapping.entries, values, strict=True):
             tag = self._by_object.get((entry.index, entry.subindex))
             if tag is not None and BITS.get(tag.type) == entry.bits:
                 self.sink.put(f"{self.config.name}.{tag.name}", decode_little(tag, raw, t_ns))
@@ -174,6 +211,10 @@ class CanopenDriver(DeviceDriver):
         if not isinstance(item, COMMAND):
             raise Bug("a node takes commands only", got=type(item).__name__, where=self.config.where)
         self.check(item)
+        if self.identity_error:
+            raise NotAllowed("another node answers: nothing is written to it", got=self.identity_error).at(
+                self.config.where
+            )
         if item.name in NMT_COMMANDS:
             await self.master.nmt(NMT_COMMANDS[item.name], self.node)
             return

@@ -1,7 +1,8 @@
 """One CAN bus: its connection, the CANopen master on it, and the bringing up of its nodes.
 
 Every node is brought up on its own and again whenever it restarts or was lost: identity, configuration, start, in the order of
-CiA 302-2. Configuring and starting are writes: on a plant that was not allowed, the nodes are listened to and nothing more.
+CiA 302-2; a node id that nobody has is given over LSS where the system file says to whom. Configuring, starting, SYNC, TIME and
+LSS are writes: on a plant that was not allowed, the nodes are listened to and nothing more.
 """
 
 from __future__ import annotations
@@ -13,13 +14,19 @@ from dataclasses import asdict, dataclass, field
 
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Connector
-from gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
+from gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.values import COMMAND, Reason
 from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.config import BusConfig
+from gateway.protocols.canopen.cob_id import LSS_REPLY
+from gateway.protocols.canopen.emcy import parse_emcy
+from gateway.protocols.canopen.emcy_log import EmcyLog
+from gateway.protocols.canopen.lss import LssAddress
+from gateway.protocols.canopen.lss_master import LssMaster
 from gateway.protocols.canopen.master import CanopenMaster
 from gateway.protocols.canopen.nmt import NodeEvent
+from gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.modbus_bus import reason_of
@@ -34,10 +41,14 @@ class NodeStatus:
     online: bool = False
     error: str = "not asked yet"
     boots: int = 0
-    emcys: int = 0
+    emcy_log: EmcyLog = field(default_factory=EmcyLog)
     bring_ups: int = 0
     wanted: asyncio.Event = field(default_factory=asyncio.Event)
     backoff: Backoff = field(default_factory=lambda: Backoff(0.25, 10.0))
+
+    @property
+    def emcys(self) -> int:
+        return self.emcy_log.total
 
 
 class CanopenBus:
@@ -58,12 +69,15 @@ class CanopenBus:
         self.connected = False
         self.opens = 0
         self.error = ""
+        self.not_produced = 0
+        """SYNC and TIME messages that found no room on the bus within their time, or were overslept."""
         self._connector = connector
         self._clock = clock
         self._tags = tags
         self._audit = audit
         self._allow_writes = allow_writes
         self._master: CanopenMaster | None = None
+        self._lss: LssMaster | None = None
         self._past: Counter[str] = Counter()
 
     def totals(self) -> Counter[str]:
@@ -81,9 +95,15 @@ class CanopenBus:
                 await self._pause(backoff.next_s())
                 continue
             master = CanopenMaster(
-                connection, self._clock, sdo_timeout_s=self.config.timeout_s, on_event=self._on_event
+                connection,
+                self._clock,
+                sdo_timeout_s=self.config.timeout_s,
+                sdo_retries=self.config.retries,
+                short_sdo=self.config.canopen.short_sdo,
+                on_event=self._on_event,
             )
-            self._master = master
+            self._master, self._lss = master, LssMaster(master.send, self._clock)
+            master.listen(LSS_REPLY, self._lss.on_reply)
             self.connected, self.error = True, ""
             self.opens += 1
             try:
@@ -93,6 +113,8 @@ class CanopenBus:
                         status.driver.attach_master(connection, master)
                         status.wanted.set()
                         nursery.start(self._keep_up(status), f"{status.driver.config.name} bring-up")
+                    for producer in self._producers():
+                        nursery.start(self._produce(producer, master), f"{self.config.name} {producer.name}")
                     backoff.reset()
                     await nursery.wait()
             except ConnectionLost as e:
@@ -100,9 +122,33 @@ class CanopenBus:
                 await self._pause(backoff.next_s())
             finally:
                 self._past.update(asdict(master.counters))
-                self._master = None
+                self._master = self._lss = None
                 self.connected = False
                 await connection.aclose()
+
+    def _producers(self) -> list[Producer]:
+        """SYNC and TIME, where the system file wants them and writing is allowed."""
+        wanted, now_ns = self.config.canopen, self._clock.monotonic_ns()
+        made: list[Producer] = []
+        if wanted.sync_ms and self._allow_writes:
+            made.append(SyncProducer(wanted.sync_ms * 1000, now_ns, overflow=wanted.sync_counter))
+        if wanted.time_ms and self._allow_writes:
+            made.append(TimeProducer(wanted.time_ms, now_ns))
+        return made
+
+    async def _produce(self, producer: Producer, master: CanopenMaster) -> None:
+        """Send what is due when it is due. What the bus does not take within a period is given up, and counted."""
+        while True:
+            await self._clock.sleep_until_ns(producer.next_ns)
+            missed = producer.missed
+            frame = producer.due(self._clock.monotonic_ns(), self._clock.utc_ns())
+            self.not_produced += producer.missed - missed
+            if frame is not None:
+                try:
+                    async with asyncio.timeout(producer.period_ns / NS_PER_S):
+                        await master.send(frame)
+                except TimeoutError:
+                    self.not_produced += 1
 
     async def _pause(self, seconds: float) -> None:
         await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(seconds * NS_PER_S))
@@ -120,17 +166,43 @@ class CanopenBus:
             status.wanted.clear()
             try:
                 await self._bring_up(status.driver)
+            except ReplyTimeout as e:
+                self._failed(status, await self._assign(status.driver, e))
+                await self._pause(status.backoff.next_s())
             except ConnectionLost:
                 raise
             except FieldtwinError as e:
-                status.online, status.error = False, str(e)
-                self._tags.put_bad(status.driver.tag_names, reason_of(e))
-                status.wanted.set()
+                self._failed(status, e)
                 await self._pause(status.backoff.next_s())
             else:
                 status.online, status.error = True, ""
                 status.bring_ups += 1
                 status.backoff.reset()
+
+    def _failed(self, status: NodeStatus, error: FieldtwinError) -> None:
+        status.online, status.error = False, str(error)
+        self._tags.put_bad(status.driver.tag_names, reason_of(error))
+        status.wanted.set()
+
+    async def _assign(self, driver: CanopenDriver, error: FieldtwinError) -> FieldtwinError:
+        """Nobody has the node's id: give it to the one that shall have it. What went wrong, or `error` where nothing did."""
+        address = driver.config.canopen.lss
+        if address is None or self._lss is None or not self._allow_writes:
+            return error
+        try:
+            if not await self._lss.any_unconfigured():
+                return error
+            self._note_lss(driver, address)
+            await self._lss.assign(address, driver.node)
+        except ConnectionLost:
+            raise
+        except FieldtwinError as e:
+            return e.at(f"{driver.config.where}, LSS")
+        return error
+
+    def _note_lss(self, driver: CanopenDriver, address: LssAddress) -> None:
+        what = f"node id {driver.node} for {address}"
+        self._audit.note("lss", driver.config.name, by="start-up", result="asked", what=what)
 
     async def _bring_up(self, driver: CanopenDriver) -> None:
         await driver.identify()
@@ -139,7 +211,9 @@ class CanopenBus:
             await driver.adopt()
             return
         name = driver.config.name
-        self._audit.note("sdo", name, by="start-up", result="asked", what="heartbeat and TPDO1 as in the system file")
+        dcf = f"{driver.config.canopen.dcf} unless it holds that, " if driver.config.canopen.configuration else ""
+        what = f"{dcf}heartbeat and TPDO1 as in the system file"
+        self._audit.note("sdo", name, by="start-up", result="asked", what=what)
         await driver.configure()
         if driver.config.start:
             self._audit.note("nmt", name, by="start-up", result="asked", what="start")
@@ -153,6 +227,7 @@ class CanopenBus:
         status.driver.on_event(event)
         if event.kind == "boot-up":
             status.boots += 1
+            status.emcy_log.restarted()
             status.online, status.error = False, "the node restarted"
             status.wanted.set()
         elif event.kind == "heartbeat-lost":
@@ -161,7 +236,7 @@ class CanopenBus:
         elif event.kind == "conflict":
             status.error = "two nodes answer under this node id"
         elif event.kind == "emcy":
-            status.emcys += 1
+            status.emcy_log.add(parse_emcy(event.data), event.t_ns)
 
     async def stop_nodes(self, timeout_s: float) -> None:
         """On the way out: nodes that we started go back to PRE-OPERATIONAL, where they send no process data."""

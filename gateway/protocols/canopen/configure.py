@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gateway.core.errors import UsageError, VerifyFailed
+from gateway.core.errors import Desync, FileInvalid, SdoAborted, UsageError, VerifyFailed
 from gateway.protocols.canopen import cob_id as cob_ids
 from gateway.protocols.canopen.datatypes import DataType, decode, encode, size_of
+from gateway.protocols.canopen.dictionary import ObjectDictionary
 from gateway.protocols.canopen.master import CanopenMaster
 from gateway.protocols.canopen.pdo import MAX_ENTRIES, PdoMapping
 
@@ -100,6 +101,44 @@ async def read_tpdo(master: CanopenMaster, node: int, number: int) -> TpdoConfig
     return TpdoConfig(
         number, word & 0x7FF, not word & PDO_INVALID, kind, event, await _read_mapping(master, node, mapping)
     )
+
+
+async def read_tpdos(master: CanopenMaster, node: int, up_to: int = TPDO_MAX) -> tuple[TpdoConfig, ...]:
+    """Read TPDO 1, 2 and so on with their mappings, as far as the node has them without a gap."""
+    found: list[TpdoConfig] = []
+    while len(found) < up_to:
+        try:
+            found.append(await read_tpdo(master, node, len(found) + 1))
+        except SdoAborted:
+            break
+    return tuple(found)
+
+
+def tpdos_of(dictionary: ObjectDictionary) -> tuple[TpdoConfig, ...]:
+    """The TPDOs as an EDS or DCF has them. Raises `FileInvalid` for a mapping that is none."""
+    found = []
+    for number in range(1, TPDO_MAX + 1):
+        communication, mapping = _records(number)
+        word = _number_in(dictionary, communication, 1)
+        if word is None:
+            continue
+        count = _number_in(dictionary, mapping, 0) or 0
+        words = [_number_in(dictionary, mapping, sub) or 0 for sub in range(1, min(count, MAX_ENTRIES) + 1)]
+        try:
+            mapped = PdoMapping.from_words(words)
+        except Desync as e:
+            where = f"[{mapping:04X}]: the mapping of TPDO {number}"
+            raise FileInvalid(where, path=dictionary.path, expected=e.expected, got=e.got) from e
+        kind = _number_in(dictionary, communication, 2)
+        event = _number_in(dictionary, communication, 5)
+        enabled = not word & PDO_INVALID
+        found.append(TpdoConfig(number, word & 0x7FF, enabled, 255 if kind is None else kind, event, mapped))
+    return tuple(found)
+
+
+def _number_in(dictionary: ObjectDictionary, index: int, subindex: int) -> int | None:
+    entry = dictionary.get(index, subindex)
+    return entry.default if entry is not None and isinstance(entry.default, int) else None
 
 
 async def configure_tpdo(

@@ -23,7 +23,10 @@ COUNTER_MAX = 240
 class Producer(Protocol):
     """Something that is due again and again."""
 
+    name: str
+    period_ns: int
     next_ns: int
+    missed: int
 
     def due(self, now_ns: int, utc_ns: int) -> CanFrame | None:
         """The frame to send at `now_ns`, None when it is too early."""
@@ -31,6 +34,8 @@ class Producer(Protocol):
 
 
 class _Periodic:
+    name = ""
+
     def __init__(self, period_ns: int, now_ns: int) -> None:
         if period_ns <= 0:
             raise UsageError("the period of a SYNC or TIME producer", expected="more than 0", got=f"{period_ns} ns")
@@ -55,6 +60,8 @@ class SyncProducer(_Periodic):
     The counter begins with 1 and goes by SYNCs that were sent.
     """
 
+    name = "SYNC"
+
     def __init__(self, period_us: int, now_ns: int, *, overflow: int = 0, can_id: int = cob_id.SYNC) -> None:
         super().__init__(period_us * NS_PER_US, now_ns)
         if overflow != 0 and not 2 <= overflow <= COUNTER_MAX:
@@ -74,6 +81,8 @@ class SyncProducer(_Periodic):
 
 class TimeProducer(_Periodic):
     """TIME each `period_ms`, the time of day in UTC."""
+
+    name = "TIME"
 
     def __init__(self, period_ms: int, now_ns: int, *, can_id: int = cob_id.TIME) -> None:
         super().__init__(period_ms * NS_PER_MS, now_ns)

@@ -1,0 +1,90 @@
+"""The CANopen keys of a system file, resolved: what a bus's master produces, and how each node is booted.
+
+A DCF is read here, so that what is wrong with it is told, with file, section and key, before anything is opened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from gateway.core.errors import UsageError
+from gateway.core.yaml_file import Key, YamlFile
+from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
+from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
+from gateway.protocols.canopen.concise_dcf import configuration_date, settings_of
+from gateway.protocols.canopen.configure import TpdoConfig, tpdos_of
+from gateway.protocols.canopen.dictionary import load_dictionary
+from gateway.protocols.canopen.lss import LssAddress
+from twin.data_files import find
+from twin.system_schema import BusForm, DeviceForm, IdentityForm
+
+CANOPEN_BUS_KEYS = ("sync", "time_ms", "short_sdo")
+CANOPEN_KEYS = ("identity", "dcf", "store", "lss", "tpdos")
+
+
+def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> CanopenBusConfig:
+    """What the master of a bus does besides; refused on another bus than CAN."""
+    if not is_can:
+        _refuse(file, ("buses", name), form.model_fields_set.intersection(CANOPEN_BUS_KEYS), "a CAN bus")
+    counter = form.sync.counter if form.sync else 0
+    if counter == 1:
+        raise file.error(("buses", name, "sync", "counter"), "a SYNC counter", expected="0, or 2 to 240", got="1")
+    return CanopenBusConfig(
+        sync_ms=form.sync.period_ms if form.sync else 0,
+        sync_counter=counter,
+        time_ms=form.time_ms or 0,
+        short_sdo=form.short_sdo,
+    )
+
+
+def canopen_node(
+    file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, path: Path, profiles: Iterable[Path], *, is_can: bool
+) -> CanopenNodeConfig:
+    """How a node is booted; refused for another device than a CANopen node."""
+    if not is_can:
+        _refuse(file, loc, form.model_fields_set.intersection(CANOPEN_KEYS), "a CANopen node")
+        return CanopenNodeConfig()
+    configuration, tpdos = _configuration(file, loc, form, path, profiles)
+    return CanopenNodeConfig(
+        identity=ExpectedIdentity(**form.identity.model_dump()) if form.identity else ExpectedIdentity(),
+        dcf=Path(form.dcf).name if form.dcf else "",
+        configuration=configuration,
+        lss=_address(file, loc, form.identity) if form.lss else None,
+        tpdos=tpdos,
+        adopt_tpdos=form.tpdos == "node",
+    )
+
+
+def _configuration(
+    file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, path: Path, profiles: Iterable[Path]
+) -> tuple[Configuration | None, tuple[TpdoConfig, ...] | None]:
+    if form.dcf is None:
+        for key in ("store", "tpdos"):
+            if getattr(form, key) in (True, "dcf"):
+                raise file.error((*loc, key), f"`{key}` says what to do with a DCF", expected="`dcf`, a DCF file")
+        return None, None
+    try:
+        dcf = find("devices", form.dcf, beside=path, extra=profiles)
+    except UsageError as e:
+        raise file.error((*loc, "dcf"), "no such file", expected="a DCF", got=form.dcf) from e
+    dictionary = load_dictionary(dcf, form.node)
+    settings = settings_of(dictionary)
+    if not settings:
+        raise file.error((*loc, "dcf"), "this DCF sets nothing", expected="objects with ParameterValue", got=str(dcf))
+    configuration = Configuration(settings, configuration_date(dictionary), form.store)
+    return configuration, tpdos_of(dictionary) if form.tpdos == "dcf" else None
+
+
+def _address(file: YamlFile, loc: tuple[Key, ...], identity: IdentityForm | None) -> LssAddress:
+    parts = [getattr(identity, name, None) for name in ("vendor", "product", "revision", "serial")]
+    if any(part is None for part in parts):
+        raise file.error(
+            (*loc, "lss"), "LSS tells nodes apart by four numbers", expected="`identity` with vendor to serial"
+        )
+    return LssAddress(*[int(part) for part in parts if part is not None])
+
+
+def _refuse(file: YamlFile, loc: tuple[Key, ...], keys: set[str], expected: str) -> None:
+    for key in sorted(keys):
+        raise file.error((*loc, key), f"`{key}` is for CANopen", expected=expected)

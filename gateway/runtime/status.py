@@ -12,7 +12,7 @@ from gateway.runtime.gateway import Gateway
 def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
     """Devices, buses, tags with quality and age, outputs, mailboxes and the PLC as the gateway sees it."""
     return {
-        "devices": _devices(gateway),
+        "devices": _devices(gateway, now_ns),
         "buses": {name: _bus(bus) for name, bus in gateway.buses.items()},
         "tags": {name: gateway.tags.current(name, now_ns).describe(now_ns) for name in gateway.tags.names},
         "outputs": [
@@ -53,7 +53,7 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
     }
 
 
-def _devices(gateway: Gateway) -> dict[str, Any]:
+def _devices(gateway: Gateway, now_ns: int) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for bus in gateway.buses.values():
         if isinstance(bus, CanopenBus):
@@ -68,6 +68,8 @@ def _devices(gateway: Gateway) -> dict[str, Any]:
                     "boots": status.boots,
                     "bring_ups": status.bring_ups,
                     "emcys": status.emcys,
+                    "emcy": [f"{code:04X}h" for code in status.emcy_log.active],
+                    "emcy_log": status.emcy_log.describe(now_ns),
                     "errors": driver.malformed_pdos,
                 }
         else:

@@ -10,13 +10,15 @@ import importlib
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from gateway.core.errors import FileInvalid
+from gateway.core.errors import FieldtwinError, FileInvalid
 from gateway.core.image import ImageLayout, TagKind, TagSpec, process_image
 from gateway.core.values import Scalar
 from plc.program import Program, Role, Variable
 
-_SOURCE = "python: module:Class"
+_SOURCES = "python: module:Class, or FILE.st, or FILE.xml, each with :PROGRAM behind it where it has several"
+_ST_SUFFIXES = (".st", ".xml")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +55,28 @@ class BoundProgram:
 
 
 def load_program(source: str, python_path: Sequence[str] = ()) -> Program:
-    """Make the program that ``python: module:Class`` names, searching `python_path` first. Raises `FileInvalid`."""
+    """Make the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
+
+    ``python: module:Class``, or a file of Structured Text (``relay.st``) or a PLCopen export (``plant.xml``), followed by
+    ``:NAME`` where it holds several programs.
+    """
     language, _, rest = source.partition(":")
+    if language.strip() == "python":
+        made = _python_class(source, rest, python_path)
+    else:
+        made = _text_class(source, python_path)
+    try:
+        return made()
+    except FieldtwinError:
+        raise
+    except Exception as e:  # its constructor is the user's: it can raise anything; translated here, once
+        raise FileInvalid(f"program {source!r} cannot be made: {type(e).__name__}: {e}") from e
+
+
+def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Program]:
     module_name, _, class_name = rest.strip().partition(":")
-    if language.strip() != "python" or not module_name or not class_name:
-        raise FileInvalid("not the source of a program", expected=_SOURCE, got=source)
+    if not module_name or not class_name:
+        raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
     for folder in reversed(python_path):
         if folder not in sys.path:
             sys.path.insert(0, folder)
@@ -69,10 +88,17 @@ def load_program(source: str, python_path: Sequence[str] = ()) -> Program:
         raise FileInvalid(
             "not a program", expected=f"a class {class_name} derived from plc.program.Program", got=source
         )
-    try:
-        return found()
-    except Exception as e:  # as above: its constructor is the user's
-        raise FileInvalid(f"program {source!r} cannot be made: {type(e).__name__}: {e}") from e
+    return found
+
+
+def _text_class(source: str, folders: Sequence[str]) -> type[Program]:
+    name, _, program = source.strip().partition(":")
+    if not name.lower().endswith(_ST_SUFFIXES):
+        raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
+    from plc.st.program import load_file  # the compiler is only loaded where there is something to compile
+
+    places = [Path(folder) / name for folder in folders if not Path(name).is_absolute()] + [Path(name)]
+    return load_file(next((p for p in places if p.exists()), places[0]), program.strip())
 
 
 def image_for(

@@ -140,6 +140,8 @@ class Program(ABC):
     """Base of all programs. A subclass declares variables in its body and overrides `execute`."""
 
     variables: ClassVar[dict[str, Variable]] = {}
+    source_path: ClassVar[str] = ""
+    """The file that the program was compiled from, where that is not its module's."""
     _lookup: Callable[[str], TagValue] | None = None
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

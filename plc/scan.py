@@ -242,7 +242,8 @@ def _find(shape: RegionShape, tag: str) -> tuple[TagSpec, int]:
 
 def _failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
     """Which program, which line: the innermost line of the program's own file, else the innermost of all."""
-    own = getattr(sys.modules.get(type(bound.program).__module__), "__file__", None)
+    made = type(bound.program)
+    own = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None)
     path, line, inside = "", 0, False
     tb = error.__traceback__
     while tb is not None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from math import prod
 
+from gateway.core.image_layout import MAX_DEPTH, MAX_MESSAGE_BYTES
 from plc.blocks import BLOCKS
+from plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from plc.st import tree as t
 from plc.st import types as ty
 from plc.st.expressions import Expressions
@@ -36,8 +38,6 @@ class Declarations:
     def type_of(self, spec: t.TypeSpec, role: str = "") -> ty.Type:
         """The type that is written; `role` is VAR_INPUT... where MESSAGES may stand."""
         if isinstance(spec, t.NamedType):
-            if spec.name.upper() == "MESSAGES" and role in ("VAR_INPUT", "VAR_OUTPUT"):
-                return ty.MessagesIn() if role == "VAR_INPUT" else ty.MessagesOut()
             return self.named(spec.name, spec.pos)
         if isinstance(spec, t.SubrangeType):
             return self._subrange(spec)
@@ -46,12 +46,33 @@ class Declarations:
             if not 1 <= length <= ty.MAX_STRING:
                 self.env.fail(spec.pos, "the length of a string", expected=f"1 to {ty.MAX_STRING}", got=str(length))
             return ty.String(length, spec.wide)
+        if isinstance(spec, t.MessagesType):
+            return self._messages(spec, role)
         ranges = tuple((self._constant(a, "an index"), self._constant(b, "an index")) for a, b in spec.ranges)
         if any(low > high for low, high in ranges):
             self.env.fail(spec.pos, "an empty range of indices")
         if prod(high - low + 1 for low, high in ranges) > ty.MAX_ELEMENTS:
             self.env.fail(spec.pos, "too large an array", expected=f"at most {ty.MAX_ELEMENTS} elements")
         return ty.Array(ranges, self.type_of(spec.of))
+
+    def _messages(self, spec: t.MessagesType, role: str) -> ty.Type:
+        if role == "VAR_INPUT" and spec.max_bytes is None:
+            return ty.MessagesIn()
+        if role != "VAR_OUTPUT":
+            self.env.fail(
+                spec.pos,
+                "MESSAGES stand here",
+                expected="MESSAGES as VAR_INPUT, MESSAGES[bytes, depth] as VAR_OUTPUT of a PROGRAM",
+            )
+        max_bytes = MESSAGE_BYTES if spec.max_bytes is None else self._constant(spec.max_bytes, "the longest message")
+        depth = MESSAGE_DEPTH if spec.depth is None else self._constant(spec.depth, "the depth")
+        if not (1 <= max_bytes <= MAX_MESSAGE_BYTES and 1 <= depth <= MAX_DEPTH):
+            self.env.fail(
+                spec.pos,
+                "MESSAGES of an impossible size",
+                expected=f"1 to {MAX_MESSAGE_BYTES} bytes, depth 1 to {MAX_DEPTH}",
+            )
+        return ty.MessagesOut(max_bytes, depth)
 
     def named(self, name: str, pos: t.Pos) -> ty.Type:
         key = name.lower()

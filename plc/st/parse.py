@@ -23,7 +23,7 @@ _READABLE = {
     "STRING_LITERAL": "a string", "WSTRING_LITERAL": "a string", "ENUM_REF": "a name", "VAR_KIND": "VAR", "SEMICOLON": ";",
     "COLON": ":", "COMMA": ",", "DOT": ".", "LPAR": "(", "RPAR": ")", "LSQB": "[", "RSQB": "]", "SIGN": "+ or -",
     "FACTOR": "* or /", "ORDER": "<", "EQUALITY": "=", "POWER": "**", "$END": "the end of the file", "DIRECT": "an address",
-    "STRING_TYPE": "STRING", "QUALIFIER": "RETAIN or CONSTANT",
+    "STRING_TYPE": "STRING", "MESSAGES": "MESSAGES", "QUALIFIER": "RETAIN or CONSTANT",
 }  # fmt: skip
 
 
@@ -158,6 +158,10 @@ class _Build(Transformer[Token, Any]):
     def string_type(self, meta: Meta, items: list[Any]) -> t.StringType:
         return t.StringType(_pos(meta), items[0].upper() == "WSTRING", items[1] if len(items) > 1 else None)
 
+    def messages_type(self, meta: Meta, items: list[Any]) -> t.MessagesType:
+        sizes = [*items[1:], None, None]
+        return t.MessagesType(_pos(meta), sizes[0], sizes[1])
+
     def array_type(self, meta: Meta, items: list[Any]) -> t.ArrayType:
         return t.ArrayType(_pos(meta), tuple(items[:-1]), items[-1])
 
@@ -283,7 +287,7 @@ class _Build(Transformer[Token, Any]):
 
 
 def _spec(items: list[Any]) -> t.TypeSpec:
-    return next(i for i in items if isinstance(i, t.NamedType | t.SubrangeType | t.StringType | t.ArrayType))
+    return next(i for i in items if isinstance(i, t.TypeSpec))
 
 
 def _initial(items: list[Any]) -> t.Init | None:

@@ -19,6 +19,7 @@ from plc.program import Program, Role, ScanInfo, Variable, message_input, messag
 from plc.st import types as ty
 from plc.st import values
 from plc.st.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
+from plc.st.plcopen import is_plcopen, to_st
 
 _ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
 
@@ -47,7 +48,6 @@ class StProgram(Program):
 
     unit: CompiledUnit
     declared: CompiledProgram
-    source_path: str
 
     def __init__(self) -> None:
         self.context = Context(lambda name: self.tag(name))
@@ -133,7 +133,7 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
         if isinstance(v.kind, ty.MessagesIn):
             body[v.name] = message_input()
         elif isinstance(v.kind, ty.MessagesOut):
-            body[v.name] = message_output()
+            body[v.name] = message_output(v.kind.max_bytes, v.kind.depth)
         elif kind is not None:
             if hasattr(StProgram, v.name) or v.name in _RESERVED:
                 raise FileInvalid(f"variable {v.name} of {found.name} needs another name", path=unit.path, got=v.name)
@@ -146,13 +146,15 @@ _RESERVED = frozenset({"context", "body", "declared", "unit", "source_path", "_i
 
 
 def load_file(path: Path, name: str = "") -> type[StProgram]:
-    """Read and compile a file. Raises `FileInvalid`."""
+    """Read and compile a file: Structured Text, or a PLCopen XML export. Raises `FileInvalid`."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as e:
         raise FileInvalid("not UTF-8 text", path=str(path), got=f"byte {e.start}: {e.object[e.start]:02x}h") from e
     except OSError as e:
         raise FileInvalid(f"cannot read: {e.strerror or e}", path=str(path)) from e
+    if is_plcopen(text):
+        text = to_st(text, str(path))
     return program_class(compile_text(text, str(path)), name)
 
 

@@ -38,13 +38,22 @@ class StringType:
 
 
 @dataclass(frozen=True, slots=True)
+class MessagesType:
+    """``MESSAGES[bytes, depth]``: the longest message and how many may be on their way."""
+
+    pos: Pos
+    max_bytes: Expr | None
+    depth: Expr | None
+
+
+@dataclass(frozen=True, slots=True)
 class ArrayType:
     pos: Pos
     ranges: tuple[tuple[Expr, Expr], ...]
     of: TypeSpec
 
 
-TypeSpec = NamedType | SubrangeType | StringType | ArrayType
+TypeSpec = NamedType | SubrangeType | StringType | MessagesType | ArrayType
 
 
 @dataclass(frozen=True, slots=True)

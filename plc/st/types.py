@@ -159,7 +159,10 @@ class MessagesIn:
 
 @dataclass(frozen=True, slots=True)
 class MessagesOut:
-    """A program's output of messages (VAR_OUTPUT name : MESSAGES)."""
+    """A program's output of messages (VAR_OUTPUT name : MESSAGES[max_bytes, depth])."""
+
+    max_bytes: int
+    depth: int
 
     def __str__(self) -> str:
         return "MESSAGES"

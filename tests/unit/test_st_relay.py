@@ -1,0 +1,46 @@
+"""The relay in Structured Text does what the one in Python does: the same trace on the same seeds."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from gateway.core.image import Message
+from plc.binding import load_program
+from plc.program import Outbox, ScanInfo
+from plc.relay import Relay
+
+SYSTEMS = Path(__file__).parents[2] / "profiles/systems"
+MAILBOXES = ("response", "log")
+
+
+def messages(rng: random.Random, odds: tuple[int, ...], longest: int) -> tuple[Message, ...]:
+    return tuple(Message(n + 1, 0, rng.randbytes(rng.randint(0, longest))) for n in range(rng.choice(odds)))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_same_seed_same_trace(seed: int) -> None:
+    python, text = Relay(), load_program("relay.st", [str(SYSTEMS)])
+    assert text.variables.keys() == python.variables.keys()
+    rng = random.Random(seed)
+    for number in range(1, 400):
+        commands = messages(rng, (0, 0, 0, 1, 2), 3) + ((Message(9, 0, b"\0\5"),) if rng.random() < 0.1 else ())
+        samples = messages(rng, (0, 0, 1, 5, 40), 256)
+        taken = {"response": rng.choice([0, 3, 16]), "log": rng.choice([0, 60, 64])}
+        for program in (python, text):
+            program.command, program.sample = commands, samples  # type: ignore[attr-defined]
+            for name in MAILBOXES:
+                box: Outbox = getattr(program, name)
+                box.outstanding, box.pending = taken[name], []
+            program.response.max_bytes = 200  # type: ignore[attr-defined]
+            program.execute(ScanInfo(number * 10_000_000, number, number == 1))
+        for name in python.variables:
+            ours, theirs = getattr(text, name), getattr(python, name)
+            if name in MAILBOXES:
+                ours, theirs = (ours.pending, ours.waits), (theirs.pending, theirs.waits)
+            assert ours == theirs, (number, name)
+    assert python.logged > 1000  # so that the log went round, and entries were lost
+    assert python.dropped > 100
+    assert python.bad_commands > 10

@@ -12,76 +12,34 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from emulators.canopen import codec
-from emulators.canopen.eds_text import Section, decode_file, parse_sections
+from emulators.canopen.compact_pdo import implied_pdos
+from emulators.canopen.eds_text import Note, Section, decode_file, parse_sections
+from emulators.canopen.entries import ARRAY as ARRAY
+from emulators.canopen.entries import DOMAIN_OBJECT as DOMAIN_OBJECT
+from emulators.canopen.entries import RECORD as RECORD
+from emulators.canopen.entries import VAR as VAR
+from emulators.canopen.entries import DictionaryObject as DictionaryObject
+from emulators.canopen.entries import Entry as Entry
+from emulators.canopen.entries import Key as Key
 from gateway.core.errors import FileInvalid
 
-Key = tuple[int, int]
-"""(index, subindex)."""
-
-VAR, ARRAY, RECORD, DOMAIN_OBJECT = 0x07, 0x08, 0x09, 0x02
 _DEFTYPE, _DEFSTRUCT = 0x05, 0x06
 _ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
 _OBJECT = re.compile(r"[0-9a-f]{1,4}")
 _SUBOBJECT = re.compile(r"([0-9a-f]{1,4})sub([0-9a-f]{1,2})")
+_BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
+_LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
+_NAMED = 4
+"""Objects of a kind that a note names."""
 _NODE_ID = re.compile(r"\$nodeid", re.IGNORECASE)
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One subindex. `default` is on-wire bytes; with `node_relative` the node id is added to it.
-
-    `size` is the value's length in bytes, None where every value has its own. `low` and `high` are inclusive.
-    """
-
-    index: int
-    subindex: int
-    name: str
-    data_type: int
-    access: str
-    mappable: bool
-    default: bytes
-    node_relative: bool = False
-    low: int | float | None = None
-    high: int | float | None = None
-
-    @property
-    def key(self) -> Key:
-        return self.index, self.subindex
-
-    @property
-    def size(self) -> int | None:
-        return codec.size_bytes(self.data_type)
-
-    @property
-    def readable(self) -> bool:
-        return self.access != "wo"
-
-    @property
-    def writable(self) -> bool:
-        return self.access in ("rw", "rwr", "rww", "wo")
-
-    def initial(self, node_id: int) -> bytes:
-        """The default value of a node with this id."""
-        if not self.node_relative:
-            return self.default
-        return codec.encode(self.data_type, int(codec.decode(self.data_type, self.default)) + node_id)
-
-
-@dataclass(frozen=True, slots=True)
-class DictionaryObject:
-    """One index: a VAR has subindex 0 only; an ARRAY or RECORD has the subindices that the data sheet lists."""
-
-    index: int
-    name: str
-    kind: int
-    entries: dict[int, Entry]
 
 
 @dataclass(frozen=True, slots=True)
 class Dictionary:
     """What a device is by its data sheet. Never changed after reading, so that many nodes share one.
 
-    `node_id` is what a DCF commissions, 0 for an EDS. `dummies` are the data types that an RPDO may map to nothing.
+    `node_id` and `bit_rate` (bit/s) are what a DCF commissions, 0 for an EDS. `dummies` are the data types that an RPDO may map
+    to nothing; `bit_rates` what the device can do, in bit/s, empty where the file does not say. `notes` is what was mended.
     """
 
     path: str
@@ -91,6 +49,10 @@ class Dictionary:
     node_id: int
     objects: dict[int, DictionaryObject]
     dummies: frozenset[int] = field(default_factory=frozenset)
+    bit_rate: int = 0
+    bit_rates: frozenset[int] = field(default_factory=frozenset)
+    lss: bool = False
+    notes: tuple[Note, ...] = ()
 
     def __contains__(self, index: object) -> bool:
         return index in self.objects
@@ -112,12 +74,14 @@ def load_eds(path: str | Path) -> Dictionary:
         raw = Path(path).read_bytes()
     except OSError as e:
         raise FileInvalid("the data sheet cannot be read", path=str(path), got=e.strerror or str(e)) from e
-    return parse_eds(decode_file(raw), str(path))
+    notes: list[Note] = []
+    return parse_eds(decode_file(raw, notes), str(path), notes)
 
 
-def parse_eds(text: str, path: str = "") -> Dictionary:
-    """The dictionary in the text of an EDS or DCF. `path` is for messages. Raises `FileInvalid`."""
-    sections = parse_sections(text, path)
+def parse_eds(text: str, path: str = "", notes: list[Note] | None = None) -> Dictionary:
+    """The dictionary in the text of an EDS or DCF. `path` is for messages, `notes` are known already. Raises `FileInvalid`."""
+    notes = [] if notes is None else notes
+    sections = parse_sections(text, path, notes)
     objects: dict[int, DictionaryObject] = {}
     for name, section in sections.items():
         # Short names such as [A0] describe data types, not objects that a client can reach.
@@ -128,33 +92,62 @@ def parse_eds(text: str, path: str = "") -> Dictionary:
     _read_subobjects(sections, objects)
     if not objects:
         raise FileInvalid("a data sheet without objects", path=path, expected="sections such as [1000]")
-    info = sections.get("deviceinfo", Section("DeviceInfo", 0, path))
-    _refuse_implied_pdos(info, objects)
-    commissioning = sections.get("devicecomissioning") or sections.get("devicecommissioning")
+    info = sections.get("deviceinfo", Section("DeviceInfo", 0, path, notes=notes))
+    objects.update(implied_pdos(info, objects))
+    _check_lists(sections, objects)
+    commissioning = _commissioning(sections)
     return Dictionary(
         path=path,
         product_name=info.text("ProductName"),
         vendor_name=info.text("VendorName"),
         vendor_number=info.number("VendorNumber", 0),
-        node_id=commissioning.number("NodeID", 0) if commissioning else 0,
+        node_id=_in_range(commissioning, "NodeID", 127) if commissioning else 0,
         objects=objects,
         dummies=_read_dummies(sections.get("dummyusage")),
+        bit_rate=_in_range(commissioning, "Baudrate", 1000) * 1000 if commissioning else 0,
+        bit_rates=frozenset(1000 * rate for rate in _BIT_RATES if info.number(f"BaudRate_{rate}", 0)),
+        lss=bool(info.number("LSS_Supported", 0)),
+        notes=tuple(sorted(notes, key=lambda note: note.line)),
     )
 
 
-def _refuse_implied_pdos(info: Section, objects: dict[int, DictionaryObject]) -> None:
-    """A file may describe PDOs by the CompactPDO mask alone; a node without its PDOs would be a silent half."""
-    if not info.number("CompactPDO", 0):
-        return
-    for key, first in (("NrOfRXPDO", 0x1400), ("NrOfTXPDO", 0x1800)):
-        listed = sum(first <= index < first + 0x200 for index in objects)
-        if listed < info.number(key, 0):
-            raise info.error(
-                "PDOs that are described by CompactPDO only",
-                "CompactPDO",
-                expected=f"{info.number(key, 0)} sections from [{first:X}] on",
-                got=str(listed),
-            )
+def _commissioning(sections: dict[str, Section]) -> Section | None:
+    """A DCF's section, which the standard spells with one m; tools write it both ways."""
+    correct = sections.get("devicecommissioning")
+    if correct is not None and "devicecomissioning" not in sections:
+        correct.note("[DeviceCommissioning] taken as [DeviceComissioning], as CiA 306 spells it")
+    return sections.get("devicecomissioning") or correct
+
+
+def _in_range(section: Section, key: str, most: int) -> int:
+    number = section.number(key, 0)
+    if not 0 <= number <= most:
+        raise section.error(f"{key} of [{section.name}]", key, expected=f"1 to {most}", got=str(number))
+    return number
+
+
+def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObject]) -> None:
+    """What the lists of objects and the counts of subindices say otherwise than the sections is noted; sections count."""
+    listed: set[int] = set()
+    for name in _LISTS:
+        section = sections.get(name)
+        for key in section.values if section else ():
+            if section is not None and key.isdigit():
+                index = section.number(key)
+                listed.add(index)
+                if index not in objects and f"{index:x}".zfill(4) not in sections:
+                    section.note(f"object {index:04X}h is listed in [{section.name}] and not described", key)
+    unlisted = [index for index in objects if listed and index not in listed and f"{index:04x}" in sections]
+    if unlisted:
+        names = ", ".join(f"{index:04X}h" for index in unlisted[:_NAMED]) + (", ..." if len(unlisted) > _NAMED else "")
+        sections[f"{unlisted[0]:04x}"].note(f"{len(unlisted)} objects are described and in no list: {names}")
+    for index, found in objects.items():
+        own = sections.get(f"{index:04x}")
+        if own is None:
+            continue
+        told = own.number("SubNumber", 0)
+        if told and not own.number("CompactSubObj", 0) and found.kind in (ARRAY, RECORD) and told != len(found.entries):
+            own.note(f"SubNumber of [{own.name}] is {told}, {len(found.entries)} are described", "SubNumber")
 
 
 def _read_dummies(section: Section | None) -> frozenset[int]:
@@ -207,6 +200,8 @@ def _read_entry(
     index: int, subindex: int, section: Section, sections: dict[str, Section], name: str, value_text: str = ""
 ) -> Entry:
     data_type = _basic_type(section, sections)
+    if not section.text("AccessType") and "accesstype" in section.values:
+        section.note(f"AccessType of [{section.name}] is empty, taken as rw", "AccessType")
     access = section.text("AccessType", "rw").lower()
     if access not in _ACCESS:
         raise section.error(f"AccessType of [{section.name}]", "AccessType", expected=", ".join(_ACCESS), got=access)
@@ -221,6 +216,10 @@ def _read_entry(
         raise section.error(
             f"{key} of [{section.name}]", key, expected=f"a value of data type {data_type:04X}h", got=text
         ) from None
+    low, high = _limit(section, "LowLimit", data_type), _limit(section, "HighLimit", data_type)
+    if low is not None and high is not None and low > high:
+        section.note(f"LowLimit of [{section.name}] is above its HighLimit, both are left out", "LowLimit")
+        low = high = None
     return Entry(
         index=index,
         subindex=subindex,
@@ -230,8 +229,8 @@ def _read_entry(
         mappable=section.number("PDOMapping", 0) != 0,
         default=default,
         node_relative=relative,
-        low=_limit(section, "LowLimit", data_type),
-        high=_limit(section, "HighLimit", data_type),
+        low=low,
+        high=high,
     )
 
 
@@ -243,7 +242,10 @@ def _basic_type(section: Section, sections: dict[str, Section]) -> int:
     if data_type <= 0x1B:
         return data_type
     defined = sections.get(f"{data_type:x}sub1")
-    return defined.number("DefaultValue", codec.DOMAIN) if defined else codec.DOMAIN
+    if defined is None:
+        section.note(f"DataType {data_type:04X}h of [{section.name}] is not described, taken as DOMAIN", "DataType")
+        return codec.DOMAIN
+    return defined.number("DefaultValue", codec.DOMAIN)
 
 
 def _limit(section: Section, key: str, data_type: int) -> int | float | None:

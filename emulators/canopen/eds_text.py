@@ -15,6 +15,17 @@ MAX_LINES = 500_000
 """More than any device has (65,536 objects), and a bound on what a wrong file can cost."""
 
 
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something that was mended in a file, and where."""
+
+    line: int
+    text: str
+
+    def __str__(self) -> str:
+        return f"line {self.line}: {self.text}" if self.line else self.text
+
+
 @dataclass(slots=True)
 class Section:
     """One section. Keys are lower case; a value that is empty counts as absent."""
@@ -23,6 +34,8 @@ class Section:
     line: int
     path: str
     values: dict[str, tuple[str, int]] = field(default_factory=dict)
+    notes: list[Note] = field(default_factory=list)
+    """Shared by the sections of one file: what was mended in it."""
 
     def text(self, key: str, default: str = "") -> str:
         """The value of `key`, or `default` when it is absent or empty."""
@@ -34,6 +47,8 @@ class Section:
         if not text:
             if default is None:
                 raise self.error(f"[{self.name}] has no {key}", key, expected="a number")
+            if key.lower() in self.values:
+                self.note(f"{key} of [{self.name}] is empty, taken as {default}", key)
             return default
         try:
             return parse_number(text)
@@ -42,22 +57,34 @@ class Section:
                 f"{key} of [{self.name}] is no number", path=self.path, line=line, expected="a number", got=text
             ) from None
 
+    def note(self, text: str, key: str = "") -> None:
+        """Something that was mended, at `key` or in the section as a whole; said once."""
+        note = Note(self.values.get(key.lower(), ("", self.line))[1], text)
+        if note not in self.notes:
+            self.notes.append(note)
+
     def error(self, message: str, key: str = "", *, expected: str = "", got: str = "") -> FileInvalid:
         """An error that points at `key`, or at the section where the key is absent."""
         line = self.values.get(key.lower(), ("", self.line))[1]
         return FileInvalid(message, path=self.path, line=line, expected=expected, got=got)
 
 
-def decode_file(raw: bytes) -> str:
-    """Text of a data sheet: UTF-8 if it is that, else Windows-1252, which most tools write."""
+def decode_file(raw: bytes, notes: list[Note] | None = None) -> str:
+    """Text of a data sheet: UTF-8 or UTF-16 if it is that, else Windows-1252, which most tools write."""
+    notes = [] if notes is None else notes
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        notes.append(Note(0, "the file is in UTF-16"))
+        return raw.decode("utf-16", "replace")
     try:
         return raw.decode("utf-8-sig")
-    except UnicodeDecodeError:
+    except UnicodeDecodeError as e:
+        notes.append(Note(raw.count(b"\n", 0, e.start) + 1, "not UTF-8, taken as Windows-1252"))
         return raw.decode("cp1252", "replace")
 
 
-def parse_sections(text: str, path: str = "") -> dict[str, Section]:
-    """Sections by lower-case name, in the file's order. Raises `FileInvalid` with the line."""
+def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -> dict[str, Section]:
+    """Sections by lower-case name, in the file's order. Raises `FileInvalid` with the line; adds to `notes`."""
+    notes = [] if notes is None else notes
     sections: dict[str, Section] = {}
     current: Section | None = None
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
@@ -73,16 +100,22 @@ def parse_sections(text: str, path: str = "") -> dict[str, Section]:
                 raise FileInvalid("a broken section header", path=path, line=number, expected="[name]", got=line)
             if name.lower() in sections:
                 raise FileInvalid(f"section [{name}] is given twice", path=path, line=number)
-            current = sections[name.lower()] = Section(name, number, path)
+            current = sections[name.lower()] = Section(name, number, path, notes=notes)
             continue
         key, equals, value = line.partition("=")
         if not equals or current is None:
             expected = "[section]" if current is None else "key=value"
-            raise FileInvalid("not a line of a data sheet", path=path, line=number, expected=expected, got=line[:60])
+            where = f" in [{current.name}]" if current else ""
+            raise FileInvalid(
+                f"not a line of a data sheet{where}", path=path, line=number, expected=expected, got=line[:60]
+            )
         key = key.strip().lower()
         if key in current.values:
             raise FileInvalid(f"{key} is given twice in [{current.name}]", path=path, line=number)
-        current.values[key] = (_without_comment(value).strip(), number)
+        bare = _without_comment(value).strip()
+        if bare != value.strip():
+            notes.append(Note(number, f"a comment behind the value of {key} in [{current.name}] is left out"))
+        current.values[key] = (bare, number)
     return sections
 
 

@@ -10,9 +10,11 @@ from collections import deque
 from emulators.canopen.aborts import Abort, abort
 from emulators.canopen.service import Core, Service
 
+COMMUNICATION_ERROR = 0x8100
+HEARTBEAT_LOST = 0x8130
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
-HEARTBEAT_LOST = 0x8130
+RPDO_TIMEOUT = 0x8250
 
 GENERIC = 0x01
 COMMUNICATION = 0x10
@@ -27,38 +29,40 @@ _UNIT_NS = 100_000
 
 
 class Emergency(Service):
-    """Active errors by code; the error register is the union of their bits."""
+    """Active errors by code and source (two heartbeats may be missing); the error register is the union of their bits."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._active: dict[int, int] = {}
+        self._active: dict[tuple[int, str], int] = {}
         self._waiting: deque[bytes] = deque()
         self._free_at_ns: int | None = None
 
     @property
     def active(self) -> tuple[int, ...]:
         """Codes of the errors that are present, oldest first."""
-        return tuple(self._active)
+        return tuple(dict.fromkeys(code for code, _ in self._active))
 
-    def raise_error(self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"") -> None:
+    def raise_error(
+        self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"", source: str = ""
+    ) -> None:
         """An error arose: register, history and message. `info` is the manufacturer's field, at most 5 bytes.
 
-        An error that is already active is no new one and sends nothing.
+        An error that is already active, from the same source, is no new one and sends nothing.
         """
-        if code not in self._active:
-            self._active[code] = register | GENERIC
-            self.report(code, now_ns, info=info)
+        if (code, source) not in self._active:
+            self._active[code, source] = register | GENERIC
+            self.report(code, now_ns, register=register, info=info)
 
     def report(self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"") -> None:
         """An error that is over as soon as it is told (a PDO too short): history and message, nothing stays active."""
         info = info[:5].ljust(5, b"\0")
-        bits = self._update_register() | (0 if code in self._active else register | GENERIC)
+        bits = self._update_register() | register | GENERIC
         self._remember(code | int.from_bytes(info[:2], "little") << 16)
         self._emit(code.to_bytes(2, "little") + bytes([bits]) + info, now_ns)
 
-    def clear_error(self, code: int, now_ns: int) -> None:
+    def clear_error(self, code: int, now_ns: int, *, source: str = "") -> None:
         """The error is repaired: 0000h with what remains in the register. Does nothing when it was not active."""
-        if self._active.pop(code, None) is not None:
+        if self._active.pop((code, source), None) is not None:
             self._emit(bytes([0, 0, self._update_register(), 0, 0, 0, 0, 0]), now_ns)
 
     def owns(self, index: int) -> bool:
@@ -96,15 +100,16 @@ class Emergency(Service):
             self._waiting.clear()
 
     def tick(self, now_ns: int) -> None:
-        while self._waiting and (self._free_at_ns is None or now_ns >= self._free_at_ns):
+        while not self._core.mutes and self._waiting and (self._free_at_ns is None or now_ns >= self._free_at_ns):
             self._transmit(self._waiting.popleft(), now_ns)
 
     def wake_at_ns(self) -> int | None:
-        return self._free_at_ns if self._waiting else None
+        return self._free_at_ns if self._waiting and not self._core.mutes else None
 
     def _emit(self, message: bytes, now_ns: int) -> None:
         self._core.note(now_ns, "emcy", 0, 0, message)
-        if not self._core.communicating or not self._core.data.has(0x1014) or len(self._waiting) >= MAX_WAITING:
+        unheard = not self._core.communicating or self._core.mutes or not self._core.data.has(0x1014)
+        if unheard or len(self._waiting) >= MAX_WAITING:
             self._core.counters.emcys_dropped += 1
             return
         self._waiting.append(message)

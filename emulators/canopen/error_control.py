@@ -1,7 +1,6 @@
-"""Error control: heartbeat producer (1017h), heartbeat consumer (1016h, 1029h) and the answer to node guarding.
+"""Error control: heartbeat producer (1017h), heartbeat consumer (1016h) and the reaction to communication errors (1029h).
 
-CiA 301 v4.2, 7.2.8 and 7.5.2.19 to 20. A node that has no 1017h produces none; one whose producer is off and that has
-100Ch answers guarding requests.
+CiA 301 v4.2, 7.2.8 and 7.5.2.19 to 20. A node that has no 1017h produces no heartbeat.
 """
 
 from __future__ import annotations
@@ -18,13 +17,28 @@ from gateway.core.clock import NS_PER_MS
 ERROR_CONTROL = 0x700
 
 
+class ErrorReaction:
+    """What 1029h:01 wants after a communication error; called with the time."""
+
+    def __init__(self, core: Core, change_state: Callable[[NmtState, int], None]) -> None:
+        self._core = core
+        self._change_state = change_state
+
+    def __call__(self, now_ns: int) -> None:
+        """0 leaves OPERATIONAL for PRE-OPERATIONAL, 1 changes nothing, 2 stops (CiA 301, 7.5.2.32)."""
+        reaction = self._core.data.number(0x1029, 1)
+        if reaction == 0 and self._core.operational:
+            self._change_state(NmtState.PRE_OPERATIONAL, now_ns)
+        elif reaction == 2 and self._core.state is not NmtState.INITIALISING:
+            self._change_state(NmtState.STOPPED, now_ns)
+
+
 class HeartbeatProducer(Service):
     """Sends the state every 1017h milliseconds; a written period counts from that moment, its first beat at once."""
 
     def __init__(self, core: Core) -> None:
         self._core = core
         self._next_ns: int | None = None
-        self._toggle = 0
 
     def owns(self, index: int) -> bool:
         return index == 0x1017
@@ -34,7 +48,6 @@ class HeartbeatProducer(Service):
 
     def reset(self, now_ns: int) -> None:
         """The boot-up message counts as the first heartbeat."""
-        self._toggle = 0
         period_ns = self._period_ns()
         self._next_ns = now_ns + period_ns if period_ns else None
 
@@ -51,14 +64,6 @@ class HeartbeatProducer(Service):
     def wake_at_ns(self) -> int | None:
         return self._next_ns
 
-    def guarded(self, now_ns: int) -> None:
-        """A remote frame asked for the state: answered with an alternating toggle bit where guarding is supported."""
-        if self._period_ns() or not self._core.data.has(0x100C):
-            self._core.counters.ignored += 1
-            return
-        self._core.send(ERROR_CONTROL + self._core.node_id, bytes([self._toggle << 7 | self._core.state]), now_ns)
-        self._toggle ^= 1
-
     def _period_ns(self) -> int:
         return self._core.data.number(0x1017) * NS_PER_MS
 
@@ -73,10 +78,10 @@ class _Watched:
 class HeartbeatConsumer(Service):
     """Watches the nodes of 1016h, each from its first heartbeat on; a loss is EMCY 8130h and the reaction of 1029h."""
 
-    def __init__(self, core: Core, emergency: emcy.Emergency, change_state: Callable[[NmtState, int], None]) -> None:
+    def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core
         self._emergency = emergency
-        self._change_state = change_state
+        self._react = react
         self._watched: dict[int, _Watched] = {}
 
     @property
@@ -129,14 +134,6 @@ class HeartbeatConsumer(Service):
     def _clear_if_all_heard(self, now_ns: int) -> None:
         if not self.lost:
             self._emergency.clear_error(emcy.HEARTBEAT_LOST, now_ns)
-
-    def _react(self, now_ns: int) -> None:
-        """1029h:01: 0 leaves OPERATIONAL for PRE-OPERATIONAL, 1 changes nothing, 2 stops (CiA 301, 7.5.2.32)."""
-        reaction = self._core.data.number(0x1029, 1)
-        if reaction == 0 and self._core.operational:
-            self._change_state(NmtState.PRE_OPERATIONAL, now_ns)
-        elif reaction == 2:
-            self._change_state(NmtState.STOPPED, now_ns)
 
     def _subs(self) -> list[int]:
         found = self._core.data.dictionary.objects.get(0x1016)

@@ -6,37 +6,42 @@ what a driver makes of its frames. `serve.serve_node` runs it on a connection.
 =================  ===========================================================  =====================================
 state              answers                                                      left by
 =================  ===========================================================  =====================================
-INITIALISING       nothing                                                      `start`: boot-up, PRE-OPERATIONAL
-PRE-OPERATIONAL    NMT, error control, SDO, SYNC, EMCY                          NMT command
+INITIALISING       LSS, when it has no node id yet                              `start` or a node id: boot-up, PRE-OPERATIONAL
+PRE-OPERATIONAL    NMT, error control, SDO, SYNC, TIME, EMCY, LSS               NMT command
 OPERATIONAL        the same and PDOs                                            NMT command, heartbeat loss (1029h)
-STOPPED            NMT, error control                                           NMT command
+STOPPED            NMT, error control, LSS                                      NMT command
 =================  ===========================================================  =====================================
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.aborts import Abort
 from emulators.canopen.behaviour import Behaviour, DeviceModel
+from emulators.canopen.bus_faults import BusFaults, BusState
+from emulators.canopen.client_view import ClientView
 from emulators.canopen.dictionary import Dictionary, Key
 from emulators.canopen.emcy import GENERIC, Emergency
-from emulators.canopen.error_control import ERROR_CONTROL, HeartbeatConsumer, HeartbeatProducer
+from emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction, HeartbeatConsumer, HeartbeatProducer
+from emulators.canopen.guarding import NodeGuarding
+from emulators.canopen.lss import FROM_MASTER, UNCONFIGURED, LssStore
+from emulators.canopen.lss_service import LssService
 from emulators.canopen.node_data import NodeData
 from emulators.canopen.rpdo import Rpdos
-from emulators.canopen.sdo_server import SdoServer
+from emulators.canopen.sdo_channels import SdoChannels
 from emulators.canopen.service import Change, Core, NmtState, NodeCounters, SentPdo, Service, Source
 from emulators.canopen.storage import Storage
-from emulators.canopen.sync import SyncConsumer
+from emulators.canopen.sync import Sync
+from emulators.canopen.time_of_day import TimeOfDay, TimeService
 from emulators.canopen.tpdo import Tpdos
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import UsageError
 
 NMT_COMMAND = 0x000
-SDO_REQUEST, SDO_RESPONSE = 0x600, 0x580
 
 _START, _STOP, _PRE_OPERATIONAL, _RESET_NODE, _RESET_COMMUNICATION = 1, 2, 128, 129, 130
 _TARGET = {
@@ -51,54 +56,70 @@ class NodeContext:
     """What the node is given besides its data sheet.
 
     `source` plays values; `model` makes of them, and of what clients write, what the device does. `factory` replaces
-    defaults (a serial number). `tolerate_short_sdo` takes SDO requests of fewer than 8 bytes as padded with zeros, as for
-    old PLCs; by default they are ignored. `journal_size` bounds both journals: older lines fall off.
+    defaults (a serial number). `refusals` are objects that SDO clients get an abort for, whatever the data sheet says.
+    `tolerate_short_sdo` takes SDO requests of fewer than 8 bytes as padded with zeros, as for old PLCs; by default they are
+    ignored. A TIME producer (1012h) tells its time every `time_period_ms`, 0 for never. `lss` decides about LSS, None lets the
+    data sheet; `lss_store` is what becomes of LSS's store command. `journal_size` bounds both journals: older lines fall off.
     """
 
     source: Source | None = None
     model: DeviceModel | None = None
     factory: Mapping[Key, bytes] = field(default_factory=dict)
+    refusals: Mapping[Key, Abort] = field(default_factory=dict)
     tolerate_short_sdo: bool = False
     sdo_timeout_ms: int = 1000
+    time_period_ms: int = 0
+    lss: bool | None = None
+    lss_store: LssStore = LssStore.WORKS
     journal_size: int = 100_000
 
 
 class CanopenNode:
     """One node. Call `start`, then `feed` for each frame and `tick` when `wake_at_ns` has come; send what they return.
 
-    Raises `UsageError` for a node id outside 1 to 127, and from any call when `source` gives what does not fit.
+    A node of id 255 has none yet and waits silently for LSS to give it one. Raises `UsageError` for any other id outside 1 to
+    127, for 255 without LSS, and from any call when `source` gives what does not fit.
     """
 
     def __init__(self, dictionary: Dictionary, node_id: int, context: NodeContext | None = None) -> None:
-        if not 1 <= node_id <= 127:
-            raise UsageError("not a CANopen node id", expected="1 to 127", got=str(node_id))
-        self.context = context or NodeContext()
-        self.node_id = node_id
-        data = NodeData(dictionary, node_id, self.context.factory)
-        source, model = self.context.source, self.context.model
+        self.context = context = context or NodeContext()
+        lss = dictionary.lss if context.lss is None else context.lss
+        if not (1 <= node_id <= 127 or (lss and node_id == UNCONFIGURED)):
+            raise UsageError("not a CANopen node id", expected="1 to 127, or 255 with LSS", got=str(node_id))
+        data = NodeData(dictionary, 0 if node_id == UNCONFIGURED else node_id, context.factory)
+        source, model = context.source, context.model
         self._behaviour = None if model is None else Behaviour(model, source, data)
-        self._core = core = Core(data, node_id, self._behaviour or source, self.context.journal_size)
+        self._core = core = Core(data, node_id, self._behaviour or source, context.journal_size)
+        self._powered = False
         self._emergency = Emergency(core)
+        react = ErrorReaction(core, self._enter)
         self._heartbeat = HeartbeatProducer(core)
-        self._consumer = HeartbeatConsumer(core, self._emergency, self._enter)
+        self._guarding = NodeGuarding(core, self._emergency, react)
+        self._consumer = HeartbeatConsumer(core, self._emergency, react)
+        self._faults = BusFaults(core, self._emergency, react)
         self._tpdos = Tpdos(core)
-        self._rpdos = Rpdos(core, self._emergency, self._tpdos.changed, self._rpdo_wrote)
-        self._sync = SyncConsumer(core, self._emergency, self._on_sync)
-        self._services: tuple[Service, ...] = (
-            self._emergency,
-            self._consumer,
-            *([self._behaviour] if self._behaviour else []),
-            self._heartbeat,
-            self._sync,
-            self._rpdos,
-            self._tpdos,
-            Storage(core),
-        )
-        self._sdo = SdoServer(_ClientView(core, self._services, self._tpdos), self.context.sdo_timeout_ms * NS_PER_MS)
+        self._sync = Sync(core, self._emergency, self._on_sync)
+        self._rpdos = Rpdos(core, self._emergency, self._tpdos.changed, self._rpdo_wrote, self._sync.in_window)
+        self._time = TimeService(core, context.time_period_ms * NS_PER_MS)
+        self._lss = LssService(core, context.lss_store, self._boot) if lss else None
+        services: list[Service] = [self._emergency, self._consumer, self._guarding, self._faults]
+        services += [self._behaviour] if self._behaviour else []
+        services += [self._heartbeat, self._sync, self._time, self._rpdos, self._tpdos, Storage(core)]
+        services += [self._lss] if self._lss else []
+        view = ClientView(core, services, self._tpdos, context.refusals)
+        timeout_ns = context.sdo_timeout_ms * NS_PER_MS
+        self._sdo = SdoChannels(core, view, timeout_ns, tolerate_short=context.tolerate_short_sdo)
+        view.add(self._sdo)
+        self._services = (self._sdo, *services)
         if self._behaviour is not None:
             self._behaviour.connect(core, self._emergency, self._tpdos.changed)
 
     # -- what can be asked ----------------------------------------------------------------------------------------
+
+    @property
+    def node_id(self) -> int:
+        """255 while it has none."""
+        return self._core.node_id
 
     @property
     def state(self) -> NmtState:
@@ -128,28 +149,41 @@ class CanopenNode:
         """EMCY codes of the errors that are present."""
         return self._emergency.active
 
+    @property
+    def bit_rate(self) -> int | None:
+        """The bit rate that LSS activated, in bit/s; None while it is the one that the node came with."""
+        return self._lss.bit_rate if self._lss else None
+
+    def time_of_day(self, now_ns: int) -> TimeOfDay | None:
+        """The network's time as the node knows it; None until it was told."""
+        return self._time.now(now_ns)
+
     def wake_at_ns(self) -> int | None:
         """When `tick` is due next; None when only a frame can make the node do something."""
         if self.state is NmtState.INITIALISING:
-            return None
-        times = [self._sdo.deadline_ns, *(service.wake_at_ns() for service in self._services)]
-        return min((t for t in times if t is not None), default=None)
+            return self._lss.wake_at_ns() if self._lss else None
+        return min((t for service in self._services if (t := service.wake_at_ns()) is not None), default=None)
 
     # -- what can happen to it ------------------------------------------------------------------------------------
 
     def start(self, now_ns: int) -> list[CanFrame]:
         """Power on (again): power-on values, boot-up message, PRE-OPERATIONAL."""
+        self._powered = True
+        if self._lss:
+            self._lss.power_on()
         self._reset(now_ns, communication_only=False)
         return self._core.take_output()
 
     def feed(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
         """A frame came off the bus."""
-        if self.state is NmtState.INITIALISING:
+        if not self._powered:
             return []
         self._core.counters.frames_in += 1
         self._run_due(now_ns)
-        if frame.extended or frame.error:
-            self._core.counters.ignored += frame.extended
+        if frame.error:
+            self._faults.on_error_frame(frame, now_ns)
+        elif frame.extended or self._core.mutes:
+            self._core.counters.ignored += 1
         elif frame.remote:
             self._on_remote(frame, now_ns)
         else:
@@ -159,9 +193,26 @@ class CanopenNode:
 
     def tick(self, now_ns: int) -> list[CanFrame]:
         """Time passed. Early calls do nothing."""
-        if self.state is not NmtState.INITIALISING:
+        if self._powered:
             self._run_due(now_ns)
         return self._core.take_output()
+
+    def bus_state(self, state: BusState, now_ns: int) -> list[CanFrame]:
+        """The CAN controller's state changed: error-passive is EMCY 8120h, bus-off is silence and 8140h after it."""
+        if self._powered:
+            self._faults.changed(state, now_ns)
+        return self.tick(now_ns)
+
+    def overrun(self, now_ns: int) -> list[CanFrame]:
+        """The CAN controller lost received frames: EMCY 8110h."""
+        if self._powered:
+            self._faults.overrun(now_ns)
+        return self.tick(now_ns)
+
+    def set_time(self, time: TimeOfDay, now_ns: int) -> list[CanFrame]:
+        """The device's own clock is set; what a TIME producer tells."""
+        self._time.tell(time, now_ns)
+        return self.tick(now_ns)
 
     def set_value(self, index: int, subindex: int, raw: bytes, now_ns: int) -> list[CanFrame]:
         """The device itself changes a value (on-wire bytes); a change is an event for TPDOs that map it."""
@@ -192,24 +243,37 @@ class CanopenNode:
     # -- inside ---------------------------------------------------------------------------------------------------
 
     def _run_due(self, now_ns: int) -> None:
-        for reply in self._sdo.tick(now_ns):
-            self._send_sdo(reply, now_ns)
-        for service in self._services:
-            service.tick(now_ns)
+        if self.state is not NmtState.INITIALISING:
+            for service in self._services:
+                service.tick(now_ns)
+        elif self._lss is not None:
+            self._lss.tick(now_ns)
 
     def _on_data(self, frame: CanFrame, now_ns: int) -> None:
-        if frame.can_id == NMT_COMMAND:
-            self._on_nmt(frame.data, now_ns)
-        elif frame.can_id == SDO_REQUEST + self.node_id:
-            self._on_sdo(frame.data, now_ns)
-        elif self._sync.receive(frame, now_ns) or self._rpdos.receive(frame.can_id, frame.data, now_ns):
-            pass
-        elif ERROR_CONTROL < frame.can_id <= ERROR_CONTROL + 127:
+        can_id, data = frame.can_id, frame.data
+        if can_id == FROM_MASTER and self._lss is not None:
+            self._lss.receive(data, now_ns)
+        elif self.state is NmtState.INITIALISING:
+            self._core.counters.ignored += 1
+        elif can_id == NMT_COMMAND:
+            self._on_nmt(data, now_ns)
+        elif not self._taken(frame, now_ns) and ERROR_CONTROL < can_id <= ERROR_CONTROL + 127:
             self._consumer.heard(frame, now_ns)
 
+    def _taken(self, frame: CanFrame, now_ns: int) -> bool:
+        """Whether a service of ours stands on the frame's identifier."""
+        can_id, data = frame.can_id, frame.data
+        return (
+            self._sdo.receive(can_id, data, now_ns)
+            or self._sync.receive(frame, now_ns)
+            or self._time.receive(can_id, data, now_ns)
+            or self._rpdos.receive(can_id, data, now_ns)
+            or self._faults.heard(frame, now_ns)
+        )
+
     def _on_remote(self, frame: CanFrame, now_ns: int) -> None:
-        if frame.can_id == ERROR_CONTROL + self.node_id:
-            self._heartbeat.guarded(now_ns)
+        if frame.can_id == ERROR_CONTROL + self.node_id and self.state is not NmtState.INITIALISING:
+            self._guarding.requested(now_ns)
         else:
             self._tpdos.on_remote(frame.can_id, now_ns)
 
@@ -227,21 +291,6 @@ class CanopenNode:
         else:
             self._reset(now_ns, communication_only=command == _RESET_COMMUNICATION)
 
-    def _on_sdo(self, data: bytes, now_ns: int) -> None:
-        short = len(data) < 8
-        if not self._core.communicating or (short and not (data and self.context.tolerate_short_sdo)):
-            self._core.counters.ignored += 1
-            return
-        replies = self._sdo.request(data.ljust(8, b"\0"), now_ns)
-        self._core.counters.sdo_requests += data[0] >> 5 != 4
-        for reply in replies:
-            self._core.counters.sdo_replies += 1
-            self._send_sdo(reply, now_ns)
-
-    def _send_sdo(self, reply: bytes, now_ns: int) -> None:
-        self._core.counters.sdo_aborts += reply[0] == 0x80
-        self._core.send(SDO_RESPONSE + self.node_id, reply, now_ns)
-
     def _on_sync(self, counter: int | None, now_ns: int) -> None:
         """Inputs are sampled at the SYNC, before what came for it is applied."""
         self._tpdos.on_sync(counter, now_ns)
@@ -256,61 +305,25 @@ class CanopenNode:
             return
         self._core.state = state
         self._core.note(now_ns, "nmt", 0, 0, bytes([state]))
-        if not self._core.communicating:
-            self._sdo.reset()
         for service in self._services:
             service.state_changed(now_ns)
 
+    def _boot(self, now_ns: int) -> None:
+        """LSS gave a node id to one that had none."""
+        self._reset(now_ns, communication_only=False)
+
     def _reset(self, now_ns: int, *, communication_only: bool) -> None:
+        """A node id that LSS gave takes effect here; without one the node stays where it is, silent."""
         self._core.state = NmtState.INITIALISING
         self._core.note(now_ns, "nmt", 0, 0, bytes([NmtState.INITIALISING]))
+        if self._lss is not None:
+            self._lss.adopt(now_ns)
         self._core.data.reset(communication_only=communication_only)
-        self._sdo.reset()
         if self._behaviour is not None and not communication_only:
             self._behaviour.power_on(now_ns)
         for service in self._services:
             service.reset(now_ns)
+        if self.node_id == UNCONFIGURED:
+            return
         self._core.send(ERROR_CONTROL + self.node_id, bytes([NmtState.INITIALISING]), now_ns)
         self._enter(NmtState.PRE_OPERATIONAL, now_ns)
-
-
-class _ClientView:
-    """`ObjectAccess` over the live values: generic rules first, then what the object's service says."""
-
-    def __init__(self, core: Core, services: Iterable[Service], tpdos: Tpdos) -> None:
-        self._core = core
-        self._services = tuple(services)
-        self._tpdos = tpdos
-
-    def read(self, index: int, subindex: int, now_ns: int) -> bytes:
-        entry = self._core.data.find(index, subindex)
-        if not entry.readable:
-            raise abort(index, subindex, Abort.WRITE_ONLY)
-        for service in self._owners(index):
-            service.check_read(index, subindex)
-        self._core.refresh(now_ns)
-        return self._core.data.get(index, subindex)
-
-    def begin_write(self, index: int, subindex: int, size: int | None) -> int | None:
-        entry = self._core.data.find(index, subindex)
-        if not entry.writable:
-            raise abort(index, subindex, Abort.READ_ONLY)
-        if size is not None:
-            self._core.data.check_size(entry, size)
-        return entry.size
-
-    def write(self, index: int, subindex: int, raw: bytes, now_ns: int) -> None:
-        entry = self._core.data.find(index, subindex)
-        self._core.data.check_value(entry, raw)
-        owners = self._owners(index)
-        for service in owners:
-            service.check_write(index, subindex, raw)
-        changed = self._core.data.put(index, subindex, raw)
-        self._core.note(now_ns, "write", index, subindex, raw)
-        for service in owners:
-            service.wrote(index, subindex, now_ns)
-        if changed:
-            self._tpdos.changed([entry.key], now_ns)
-
-    def _owners(self, index: int) -> list[Service]:
-        return [service for service in self._services if service.owns(index)]

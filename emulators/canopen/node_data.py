@@ -36,13 +36,18 @@ class NodeData:
 
     def __init__(self, dictionary: Dictionary, node_id: int, factory: Mapping[Key, bytes] | None = None) -> None:
         self.dictionary = dictionary
-        self.node_id = node_id
-        self._factory: dict[Key, bytes] = {entry.key: entry.initial(node_id) for entry in dictionary.entries()}
-        for key, raw in (factory or {}).items():
+        self._given = dict(factory or {})
+        for key, raw in self._given.items():
             self._sized(key, raw)
-            self._factory[key] = raw
+        self._factory: dict[Key, bytes] = {}
+        self.rebase(node_id)
         self._stored: dict[Key, bytes] = {}
         self._live: dict[Key, bytes] = dict(self._factory)
+
+    def rebase(self, node_id: int) -> None:
+        """Factory values of a node with this id; live values stay until a reset."""
+        self.node_id = node_id
+        self._factory = {entry.key: entry.initial(node_id) for entry in self.dictionary.entries()} | self._given
 
     def find(self, index: int, subindex: int) -> Entry:
         """The entry; raises `SdoAborted` with 06020000 or 06090011 when there is none."""

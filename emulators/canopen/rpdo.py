@@ -1,7 +1,8 @@
 """Receive PDOs: taking values off the bus (CiA 301 v4.2, 7.2.2 and 7.5.2.35 to 36).
 
 Applied at once with transmission types 254 and 255, at the next SYNC with 0 to 240. Too short a PDO is EMCY 8210h and not
-applied; of too long a one the first bytes count.
+applied; of too long a one the first bytes count. One that was received and does not come again within its event timer is
+EMCY 8250h until it does.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 
 from emulators.canopen import emcy
 from emulators.canopen.dictionary import Key
-from emulators.canopen.pdo import COB_ID, MAPPING_OFFSET, PdoParameters, pdo_indices
+from emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, PdoParameters, pdo_indices
 from emulators.canopen.service import Core, Service
 from gateway.core.errors import SdoAborted
 
@@ -23,6 +24,13 @@ class _Rpdo:
     parameters: PdoParameters
     waiting: bytes | None = None
     """Received, to be applied at the next SYNC; a newer one replaces it."""
+    deadline_ns: int | None = None
+    """When the next one must be here; None before the first."""
+
+    @property
+    def source(self) -> str:
+        """Whose error a timeout is."""
+        return f"{self.parameters.index:04X}h"
 
 
 class Rpdos(Service):
@@ -34,7 +42,9 @@ class Rpdos(Service):
         emergency: emcy.Emergency,
         changed: Callable[[list[Key], int], None],
         wrote: Callable[[list[Key], int], None],
+        in_window: Callable[[int], bool],
     ) -> None:
+        self._in_window = in_window
         self._core = core
         self._emergency = emergency
         self._changed = changed
@@ -55,12 +65,23 @@ class Rpdos(Service):
         for rpdo in self._rpdos:
             if rpdo.parameters.index == index and subindex == COB_ID:
                 rpdo.waiting = None
+            if rpdo.parameters.index == index and subindex in (COB_ID, EVENT):
+                self._stop_watching(rpdo, now_ns)
 
     def reset(self, now_ns: int) -> None:
-        self._forget()
+        self._forget(now_ns)
 
     def state_changed(self, now_ns: int) -> None:
-        self._forget()
+        self._forget(now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        for rpdo in self._rpdos:
+            if rpdo.deadline_ns is not None and now_ns >= rpdo.deadline_ns:
+                rpdo.deadline_ns = None
+                self._emergency.raise_error(emcy.RPDO_TIMEOUT, now_ns, register=emcy.COMMUNICATION, source=rpdo.source)
+
+    def wake_at_ns(self) -> int | None:
+        return min((r.deadline_ns for r in self._rpdos if r.deadline_ns is not None), default=None)
 
     def receive(self, can_id: int, payload: bytes, now_ns: int) -> bool:
         """A data frame. Returns whether it is an RPDO of ours, applied or not."""
@@ -73,10 +94,16 @@ class Rpdos(Service):
             if len(payload) < needed:
                 self._core.counters.rpdos_refused += 1
                 self._emergency.report(emcy.PDO_TOO_SHORT, now_ns, register=emcy.COMMUNICATION)
-            elif rpdo.parameters.type <= 240:
+                continue
+            event_ns = rpdo.parameters.event_ns
+            rpdo.deadline_ns = now_ns + event_ns if event_ns else None
+            self._emergency.clear_error(emcy.RPDO_TIMEOUT, now_ns, source=rpdo.source)
+            if rpdo.parameters.type > 240:
+                self._apply(rpdo, payload, now_ns)
+            elif self._in_window(now_ns):
                 rpdo.waiting = payload
             else:
-                self._apply(rpdo, payload, now_ns)
+                self._core.counters.rpdos_refused += 1
         return bool(mine)
 
     def on_sync(self, now_ns: int) -> None:
@@ -86,9 +113,14 @@ class Rpdos(Service):
                 payload, rpdo.waiting = rpdo.waiting, None
                 self._apply(rpdo, payload, now_ns)
 
-    def _forget(self) -> None:
+    def _forget(self, now_ns: int) -> None:
         for rpdo in self._rpdos:
             rpdo.waiting = None
+            self._stop_watching(rpdo, now_ns)
+
+    def _stop_watching(self, rpdo: _Rpdo, now_ns: int) -> None:
+        rpdo.deadline_ns = None
+        self._emergency.clear_error(emcy.RPDO_TIMEOUT, now_ns, source=rpdo.source)
 
     def _apply(self, rpdo: _Rpdo, payload: bytes, now_ns: int) -> None:
         """All values or none: one outside its limits refuses the whole PDO, counted."""

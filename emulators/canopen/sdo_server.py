@@ -90,6 +90,11 @@ class SdoServer:
         return self._transfer is not None
 
     @property
+    def in_sub_block(self) -> bool:
+        """Whether frames are taken as segments of a block download."""
+        return isinstance(self._transfer, BlockDownload) and self._transfer.receiving
+
+    @property
     def deadline_ns(self) -> int | None:
         """When `tick` has something to do for the running transfer, None when there is none."""
         return self._deadline_ns if self._prompt_ns is None else self._prompt_ns
@@ -107,10 +112,8 @@ class SdoServer:
         except SdoAborted as e:
             self.reset()
             return [abort_frame(e)]
-        transfer = self._transfer
-        receiving = isinstance(transfer, BlockDownload) and transfer.receiving
-        self._deadline_ns = now_ns + self._timeout_ns if transfer else None
-        self._prompt_ns = now_ns + self._timeout_ns // 2 if receiving else None
+        self._deadline_ns = now_ns + self._timeout_ns if self._transfer else None
+        self._prompt_ns = now_ns + self._timeout_ns // 2 if self.in_sub_block else None
         return replies
 
     def tick(self, now_ns: int) -> list[bytes]:

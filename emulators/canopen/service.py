@@ -30,11 +30,13 @@ class NodeCounters:
 
     `sdo_requests` are request frames that were taken (a client's abort is none), `sdo_replies` the frames that answered
     them, aborts among them: without block transfers the two are equal. `sdo_aborts` are all aborts sent, those after a
-    timeout included, which answer nothing. `ignored` are frames for this node that the standard tells it to ignore.
+    timeout included, which answer nothing. `ignored` are frames for this node that the standard tells it to ignore,
+    `frames_muted` those that it could not send in bus-off or while its bit rate changes.
     """
 
     frames_in: int = 0
     frames_out: int = 0
+    frames_muted: int = 0
     nmt_commands: int = 0
     heartbeats: int = 0
     sdo_requests: int = 0
@@ -63,9 +65,9 @@ class SentPdo(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """Something about the node changed: `what` is ``nmt``, ``write`` (SDO), ``rpdo``, ``set`` (the device itself) or
-    ``emcy``. `index`, `subindex` and `data` are the object and its new bytes; for ``nmt`` the state, for ``emcy`` the
-    8 bytes of the message, with index 0.
+    """Something about the node changed: `what` is ``nmt``, ``write`` (SDO), ``rpdo``, ``set`` (the device itself),
+    ``emcy``, ``time`` or ``lss``. `index`, `subindex` and `data` are the object and its new bytes; for ``nmt`` the state, for
+    ``emcy`` the 8 bytes of the message, for ``time`` the TIME_OF_DAY, for ``lss`` the new node id; without an object, index 0.
     """
 
     t_ns: int
@@ -97,6 +99,8 @@ class Core:
         self.counters = NodeCounters()
         self.journal: deque[SentPdo] = deque(maxlen=journal_size)
         self.changes: deque[Change] = deque(maxlen=journal_size)
+        self.mutes: set[str] = set()
+        """Reasons why nothing can be sent now."""
         self._source = source
         self._out: list[CanFrame] = []
 
@@ -110,7 +114,10 @@ class Core:
         return self.state is NmtState.OPERATIONAL
 
     def send(self, can_id: int, data: bytes, now_ns: int) -> None:
-        """Queue a frame for this turn's output."""
+        """Queue a frame for this turn's output; while the node is mute it is lost, and counted."""
+        if self.mutes:
+            self.counters.frames_muted += 1
+            return
         self._out.append(CanFrame(can_id, data, t_ns=now_ns))
         self.counters.frames_out += 1
 

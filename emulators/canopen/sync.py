@@ -1,6 +1,7 @@
-"""The SYNC consumer: which frame is a SYNC, and whether it is a good one (CiA 301 v4.2, 7.2.5, 1005h, 1019h).
+"""SYNC: consumer, producer, counter and window (CiA 301 v4.2, 7.2.5; 1005h, 1006h, 1007h, 1019h).
 
-The node produces no SYNC: bit 30 of 1005h is refused.
+A node that is told a cycle (1006h) and hears no SYNC for one and a half of it reports 8100h until SYNC is back; the
+standard has no code of its own for that. Synchronous PDOs that come after the window (1007h) wait for nothing.
 """
 
 from __future__ import annotations
@@ -9,44 +10,136 @@ from collections.abc import Callable
 
 from emulators.canopen import emcy
 from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import Core, Service
+from emulators.canopen.service import Core, NmtState, Service
 from gateway.core.canframe import CanFrame
 
 DEFAULT_COB_ID = 0x80
+COB_ID, CYCLE, WINDOW, OVERFLOW = 0x1005, 0x1006, 0x1007, 0x1019
 _GENERATES = 1 << 30
+_NS_PER_US = 1000
+_SOURCE = "sync"
 
 
-class SyncConsumer(Service):
-    """Calls `on_sync(counter, now_ns)` for each good SYNC in OPERATIONAL; `counter` is None where SYNC has none."""
+class Sync(Service):
+    """Calls `on_sync(counter, now_ns)` for each good SYNC in OPERATIONAL, its own included; `counter` is None without 1019h."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, on_sync: Callable[[int | None, int], None]) -> None:
         self._core = core
         self._emergency = emergency
         self._on_sync = on_sync
+        self._last_ns: int | None = None
+        self._late_told = False
+        self._missing_at_ns: int | None = None
+        self._send_at_ns: int | None = None
+        self._counter = 1
+        self._was_stopped = False
 
     def owns(self, index: int) -> bool:
-        return index in (0x1005, 0x1019)
+        return index in (COB_ID, CYCLE, WINDOW, OVERFLOW)
 
     def check_write(self, index: int, subindex: int, raw: bytes) -> None:
         value = int.from_bytes(raw, "little")
-        if index == 0x1005 and (value & _GENERATES or value & 0x3FFFF800):
-            raise abort(index, subindex, Abort.VALUE)
-        if index == 0x1019 and (value == 1 or value > 240):
-            raise abort(index, subindex, Abort.VALUE)
+        if index == COB_ID:
+            changed_while_running = self._generates and value & _GENERATES and value != self._core.data.number(COB_ID)
+            impossible = value & _GENERATES and not self._core.data.has(CYCLE)
+            if value & 0x3FFFF800 or changed_while_running or impossible:
+                raise abort(index, subindex, Abort.VALUE)
+        if index == OVERFLOW:
+            if value == 1 or value > 240:
+                raise abort(index, subindex, Abort.VALUE)
+            if self._cycle_ns:
+                raise abort(index, subindex, Abort.DEVICE_STATE)
+
+    def wrote(self, index: int, subindex: int, now_ns: int) -> None:
+        if index == COB_ID:
+            self._counter = 1
+        if index in (COB_ID, CYCLE):
+            self._missing_at_ns = None
+            self._emergency.clear_error(emcy.COMMUNICATION_ERROR, now_ns, source=_SOURCE)
+            self._schedule(now_ns)
+
+    def reset(self, now_ns: int) -> None:
+        self._last_ns = self._missing_at_ns = self._send_at_ns = None
+        self._counter = 1
+
+    def state_changed(self, now_ns: int) -> None:
+        """The producer counts from 1 again after STOPPED; nobody misses a SYNC that STOPPED does not hear."""
+        if not self._core.communicating:
+            self._send_at_ns = self._missing_at_ns = None
+        elif self._send_at_ns is None:
+            self._schedule(now_ns)
+        if self._was_stopped:
+            self._counter = 1
+        self._was_stopped = self._core.state is NmtState.STOPPED
 
     def receive(self, frame: CanFrame, now_ns: int) -> bool:
         """A data frame. Returns whether it is the SYNC, good or not."""
-        if frame.can_id != self._core.data.number(0x1005, 0, DEFAULT_COB_ID) & 0x7FF:
+        if frame.can_id != self._can_id:
             return False
         if not self._core.communicating:
             self._core.counters.ignored += 1
             return True
-        counted = self._core.data.number(0x1019) != 0
+        counted = self._core.data.number(OVERFLOW) != 0
         if len(frame.data) != (1 if counted else 0):
             self._core.counters.ignored += 1
             self._emergency.report(emcy.SYNC_LENGTH, now_ns, register=emcy.COMMUNICATION)
             return True
-        self._core.counters.syncs += 1
-        if self._core.operational:
-            self._on_sync(frame.data[0] if counted else None, now_ns)
+        self._take(frame.data[0] if counted else None, now_ns)
         return True
+
+    def in_window(self, now_ns: int) -> bool:
+        """Whether a synchronous PDO still counts for this cycle; the first that does not is reported."""
+        window_ns = self._core.data.number(WINDOW) * _NS_PER_US
+        if not window_ns or self._last_ns is None or now_ns - self._last_ns <= window_ns:
+            return True
+        if not self._late_told:
+            self._late_told = True
+            self._emergency.report(emcy.COMMUNICATION_ERROR, now_ns, register=emcy.COMMUNICATION)
+        return False
+
+    def tick(self, now_ns: int) -> None:
+        if self._missing_at_ns is not None and now_ns >= self._missing_at_ns:
+            self._missing_at_ns = None
+            self._emergency.raise_error(emcy.COMMUNICATION_ERROR, now_ns, register=emcy.COMMUNICATION, source=_SOURCE)
+        if self._send_at_ns is not None and now_ns >= self._send_at_ns:
+            self._produce(now_ns)
+
+    def wake_at_ns(self) -> int | None:
+        return min((t for t in (self._missing_at_ns, self._send_at_ns) if t is not None), default=None)
+
+    @property
+    def _can_id(self) -> int:
+        return self._core.data.number(COB_ID, 0, DEFAULT_COB_ID) & 0x7FF
+
+    @property
+    def _generates(self) -> bool:
+        return bool(self._core.data.number(COB_ID) & _GENERATES)
+
+    @property
+    def _cycle_ns(self) -> int:
+        return self._core.data.number(CYCLE) * _NS_PER_US
+
+    def _schedule(self, now_ns: int) -> None:
+        producing = self._generates and self._cycle_ns and self._core.communicating
+        self._send_at_ns = now_ns + self._cycle_ns if producing else None
+
+    def _produce(self, now_ns: int) -> None:
+        due_ns, cycle_ns = self._send_at_ns or now_ns, self._cycle_ns
+        self._send_at_ns = max(due_ns + cycle_ns, now_ns + 1)
+        if due_ns + cycle_ns <= now_ns:  # late by more than a cycle: skip, never burst
+            self._send_at_ns = now_ns + cycle_ns
+        overflow = self._core.data.number(OVERFLOW)
+        counter = self._counter if overflow else None
+        self._counter = self._counter % overflow + 1 if overflow else 1
+        self._core.send(self._can_id, b"" if counter is None else bytes([counter]), now_ns)
+        self._take(counter, now_ns)
+
+    def _take(self, counter: int | None, now_ns: int) -> None:
+        self._core.counters.syncs += 1
+        self._last_ns = now_ns
+        self._late_told = False
+        watched = self._cycle_ns and not self._generates
+        self._missing_at_ns = now_ns + self._cycle_ns * 3 // 2 if watched else None
+        self._emergency.clear_error(emcy.COMMUNICATION_ERROR, now_ns, source=_SOURCE)
+        if self._core.operational:
+            self._on_sync(counter, now_ns)

@@ -87,7 +87,7 @@ class Tpdos(Service):
                 tpdo.pending = True
 
     def tick(self, now_ns: int) -> None:
-        if not self._core.operational:
+        if not self._core.operational or self._core.mutes:
             return
         for tpdo in self._tpdos:
             due_ns = tpdo.due_ns()
@@ -95,7 +95,7 @@ class Tpdos(Service):
                 self._send_event(tpdo, now_ns)
 
     def wake_at_ns(self) -> int | None:
-        if not self._core.operational:
+        if not self._core.operational or self._core.mutes:
             return None
         return min((due for tpdo in self._tpdos if (due := tpdo.due_ns()) is not None), default=None)
 
@@ -154,7 +154,7 @@ class Tpdos(Service):
 
     def _transmit(self, tpdo: _Tpdo, data: bytes | None, now_ns: int) -> None:
         data = self._build(tpdo, now_ns) if data is None else data
-        if not data:
+        if not data or self._core.mutes:
             return  # nothing mapped: the PDO carries nothing and is not sent
         can_id = tpdo.parameters.can_id
         self._core.counters.tpdos += 1

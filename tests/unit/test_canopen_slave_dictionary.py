@@ -121,7 +121,7 @@ def test_a_dcf_s_parameter_values_and_node_id() -> None:
         ("[1000]\nDataType=5\nLowLimit=x\n", 3, "LowLimit"),
         ("[1000]\nDataType=5\n[1001sub1]\nDataType=5\n", 3, "not there"),
         ("[1000]\nObjectType=99\n", 2, "unknown kind"),
-        ("[DeviceInfo]\nCompactPDO=3\nNrOfTXPDO=1\n[1000]\nDataType=7\n", 2, "CompactPDO"),
+        ("[DeviceInfo]\nCompactPDO=3\nNrOfTXPDO=513\n[1000]\nDataType=7\n", 3, "NrOfTXPDO"),
     ],
 )
 def test_a_broken_file_names_the_line(text: str, line: int, says: str) -> None:

@@ -1,0 +1,68 @@
+"""The object dictionary as an SDO client sees it: generic rules first, then what the object's service says.
+
+It must never know SDO's frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from emulators.canopen.aborts import Abort, abort
+from emulators.canopen.dictionary import Key
+from emulators.canopen.service import Core, Service
+from emulators.canopen.tpdo import Tpdos
+
+
+class ClientView:
+    """An `ObjectAccess` over the live values. `refusals` are objects that the device refuses for reasons of its own."""
+
+    def __init__(
+        self, core: Core, services: Iterable[Service], tpdos: Tpdos, refusals: Mapping[Key, Abort] | None = None
+    ) -> None:
+        self._core = core
+        self._services = tuple(services)
+        self._tpdos = tpdos
+        self._refusals = dict(refusals or {})
+
+    def add(self, service: Service) -> None:
+        """One more service to ask: that of the SDO servers, which stand on this view."""
+        self._services += (service,)
+
+    def read(self, index: int, subindex: int, now_ns: int) -> bytes:
+        entry = self._core.data.find(index, subindex)
+        if not entry.readable:
+            raise abort(index, subindex, Abort.WRITE_ONLY)
+        self._check_refusal(entry.key)
+        for service in self._owners(index):
+            service.check_read(index, subindex)
+        self._core.refresh(now_ns)
+        return self._core.data.get(index, subindex)
+
+    def begin_write(self, index: int, subindex: int, size: int | None) -> int | None:
+        entry = self._core.data.find(index, subindex)
+        if not entry.writable:
+            raise abort(index, subindex, Abort.READ_ONLY)
+        self._check_refusal(entry.key)
+        if size is not None:
+            self._core.data.check_size(entry, size)
+        return entry.size
+
+    def write(self, index: int, subindex: int, raw: bytes, now_ns: int) -> None:
+        entry = self._core.data.find(index, subindex)
+        self._core.data.check_value(entry, raw)
+        owners = self._owners(index)
+        for service in owners:
+            service.check_write(index, subindex, raw)
+        changed = self._core.data.put(index, subindex, raw)
+        self._core.note(now_ns, "write", index, subindex, raw)
+        for service in owners:
+            service.wrote(index, subindex, now_ns)
+        if changed:
+            self._tpdos.changed([entry.key], now_ns)
+
+    def _check_refusal(self, key: Key) -> None:
+        if key in self._refusals:
+            raise abort(*key, self._refusals[key])
+
+    def _owners(self, index: int) -> list[Service]:
+        return [service for service in self._services if service.owns(index)]

@@ -1,0 +1,71 @@
+"""LSS inside a node: when it is answered, and what becomes of a new node id or bit rate (CiA 305 v3.0, 4.3 and 6.3).
+
+A configured node takes a new id at the next reset; one without an id boots with it as soon as LSS leaves configuration. The
+bit rate changes after the switch delay; the node is silent for a delay before and one after.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from emulators.canopen.lss import BIT_RATES, FROM_SLAVE, UNCONFIGURED, Identity, LssSlave, LssStore
+from emulators.canopen.service import Core, Service
+from gateway.core.clock import NS_PER_MS
+
+_MUTE = "bit timing"
+
+
+class LssService(Service):
+    """One node's LSS slave. `boot` is called with the time when a node that had no id has one pending."""
+
+    def __init__(self, core: Core, store: LssStore, boot: Callable[[int], None]) -> None:
+        self._core = core
+        self._boot = boot
+        rates = core.data.dictionary.bit_rates or frozenset(BIT_RATES.values())
+        self._slave = LssSlave(self._identity, core.node_id, rates, store)
+        self._talks_at_ns: int | None = None
+        self.bit_rate: int | None = None
+
+    def power_on(self) -> None:
+        """What was stored is what the node has."""
+        self._slave.pending_id = self._slave.stored_id
+        self.bit_rate = self._slave.stored_rate
+        self._talks_at_ns = None
+        self._core.mutes.discard(_MUTE)
+
+    def adopt(self, now_ns: int) -> None:
+        """A reset: the pending node id becomes the node's. Live values are the caller's to reset."""
+        if self._slave.pending_id != self._core.node_id:
+            self._core.node_id = self._slave.pending_id
+            self._core.note(now_ns, "lss", 0, 0, bytes([self._core.node_id]))
+            self._core.data.rebase(0 if self._core.node_id == UNCONFIGURED else self._core.node_id)
+        self._slave.adopt(self._core.node_id)
+
+    def receive(self, data: bytes, now_ns: int) -> None:
+        """A frame of the LSS master's; not for a node in OPERATIONAL."""
+        if self._core.operational:
+            self._core.counters.ignored += 1
+            return
+        reply = self._slave.request(data)
+        if reply is not None:
+            self._core.send(FROM_SLAVE, reply, now_ns)
+        if self._slave.activate_ms is not None:
+            delay_ns, self._slave.activate_ms = self._slave.activate_ms * NS_PER_MS, None
+            self._talks_at_ns = now_ns + 2 * delay_ns
+            self._core.mutes.add(_MUTE)
+        unconfigured = self._core.node_id == UNCONFIGURED
+        if unconfigured and not self._slave.configuring and self._slave.pending_id != UNCONFIGURED:
+            self._boot(now_ns)
+
+    def tick(self, now_ns: int) -> None:
+        if self._talks_at_ns is not None and now_ns >= self._talks_at_ns:
+            self._talks_at_ns = None
+            self._core.mutes.discard(_MUTE)
+            self.bit_rate = self._slave.pending_rate or self.bit_rate
+
+    def wake_at_ns(self) -> int | None:
+        return self._talks_at_ns
+
+    def _identity(self) -> Identity:
+        number = self._core.data.number
+        return number(0x1018, 1), number(0x1018, 2), number(0x1018, 3), number(0x1018, 4)

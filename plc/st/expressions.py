@@ -39,6 +39,8 @@ class Expressions:
         if isinstance(target, ty.Subrange) and value.type != target and not isinstance(source, ty.AnyInt):
             return f"_v.inside({value.code}, {target.low}, {target.high})"
         sink = ty.plain(target)
+        if isinstance(source, ty.AnyReal) and value.constant is None:
+            return f"_v.real({value.code})" if sink == ty.REAL else value.code
         if isinstance(source, ty.AnyInt | ty.AnyReal):
             return _literal(source.value, sink)
         if isinstance(source, ty.String) and isinstance(sink, ty.String):

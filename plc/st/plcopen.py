@@ -241,6 +241,7 @@ class _Converter:
 
 
 def _texts(element: _Element) -> Iterator[tuple[int, str]]:
-    yield from element.text
+    if element.text:  # the parser hands text over in pieces, an entity or a line a piece
+        yield element.text[0][0], "".join(piece for _, piece in element.text)
     for child in element.children:
         yield from _texts(child)

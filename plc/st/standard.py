@@ -63,10 +63,10 @@ def _meeting(x: Expressions, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
         if meeting is None:
             x.env.fail(expr.pos, "arguments of types that do not meet", got=f"{kind} and {value.type}")
         kind = meeting
-    if isinstance(kind, ty.AnyInt):
-        kind = ty.LINT
+    if isinstance(kind, ty.AnyInt):  # the narrowest type that holds them all
+        kind = next(k for k in (ty.INT, ty.DINT, ty.LINT, ty.ULINT) if all(ty.fits(v.type, k) for v in found))
     elif isinstance(kind, ty.AnyReal):
-        kind = ty.LREAL
+        return [repr(float(v.constant)) if v.constant is not None else v.code for v in found], kind
     if isinstance(kind, ty.String):
         kind = ty.String(max(v.type.length for v in found if isinstance(v.type, ty.String)), kind.wide)
     return [x.coerced(v, kind, e.pos) for v, e in zip(found, exprs, strict=True)], kind
@@ -75,8 +75,11 @@ def _meeting(x: Expressions, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
 @FUNCTIONS.add(*_MATH)
 def _of_real(x: Expressions, call: t.Call) -> Value:
     value = _number(x, x.positional(call, 1)[0], "real", "int")
+    name = _MATH[call.ref.name.upper()]
+    if value.constant is not None:
+        return Value(f"_v.of_real({name!r}, {value.constant!r})", ty.AnyReal(0.0))
     kind = value.type if isinstance(value.type, ty.Elementary) and value.type.kind == "real" else ty.LREAL
-    code = f"_v.of_real({_MATH[call.ref.name.upper()]!r}, {value.code})"
+    code = f"_v.of_real({name!r}, {value.code})"
     return Value(f"_v.real({code})" if kind.bits == 32 else code, kind)
 
 

@@ -27,7 +27,7 @@ class Statements(Expressions):
     # -- assignment and calls -----------------------------------------------------------------------------------------
 
     def _assign(self, s: t.Assign) -> None:
-        self.assign(s.target, self.value(s.value), s.pos)
+        self.assign(s.target, self.value(s.value), s.value.pos)
 
     def _callstatement(self, s: t.CallStatement) -> None:
         call = s.call

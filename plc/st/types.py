@@ -72,7 +72,7 @@ class AnyInt:
 
 @dataclass(frozen=True, slots=True)
 class AnyReal:
-    """A real constant without a type of its own."""
+    """A real constant, or a choice between some, without a type of its own."""
 
     value: float
 
@@ -223,6 +223,9 @@ def common(a: Type, b: Type) -> Type | None:
         return AnyInt(0)
     if isinstance(a, AnyInt | AnyReal) and isinstance(b, AnyInt | AnyReal):
         return AnyReal(0.0)
+    for constant, other in ((a, b), (b, a)):
+        if isinstance(constant, AnyReal) and isinstance(other, Elementary) and other.kind == "int":
+            return REAL if fits(other, REAL) else LREAL if fits(other, LREAL) else None
     if fits(a, b):
         return b
     return a if fits(b, a) else None

@@ -1,0 +1,30 @@
+"""Runs small pieces of Structured Text for the tests."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from plc.program import ScanInfo
+from plc.st.compile import compile_text
+from plc.st.program import StProgram, program_class
+
+
+def program(text: str, name: str = "") -> StProgram:
+    return program_class(compile_text(text, "test.st"), name)()
+
+
+def scan(made: StProgram, number: int = 1, ms: int | None = None) -> None:
+    made.execute(ScanInfo((10 * number if ms is None else ms) * 1_000_000, number, number == 1))
+
+
+def run(variables: str, body: str, before: str = "", scans: int = 1) -> dict[str, Any]:
+    """Variables, in lower case, after `scans` scans of a program with `body`."""
+    made = program(f"{before}\nPROGRAM p VAR {variables} END_VAR\n{body}\nEND_PROGRAM")
+    for number in range(1, scans + 1):
+        scan(made, number)
+    return {name[2:]: value for name, value in vars(made.body).items()}
+
+
+def value(kind: str, expression: str, variables: str = "", before: str = "") -> Any:
+    """What `expression` is as a `kind`."""
+    return run(f"{variables} result : {kind};", f"result := {expression};", before)["result"]

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Makes recordings of the real devices that fieldtwin has profiles of: plausible values from the manuals' facts, with a seed.
+"""Makes recordings of the devices that fieldtwin has profiles of: plausible values from the manuals' facts, with a seed.
 
     scripts/make_device_recordings.py [--seed N] [--out DIR]
 
@@ -9,9 +9,10 @@ Nothing here was measured: every header says `synthetic`. The same seed gives th
 from __future__ import annotations
 
 import argparse
+import math
 import random
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -20,7 +21,7 @@ if str(ROOT) not in sys.path:  # run as a file, the checkout's packages are not 
 
 from emulators.codec import encode  # noqa: E402
 from gateway.core.profile import READ_FUNCTION, DeviceProfile, load_profile  # noqa: E402
-from gateway.core.recording import Exchange, RecordingHeader, RecordingWriter  # noqa: E402
+from gateway.core.recording import Exchange, RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
 
 DEFAULT_SEED = 1
 ROUNDS = 20
@@ -93,6 +94,64 @@ DEVICES: dict[str, Steps] = {
 }
 
 
+LOOP_S = 60
+"""How long a CANopen node's signals go before they begin again; the last row is the first."""
+
+Rows = Iterator[tuple[float, Sequence[float]]]
+
+
+def io_module(r: random.Random) -> Rows:
+    """A pump station: float switches, a running light, a level that rises and falls. Inputs change in steps."""
+    phase = [r.random() * 2 * math.pi for _ in range(4)]
+    last: tuple[int, int] | None = None
+    for i in range(LOOP_S * 5 + 1):
+        t = i / 5
+        turn = 2 * math.pi * (t % LOOP_S) / LOOP_S
+        level = 5.0 - 3.0 * math.cos(turn)
+        switches = sum(1 << n for n, at in enumerate((2.5, 4.0, 5.5, 7.0)) if level > at)
+        inputs = switches, 1 << (int(t % LOOP_S) % 8)
+        volts = [level, *(2.5 + 0.5 * n + 0.4 * math.sin((n + 1) * turn + phase[n]) for n in (1, 2, 3))]
+        analogue = [round(v, 4) for v in volts]
+        if last is not None and last != inputs:
+            yield t, (*last, *analogue)
+        last = inputs
+        yield t, (*inputs, *analogue)
+
+
+def drive(r: random.Random) -> Rows:
+    """What a drive cannot compute from its set-points: the mains' ripple on its DC link, and the load on its shaft."""
+    phase = r.random() * 2 * math.pi
+    for i in range(LOOP_S * 10 + 1):
+        turn = 2 * math.pi * (i % (LOOP_S * 10)) / (LOOP_S * 10)
+        yield i / 10, (round(14.0 + 6.0 * math.sin(3 * turn + phase), 1), round(325.0 + 2.0 * math.sin(12 * turn), 3))
+
+
+def measuring_device(r: random.Random) -> Rows:
+    """A hydraulic cylinder at work: 80 to 210 bar, oil that warms and cools."""
+    phase = r.random() * 2 * math.pi
+    for i in range(LOOP_S * 10 + 1):
+        turn = 2 * math.pi * (i % (LOOP_S * 10)) / (LOOP_S * 10)
+        bar = 145.0 + 50.0 * math.sin(4 * turn + phase) + 15.0 * math.sin(11 * turn)
+        yield i / 10, (round(bar, 3), round(41.0 + 3.0 * math.sin(turn), 3))
+
+
+def encoder(r: random.Random) -> Rows:
+    """A winch: forty turns out and forty turns back, in a minute, from turn 1000 on."""
+    start = 1000 * 8192 + r.randrange(8192)
+    for i in range(LOOP_S * 10 + 1):
+        turn = 2 * math.pi * (i % (LOOP_S * 10)) / (LOOP_S * 10)
+        yield i / 10, (round(start + 20 * 8192 * (1 - math.cos(turn))),)
+
+
+NODES: dict[str, tuple[tuple[str, ...], Callable[[random.Random], Rows]]] = {
+    "io-cia401": (("inputs_1", "inputs_2", *(f"analogue_in_{n}" for n in (1, 2, 3, 4))), io_module),
+    "drive-cia402": (("torque", "dc_voltage"), drive),
+    "measuring-cia404": (("pressure", "temperature"), measuring_device),
+    "encoder-cia406": (("position",), encoder),
+}
+"""CANopen nodes: the tags that are played, and how they go."""
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Write every recording; returns the exit code."""
     parser = argparse.ArgumentParser(description="make the recordings of real devices that ship with fieldtwin")
@@ -102,6 +161,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     for name in DEVICES:
         make(name, options.out, options.seed)
+    for name in NODES:
+        make_node(name, options.out, options.seed)
     return 0
 
 
@@ -123,6 +184,27 @@ def make(name: str, out: Path, seed: int) -> None:
         for n in range(ROUNDS):
             _round(profile, DEVICES[name](r, n), n * EVERY_S, r, writer)
     print(f"{path.name}: {writer.records} exchanges", file=sys.stderr)
+
+
+def make_node(name: str, out: Path, seed: int) -> None:
+    """Write NAME.jsonl: the signals of a CANopen node."""
+    profile = load_profile(ROOT / "profiles" / "devices" / f"{name}.yaml")
+    signals, steps = NODES[name]
+    path = out / f"{name}.jsonl"
+    path.unlink(missing_ok=True)
+    header = RecordingHeader(
+        version=1,
+        device=profile.name,
+        kind="signals",
+        source="synthetic",
+        made_by=f"scripts/make_device_recordings.py --seed {seed}",
+        profile_hash=profile.hash,
+        signals={tag: SignalInfo(unit=profile.tags[tag].unit) for tag in signals},
+    )
+    with RecordingWriter(path, header) as writer:
+        for t_s, values in steps(random.Random(f"{name} {seed}")):
+            writer.row(t_s, values)
+    print(f"{path.name}: {writer.records} rows", file=sys.stderr)
 
 
 def _round(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 from emulators.canopen.codec import encode
@@ -39,6 +40,8 @@ class PlayedObjects:
         out: dict[Key, bytes] = {}
         for tag, key, data_type in self._objects:
             number = (values[tag.name] - tag.offset) / tag.scale
+            if math.isnan(number) and not tag.type.startswith("float"):
+                continue  # no integer says "no value": the object keeps what it has
             raw = encode(data_type, number if tag.type.startswith("float") else round(number))
             self.journal.note(tag.name, raw, now_ns)
             out[key] = raw

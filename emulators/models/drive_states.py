@@ -1,0 +1,134 @@
+"""The state machine of a CiA 402 drive, as a table.
+
+A power drive system goes through these states (CiA 402-2, 7.1; IEC 61800-7-201, figure "FSA"). The controlword 6040h asks,
+the statusword 6041h answers. Fifteen transitions and a sixteenth; whatever else is asked for is ignored, without an answer::
+
+    NOT READY --1--> SWITCH ON DISABLED --2--> READY TO SWITCH ON --3--> SWITCHED ON --4--> OPERATION ENABLED
+                            ^   ^ <--------7----------/  ^ <------6--------/    ^ <---------5--------/ | |
+                            |   | <--------------10----- | -----------------/   |                      | |
+                            |   |                        \\-----------------8--- | --------------------/ |
+                            |   \\----9------------------------------------------|-----------------------/
+                         12 |                                                   |                       | 11
+                            \\--------- QUICK STOP ACTIVE <-------------------------------------------- /  (16: back)
+    any --13--> FAULT REACTION ACTIVE --14--> FAULT --15--> SWITCH ON DISABLED
+
+Only that is here: no motion, no objects, no time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+
+
+class DriveState(Enum):
+    """The states; the value is the statusword's bits under `STATE_MASK`."""
+
+    NOT_READY = 0x00
+    SWITCH_ON_DISABLED = 0x40
+    READY = 0x21
+    SWITCHED_ON = 0x23
+    OPERATION_ENABLED = 0x27
+    QUICK_STOP = 0x07
+    FAULT_REACTION = 0x0F
+    FAULT = 0x08
+
+    @property
+    def powered(self) -> bool:
+        """Whether the drive function is on: the motor follows set-points or a ramp."""
+        return self in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP, DriveState.FAULT_REACTION)
+
+
+STATE_MASK = 0x6F
+"""Bits 0 to 3, 5 and 6 of the statusword. Bit 5 is no part of the pattern in states where the standard leaves it open."""
+
+
+class Cause(Enum):
+    """What makes the drive leave a state: the commands of the controlword, and what happens inside."""
+
+    SHUTDOWN = "shutdown"
+    SWITCH_ON = "switch on"  # from OPERATION ENABLED the same bits are "disable operation"
+    ENABLE_OPERATION = "enable operation"
+    DISABLE_VOLTAGE = "disable voltage"
+    QUICK_STOP = "quick stop"
+    FAULT_RESET = "fault reset"
+    INITIALISED = "self-test done"
+    STOPPED = "quick stop completed"
+    ERROR = "error"
+    REACTED = "fault reaction completed"
+
+
+class Bit(IntEnum):
+    """Bits of the controlword that the state machine reads."""
+
+    SWITCH_ON = 1 << 0
+    ENABLE_VOLTAGE = 1 << 1
+    QUICK_STOP = 1 << 2
+    ENABLE_OPERATION = 1 << 3
+    FAULT_RESET = 1 << 7
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One arrow. `number` is the standard's; 1, 12, 13 and 14 the drive does by itself, 12 a command can do as well."""
+
+    number: int
+    source: DriveState
+    cause: Cause
+    target: DriveState
+
+
+_S, _C = DriveState, Cause
+TRANSITIONS = (
+    Transition(1, _S.NOT_READY, _C.INITIALISED, _S.SWITCH_ON_DISABLED),
+    Transition(2, _S.SWITCH_ON_DISABLED, _C.SHUTDOWN, _S.READY),
+    Transition(3, _S.READY, _C.SWITCH_ON, _S.SWITCHED_ON),
+    Transition(3, _S.READY, _C.ENABLE_OPERATION, _S.SWITCHED_ON),  # and on to 4 with the same controlword
+    Transition(4, _S.SWITCHED_ON, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+    Transition(5, _S.OPERATION_ENABLED, _C.SWITCH_ON, _S.SWITCHED_ON),
+    Transition(6, _S.SWITCHED_ON, _C.SHUTDOWN, _S.READY),
+    Transition(7, _S.READY, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    Transition(7, _S.READY, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    Transition(8, _S.OPERATION_ENABLED, _C.SHUTDOWN, _S.READY),
+    Transition(9, _S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    Transition(10, _S.SWITCHED_ON, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    Transition(10, _S.SWITCHED_ON, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    Transition(11, _S.OPERATION_ENABLED, _C.QUICK_STOP, _S.QUICK_STOP),
+    Transition(12, _S.QUICK_STOP, _C.STOPPED, _S.SWITCH_ON_DISABLED),
+    Transition(12, _S.QUICK_STOP, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    *(Transition(13, state, _C.ERROR, _S.FAULT_REACTION) for state in _S if state not in (_S.FAULT, _S.FAULT_REACTION)),
+    Transition(14, _S.FAULT_REACTION, _C.REACTED, _S.FAULT),
+    Transition(15, _S.FAULT, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
+    Transition(16, _S.QUICK_STOP, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),  # if the option code lets it stay there
+)
+
+_BY_CAUSE = {(t.source, t.cause): t for t in TRANSITIONS}
+
+
+def transition(state: DriveState, cause: Cause, *, stays_stopped: bool = False) -> Transition | None:
+    """The arrow that `cause` takes from `state`; None where there is none, and nothing happens.
+
+    `stays_stopped`: the quick stop option code is 5 to 8, so that the drive stays in QUICK STOP ACTIVE once it stands.
+    """
+    found = _BY_CAUSE.get((state, cause))
+    if found is not None and found.number == 16 and not stays_stopped:
+        return None
+    if found is not None and cause is Cause.STOPPED and stays_stopped:
+        return None
+    return found
+
+
+def command_of(controlword: int, before: int) -> Cause | None:
+    """The command in a controlword, `before` being the one that it replaces (fault reset is an edge of bit 7).
+
+    While bit 7 is held the word is no other command (CiA 402-2, table "Command coding").
+    """
+    if controlword & Bit.FAULT_RESET:
+        return None if before & Bit.FAULT_RESET else Cause.FAULT_RESET
+    if not controlword & Bit.ENABLE_VOLTAGE:
+        return Cause.DISABLE_VOLTAGE
+    if not controlword & Bit.QUICK_STOP:
+        return Cause.QUICK_STOP
+    if not controlword & Bit.SWITCH_ON:
+        return Cause.SHUTDOWN
+    return Cause.ENABLE_OPERATION if controlword & Bit.ENABLE_OPERATION else Cause.SWITCH_ON

@@ -1,0 +1,87 @@
+"""A point that moves with piecewise constant acceleration: where it is, and the ramps that bring it to a speed or a place.
+
+Closed forms, so that it can be asked at any time and never drifts. Units are the caller's, time is in seconds. It knows no
+drive and no clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+Ramp = tuple[float, float]
+"""(duration in s, acceleration)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """From place `x` with speed `v` through `ramps`; then on with the speed that is reached."""
+
+    x: float = 0.0
+    v: float = 0.0
+    ramps: tuple[Ramp, ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        """How long the ramps take."""
+        return sum(duration for duration, _ in self.ramps)
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Place and speed `t_s` after the start."""
+        x, v = self.x, self.v
+        for duration, a in self.ramps:
+            t = min(t_s, duration)
+            x, v = x + v * t + a * t * t / 2, v + a * t
+            t_s -= t
+            if t_s <= 0:
+                return x, v
+        return x + v * t_s, v
+
+
+def to_speed(v: float, target: float, acceleration: float, deceleration: float) -> tuple[Ramp, ...]:
+    """From speed `v` to `target`. Through zero it brakes first. Accelerations are above 0."""
+    ramps: list[Ramp] = []
+    if v * target < 0:
+        ramps.append((abs(v) / deceleration, -math.copysign(deceleration, v)))
+        v = 0.0
+    if v != target:
+        a = acceleration if abs(target) > abs(v) else deceleration
+        ramps.append((abs(target - v) / a, math.copysign(a, target - v)))
+    return tuple(ramps)
+
+
+def to_place(distance: float, v: float, cruise: float, acceleration: float, deceleration: float) -> tuple[Ramp, ...]:
+    """Over `distance` from speed `v` to a stand, no faster than `cruise`. All three rates are above 0.
+
+    What goes the wrong way, or too fast to stop in time, brakes to a stand first and comes back.
+    """
+    ramps: list[Ramp] = []
+    braking = v * abs(v) / (2 * deceleration)
+    if v and (v * distance < 0 or abs(braking) > abs(distance) * (1 + 1e-12)):
+        ramps.append((abs(v) / deceleration, -math.copysign(deceleration, v)))
+        distance, v = distance - braking, 0.0
+    if distance == 0 and v == 0:
+        return tuple(ramps)
+    sign = math.copysign(1.0, distance if distance else v)
+    way, speed = abs(distance), abs(v)
+    if speed > cruise:
+        ramps.append(((speed - cruise) / deceleration, -sign * deceleration))
+        way -= (speed * speed - cruise * cruise) / (2 * deceleration)
+        speed = cruise
+    # Up to the peak speed and down again: what is under the two ramps is the way.
+    peak_squared = (2 * acceleration * deceleration * way + deceleration * speed * speed) / (
+        acceleration + deceleration
+    )
+    peak = min(cruise, math.sqrt(max(0.0, peak_squared)))
+    peak = max(peak, speed)
+    up, down = (peak * peak - speed * speed) / (2 * acceleration), peak * peak / (2 * deceleration)
+    ramps += [((peak - speed) / acceleration, sign * acceleration)]
+    if way - up - down > 0:
+        ramps.append(((way - up - down) / peak, 0.0))
+    ramps.append((peak / deceleration, -sign * deceleration))
+    return tuple(ramp for ramp in _positive(ramps))
+
+
+def _positive(ramps: Sequence[Ramp]) -> list[Ramp]:
+    return [(duration, a) for duration, a in ramps if duration > 0]

@@ -10,6 +10,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
+from gateway.connections.tls_listen import check_files
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from gateway.core.profile import Tag
@@ -89,12 +90,15 @@ def _server(
     _check_overlaps(file, loc, tags)
     return ServeConfig(
         name=name,
-        listen=_endpoint(file, loc, form.url, ("tcp",)),
+        listen=_endpoint(file, loc, form.url, ("tcp", "tls")),
         unit=form.unit,
         tags=tags,
         if_bad=form.if_bad,
         networks=_networks(file, (*loc, "from"), form.networks),
         clients=form.clients,
+        roles=_roles(file, (*loc, "roles"), form.roles, form.url),
+        write_roles=_roles(file, (*loc, "write_roles"), form.write_roles, form.url),
+        idle_s=form.idle_s,
     )
 
 
@@ -190,13 +194,15 @@ def _check_overlaps(file: YamlFile, loc: tuple[Key, ...], tags: Iterable[ServedT
 
 def _bridge(file: YamlFile, name: str, form: BridgeForm, buses: Mapping[str, BusConfig]) -> BridgeConfig:
     loc: tuple[Key, ...] = ("bridge", name)
-    listen = _endpoint(file, loc, form.url, ("tcp", "rtu"))
+    listen = _endpoint(file, loc, form.url, ("tcp", "tls", "rtu"))
     if form.to is None and not form.units:
         raise file.error(loc, "where does this bridge lead?", expected="`to: BUS`, or `units: {1: BUS/1}`")
     if form.to is not None:
         _modbus_bus(file, (*loc, "to"), form.to, buses)
     routes = {unit: _route(file, (*loc, "units", unit), unit, text, buses) for unit, text in form.units.items()}
-    rules = tuple(_rule(file, (*loc, "allow", i), rule) for i, rule in enumerate(form.allow)) or (AllowRule(),)
+    rules = tuple(_rule(file, (*loc, "allow", i), rule, form.url) for i, rule in enumerate(form.allow)) or (
+        AllowRule(),
+    )
     return BridgeConfig(
         name=name,
         listen=listen,
@@ -208,6 +214,7 @@ def _bridge(file: YamlFile, name: str, form: BridgeForm, buses: Mapping[str, Bus
         clients=form.clients,
         queue=form.queue,
         in_flight=form.in_flight,
+        idle_s=form.idle_s,
     )
 
 
@@ -225,7 +232,7 @@ def _route(file: YamlFile, loc: tuple[Key, ...], unit: int, text: str, buses: Ma
     return Route(bus, int(number))
 
 
-def _rule(file: YamlFile, loc: tuple[Key, ...], form: AllowForm) -> AllowRule:
+def _rule(file: YamlFile, loc: tuple[Key, ...], form: AllowForm, url: str) -> AllowRule:
     functions: set[int] = set()
     for i, entry in enumerate(form.functions):
         if isinstance(entry, int):
@@ -243,7 +250,17 @@ def _rule(file: YamlFile, loc: tuple[Key, ...], form: AllowForm) -> AllowRule:
             table: tuple(_span(file, (*loc, "addresses", table, i), e, ADDRESSES - 1) for i, e in enumerate(entries))
             for table, entries in form.addresses.items()
         }
-    return AllowRule(_networks(file, (*loc, "from"), form.networks), units, frozenset(functions), addresses)
+    networks, roles = _networks(file, (*loc, "from"), form.networks), _roles(file, (*loc, "roles"), form.roles, url)
+    return AllowRule(networks, units, frozenset(functions), addresses, roles)
+
+
+def _roles(file: YamlFile, loc: tuple[Key, ...], roles: list[str] | None, url: str) -> frozenset[str] | None:
+    """Roles are in certificates: without TLS nobody has one."""
+    if roles is None:
+        return None
+    if not url.lower().startswith("tls:"):
+        raise file.error(loc, "roles are in clients' certificates", expected="a tls:// url", got=url)
+    return frozenset(roles)
 
 
 def _span(file: YamlFile, loc: tuple[Key, ...], entry: int | str, most: int) -> tuple[int, int]:
@@ -279,6 +296,8 @@ def _endpoint(file: YamlFile, loc: tuple[Key, ...], url: str, schemes: tuple[str
             raise UsageError(
                 "the gateway does not listen there", expected=" or ".join(f"{s}:" for s in schemes), got=url
             )
+        if endpoint.scheme == "tls":
+            check_files(endpoint)
     except UsageError as e:
         raise file.error((*loc, "url"), e.message, expected=e.expected, got=e.got) from e
     return endpoint

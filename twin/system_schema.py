@@ -144,6 +144,9 @@ class ServeForm(Strict):
     if_bad: Literal["exception", "nan"] = "exception"
     networks: list[str] = Field(default=["0.0.0.0/0", "::/0"], alias="from", description="who may connect")
     clients: int = Field(default=16, ge=1, le=1000)
+    roles: list[str] | None = Field(default=None, description="TLS: roles whose clients may ask; default: every client")
+    write_roles: list[str] | None = Field(default=None, description="TLS: roles whose clients may write as well")
+    idle_s: int = Field(default=0, ge=0, le=86_400, description="silent clients are closed; 0: never")
 
 
 class AllowForm(Strict):
@@ -153,6 +156,7 @@ class AllowForm(Strict):
     units: list[int | str] | None = None
     functions: list[int | Literal["read", "write"]] = ["read"]
     addresses: dict[Literal["coil", "discrete", "input", "holding"], list[int | str]] | None = None
+    roles: list[str] | None = Field(default=None, description="TLS: the roles that it is for; default: every client")
 
 
 class BridgeForm(Strict):
@@ -167,6 +171,7 @@ class BridgeForm(Strict):
     clients: int = Field(default=16, ge=1, le=1000)
     queue: int = Field(default=32, ge=1, le=64)
     in_flight: int = Field(default=16, ge=1, le=64)
+    idle_s: int = Field(default=0, ge=0, le=86_400, description="silent clients are closed; 0: never")
 
 
 class SystemForm(Strict):

@@ -1,6 +1,7 @@
-"""The gateway's listening side: a TCP port whose clients become `ByteConnection`s.
+"""The gateway's listening side: a TCP port, with TLS where it is asked for, whose clients become `ByteConnection`s.
 
-It must never know a protocol: who may enter is asked of its owner by address, what a client says is its owner's business.
+It must never know a protocol: who may enter is asked of its owner by address, what a client says is its owner's business,
+and so is what a role in its certificate allows.
 """
 
 from __future__ import annotations
@@ -8,9 +9,12 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
+import ssl
 from collections.abc import Awaitable, Callable
 
 from gateway.connections.tcp import TcpConnection
+from gateway.connections.tls_listen import HANDSHAKE_LIMIT_S, server_context
+from gateway.connections.tls_role import role_in
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
 
@@ -24,12 +28,14 @@ ACCEPT_PAUSE_S = 0.1
 
 
 class ClientConnection(TcpConnection):
-    """One client. `peer` is its address, `last_used_s` the loop's time when it last said something."""
+    """One client. `peer` is its address, `last_used_s` the loop's time when it last said something, `role` what its
+    certificate names (MBTLS 8.4), empty without one and without TLS."""
 
     def __init__(self, endpoint: Endpoint, peer: str, port: int) -> None:
         super().__init__(endpoint, CLIENT_CHUNKS)
         self.peer = peer
         self.peer_port = port
+        self.role = ""
         self._loop = asyncio.get_running_loop()
         self.last_used_s = self._loop.time()
         self.on_arrival = self._used
@@ -37,15 +43,20 @@ class ClientConnection(TcpConnection):
     def _used(self, data: bytes) -> None:
         self.last_used_s = self._loop.time()
 
-    async def take(self, sock: socket.socket) -> None:
-        """Become the connection of an accepted socket."""
-        await self._loop.connect_accepted_socket(lambda: self._wire, sock)
+    async def take(self, sock: socket.socket, tls: ssl.SSLContext | None) -> None:
+        """Become the connection of an accepted socket, and shake hands where a context is given."""
+        limit_s = HANDSHAKE_LIMIT_S if tls is not None else None
+        await self._loop.connect_accepted_socket(lambda: self._wire, sock, ssl=tls, ssl_handshake_timeout=limit_s)
+        if tls is not None:
+            shaken = self._wire.transport.get_extra_info("ssl_object")
+            assert isinstance(shaken, ssl.SSLObject)
+            self.role = role_in(shaken.getpeercert(binary_form=True) or b"")
         if self._lost is not None:  # its place was given away meanwhile
             self._wire.transport.abort()
 
-    def evict(self) -> None:
-        """End it at once: another client needs the place."""
-        self.feed_lost(ConnectionLost("closed to make room for another client", where=f"{self.endpoint}: {self.peer}"))
+    def evict(self, why: str) -> None:
+        """End it at once."""
+        self.feed_lost(ConnectionLost(why, where=f"{self.endpoint}: {self.peer}"))
         self.inbound.data_stream.clear()
         if hasattr(self._wire, "transport"):
             self._wire.transport.abort()
@@ -58,7 +69,8 @@ class TcpListener:
     """Runs `on_client(connection)` for each client that `admits` lets in; when that returns, the client is closed.
 
     When `max_clients` are connected, the next one takes the place of the one that has been silent for longest
-    (TG 4.2.1, case MB-065). `refused` counts who was not admitted.
+    (TG 4.2.1, case MB-065). One that has been silent for `idle_s` is closed as well; 0: never. `refused` counts who was not
+    admitted, `unshaken` whose TLS handshake came to nothing, `retired` who was silent for too long.
     """
 
     def __init__(
@@ -68,16 +80,22 @@ class TcpListener:
         on_client: OnClient,
         max_clients: int,
         admits: Callable[[str], bool],
+        tls: ssl.SSLContext | None = None,
+        idle_s: float = 0.0,
     ) -> None:
         """Take over a listening socket; use `open`."""
-        self.accepted = self.evicted = self.refused = 0
+        self.accepted = self.evicted = self.refused = self.unshaken = self.retired = 0
         self._endpoint = endpoint
         self._sock = sock
         self._on_client = on_client
         self._max_clients = max_clients
         self._admits = admits
+        self._tls = tls
+        self._idle_s = idle_s
         self._clients: list[ClientConnection] = []
+        self._shaking: dict[ClientConnection, asyncio.Task[None]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._retiring: asyncio.TimerHandle | None = None
         self._accepting = asyncio.get_running_loop().create_task(self._accept(), name=f"clients of {self.bound}")
 
     @classmethod
@@ -87,14 +105,16 @@ class TcpListener:
         on_client: OnClient,
         max_clients: int = MAX_CLIENTS,
         admits: Callable[[str], bool] = lambda address: True,
+        idle_s: float = 0.0,
     ) -> TcpListener:
-        """Listen on a ``tcp://`` endpoint; port 0 takes a free one (`bound` says which).
+        """Listen on a ``tcp://`` or ``tls://`` endpoint; port 0 takes a free one (`bound` says which).
 
         Raises `EndpointBusy`, or `Unreachable` that says what to do about it.
         """
-        if endpoint.scheme != "tcp":
-            raise UsageError("cannot listen there", expected="tcp://HOST:PORT", got=str(endpoint))
+        if endpoint.scheme not in ("tcp", "tls"):
+            raise UsageError("cannot listen there", expected="tcp://HOST:PORT or tls://HOST:PORT", got=str(endpoint))
         loop = asyncio.get_running_loop()
+        tls = await loop.run_in_executor(None, server_context, endpoint) if endpoint.scheme == "tls" else None
         sock: socket.socket | None = None
         try:
             # The first address only: a name with an IPv4 and an IPv6 address would get two different free ports.
@@ -110,7 +130,7 @@ class TcpListener:
             if sock is not None:
                 sock.close()
             raise _cannot_listen(endpoint, e) from e
-        return cls(endpoint, sock, on_client, max_clients, admits)
+        return cls(endpoint, sock, on_client, max_clients, admits, tls, idle_s)
 
     @property
     def bound(self) -> Endpoint:
@@ -126,6 +146,8 @@ class TcpListener:
 
     async def aclose(self) -> None:
         """Stop listening and close every client. Closing twice does nothing."""
+        if self._retiring is not None:
+            self._retiring.cancel()
         self._accepting.cancel()
         tasks = [self._accepting, *self._tasks]
         for task in tasks:
@@ -151,24 +173,51 @@ class TcpListener:
             self._clients.append(client)
             task = loop.create_task(self._serve(client, sock), name=f"client {address[0]}:{address[1]}")
             self._tasks.add(task)
+            if self._tls is not None:
+                self._shaking[client] = task
             task.add_done_callback(self._ended)
+            self._retire()
 
     def _make_room(self) -> None:
         while len(self._clients) >= self._max_clients:
             idlest = min(self._clients, key=lambda c: c.last_used_s)
-            self._clients.remove(idlest)
             self.evicted += 1
-            idlest.evict()
+            self._end(idlest, "closed to make room for another client")
+
+    def _end(self, client: ClientConnection, why: str) -> None:
+        self._clients.remove(client)
+        shaking = self._shaking.pop(client, None)
+        if shaking is not None:
+            shaking.cancel()  # there is no connection yet that could be closed
+        else:
+            client.evict(why)
+
+    def _retire(self) -> None:
+        """Close who has been silent for too long, and look again when the next one may have been."""
+        if self._retiring is not None:
+            self._retiring.cancel()
+            self._retiring = None
+        if not self._idle_s:
+            return
+        loop = asyncio.get_running_loop()
+        for client in [c for c in self._clients if loop.time() >= c.last_used_s + self._idle_s]:
+            self.retired += 1
+            self._end(client, f"silent for {self._idle_s:g} s")
+        if self._clients:
+            earliest_s = min(c.last_used_s for c in self._clients) + self._idle_s
+            self._retiring = loop.call_at(earliest_s, self._retire)
 
     async def _serve(self, client: ClientConnection, sock: socket.socket) -> None:
         try:
-            await client.take(sock)
+            await client.take(sock, self._tls)
         except BaseException as e:
             sock.close()
             self._forget(client)
-            if isinstance(e, OSError):
-                return  # it went while it was being accepted
+            if isinstance(e, OSError):  # it went while it was being accepted, or is none that TLS lets in
+                self.unshaken += self._tls is not None
+                return
             raise
+        self._shaking.pop(client, None)
         try:
             await self._on_client(client)
         except ConnectionLost:
@@ -178,6 +227,7 @@ class TcpListener:
             await client.aclose()
 
     def _forget(self, client: ClientConnection) -> None:
+        self._shaking.pop(client, None)
         if client in self._clients:
             self._clients.remove(client)
 

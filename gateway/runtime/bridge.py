@@ -65,11 +65,11 @@ class Route:
 
 @dataclass(frozen=True)
 class BridgeConfig:
-    """`listen` is ``tcp://HOST:PORT`` for clients, or a serial line whose master asks us.
+    """`listen` is ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` for clients, or a serial line whose master asks us.
 
     `routes` go first; a unit that is not in them keeps its id on `to`, where that is given. `broadcast`: unit 0 is passed on
     to every serial line that the bridge reaches, and nobody answers. `queue` bounds what waits for one bus, `in_flight` what
-    one client may have under way. `cache_ms` 0: no cache.
+    one client may have under way. `cache_ms` 0: no cache. `idle_s`: a client that is silent for so long is closed; 0: never.
     """
 
     name: str
@@ -82,6 +82,7 @@ class BridgeConfig:
     clients: int = 16
     queue: int = 32
     in_flight: int = 16
+    idle_s: float = 0.0
     insist: bool = True
     """Whether a port that cannot be listened on is tried again and again; else that is an error."""
 
@@ -155,6 +156,7 @@ class Bridge:
                 in_flight=config.in_flight,
                 admits=config.policy.admits,
                 insist=config.insist,
+                idle_s=config.idle_s,
             )
 
     async def run(self) -> None:
@@ -197,13 +199,13 @@ class Bridge:
         except ModbusExceptionReply:
             self.counters.refused += 1
             raise
-        code = self.config.policy.judge(caller.address, unit, asked)
+        code = self.config.policy.judge(caller.address, unit, asked, caller.role)
         if broadcast and not code and asked.function not in BROADCAST_FUNCTIONS:
             code = ILLEGAL_FUNCTION
         if code:
             self.counters.refused += 1
             if asked.changes:
-                self._record.refused(caller.name, self._place(unit, route), unit, pdu, code)
+                self._record.refused(caller.on_record, self._place(unit, route), unit, pdu, code)
             raise refusal(function, code)
         return asked, route
 
@@ -239,7 +241,7 @@ class Bridge:
             self.counters.full += 1
             raise refusal(asked.function, SERVER_BUSY)
         if asked.changes and (why := self._blocked(route.bus, route.unit)):
-            self._record.refused(caller.name, self._place(0, route), route.unit, pdu, NO_PATH, why)
+            self._record.refused(caller.on_record, self._place(0, route), route.unit, pdu, NO_PATH, why)
             raise refusal(asked.function, NO_PATH)
         promise: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
         self._under_way[route.bus] += 1
@@ -259,13 +261,13 @@ class Bridge:
     ) -> Guest:
         def before() -> None:
             if asked.changes:
-                self._record.asked(caller.name, self._place(0, route), route.unit, pdu)
+                self._record.asked(caller.on_record, self._place(0, route), route.unit, pdu)
 
         def done(result: ForwardedReply | FieldtwinError) -> None:
             response = self._response(route, pdu, asked, result)
             if asked.changes:
                 self.cache.forget(route.bus, route.unit)
-                self._record.ended(caller.name, self._place(0, route), route.unit, pdu, result)
+                self._record.ended(caller.on_record, self._place(0, route), route.unit, pdu, result)
             if promise.done():
                 self.counters.unread += 1
             else:
@@ -317,7 +319,7 @@ class Bridge:
             if not self._is_line(name) or bus.down is not None:
                 continue
             if why := self._blocked(name, 0):
-                self._record.refused(caller.name, f"{name}/0", 0, pdu, NO_PATH, why)
+                self._record.refused(caller.on_record, f"{name}/0", 0, pdu, NO_PATH, why)
                 continue
             promise: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
             if self._under_way[name] < self.config.queue:

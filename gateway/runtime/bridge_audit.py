@@ -43,7 +43,7 @@ class WriteRecord:
 
     def refused(self, by: str, device: str, unit: int, pdu: bytes, code: int, why: str = "") -> None:
         """A write that was not passed on."""
-        client = by.rpartition(":")[0] or by
+        client = by.partition(" (")[0].rpartition(":")[0] or by  # without the port and the role
         now_ns = self._clock.monotonic_ns()
         last_ns, held_back = self._refusals.pop(client, (0, 0))
         if last_ns and now_ns - last_ns < NS_PER_S:

@@ -1,6 +1,7 @@
-"""Who may ask what through a bridge: client networks to units, functions and address ranges. What is not allowed is refused.
+"""Who may ask what through a bridge: client networks and roles to units, functions and address ranges. What is not allowed
+is refused.
 
-Pure: addresses of clients as text, requests as `Asked`. Nothing here knows connections, buses or time.
+Pure: addresses and roles of clients as text, requests as `Asked`. Nothing here knows connections, buses or time.
 """
 
 from __future__ import annotations
@@ -49,16 +50,21 @@ class AllowRule:
     """What the clients of `networks` may ask. `units` as the client says them; None: every unit.
 
     `addresses` holds first and last address by table; None: every address. A table that it does not name is not allowed,
-    nor then is a function without register addresses.
+    nor then is a function without register addresses. `roles`: those of clients' certificates (MBTLS 8.4), where the rule is
+    for some only; None: every client, with a certificate or without.
     """
 
     networks: tuple[Network, ...] = LOOPBACK
     units: frozenset[int] | None = None
     functions: frozenset[int] = READ_FUNCTIONS
     addresses: Mapping[str, tuple[tuple[int, int], ...]] | None = None
+    roles: frozenset[str] | None = None
 
     def admits(self, peer: str) -> bool:
         return peer == LINE or within(peer, self.networks)
+
+    def is_for(self, role: str) -> bool:
+        return self.roles is None or role in self.roles
 
     def judge(self, unit: int, asked: Asked) -> int:
         """`ALLOWED`, or the exception code that says how far the request got: unit, function, address."""
@@ -93,9 +99,14 @@ class Policy:
         """Whether a client from `peer` may connect at all."""
         return any(rule.admits(peer) for rule in self.rules)
 
-    def judge(self, peer: str, unit: int, asked: Asked) -> int:
-        """`ALLOWED`, or the exception code to answer with: 0A for a unit, 01 for a function, 02 for an address."""
-        verdicts = {rule.judge(unit, asked) for rule in self.rules if rule.admits(peer)}
+    def judge(self, peer: str, unit: int, asked: Asked, role: str = "") -> int:
+        """`ALLOWED`, or the exception code to answer with: 0A for a unit, 01 for a function or a role (MBTLS 8.5), 02 for an
+        address."""
+        verdicts = {
+            rule.judge(unit, asked) if rule.is_for(role) else ILLEGAL_FUNCTION
+            for rule in self.rules
+            if rule.admits(peer)
+        }
         if ALLOWED in verdicts:
             return ALLOWED if self.allow_writes or not asked.changes else ILLEGAL_FUNCTION
         return next((code for code in _FARTHEST if code in verdicts), NO_PATH)

@@ -1,4 +1,4 @@
-"""Modbus TCP clients of the gateway: their connections, their requests in order, their answers in the same order.
+"""Modbus TCP clients of the gateway, with TLS or without: their connections, requests in order, answers in the same order.
 
 Who answers is not known here: `ask` is given a request and returns its answer, or a promise of one. A client may have so
 many requests under way and no more (exception 06, case MB-053); one that does not read its answers is not read either.
@@ -29,10 +29,17 @@ MOST_UNSENT = 64
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asks: `name` tells one connection from another, `address` is what allow-lists know."""
+    """Who asks: `name` tells one connection from another, `address` and `role` are what allow-lists know. The role is the
+    one in the client's certificate (MBTLS 8.4), empty without one."""
 
     name: str
     address: str
+    role: str = ""
+
+    @property
+    def on_record(self) -> str:
+        """As audit logs name it."""
+        return f"{self.name} ({self.role})" if self.role else self.name
 
 
 Answer = bytes | None | asyncio.Future[bytes | None]
@@ -66,6 +73,7 @@ class TcpFront:
         in_flight: int = 16,
         admits: Callable[[str], bool] = lambda address: True,
         insist: bool = True,
+        idle_s: float = 0.0,
     ) -> None:
         self.endpoint = endpoint
         self.counters = FrontCounters()
@@ -77,6 +85,7 @@ class TcpFront:
         self._in_flight = in_flight
         self._admits = admits
         self._insist = insist
+        self._idle_s = idle_s
 
     @property
     def bound(self) -> Endpoint | None:
@@ -88,7 +97,9 @@ class TcpFront:
         backoff = Backoff(0.25, 5.0)
         while self.listener is None:
             try:
-                self.listener = await TcpListener.open(self.endpoint, self._serve, self._max_clients, self._admits)
+                self.listener = await TcpListener.open(
+                    self.endpoint, self._serve, self._max_clients, self._admits, self._idle_s
+                )
             except Unreachable as e:
                 if not self._insist:
                     raise
@@ -111,6 +122,8 @@ class TcpFront:
             "accepted": listener.accepted if listener is not None else 0,
             "evicted": listener.evicted if listener is not None else 0,
             "turned_away": listener.refused if listener is not None else 0,
+            "unshaken": listener.unshaken if listener is not None else 0,
+            "retired": listener.retired if listener is not None else 0,
             "requests": c.requests,
             "busy": c.busy,
             "foreign": c.foreign,
@@ -127,7 +140,7 @@ class _Session:
 
     def __init__(self, connection: ClientConnection, ask: Ask, in_flight: int, counters: FrontCounters) -> None:
         self._connection = connection
-        self._caller = Caller(f"{connection.peer}:{connection.peer_port}", connection.peer)
+        self._caller = Caller(f"{connection.peer}:{connection.peer_port}", connection.peer, connection.role)
         self._ask = ask
         self._in_flight = in_flight
         self._counters = counters

@@ -67,7 +67,11 @@ class ServedTag:
 
 @dataclass(frozen=True)
 class ServeConfig:
-    """One server. `if_bad` "nan" is for floats; other types of a bad tag have nothing that could not be a value."""
+    """One server. `if_bad` "nan" is for floats; other types of a bad tag have nothing that could not be a value.
+
+    `roles` in a client's certificate (MBTLS 8.4) may ask, `write_roles` write as well; None: every client, also one
+    without a certificate. `idle_s`: a client that is silent for so long is closed; 0: never.
+    """
 
     name: str
     listen: Endpoint
@@ -76,6 +80,9 @@ class ServeConfig:
     if_bad: Literal["exception", "nan"] = "exception"
     networks: tuple[Network, ...] = EVERYONE
     clients: int = 16
+    roles: frozenset[str] | None = None
+    write_roles: frozenset[str] | None = None
+    idle_s: float = 0.0
 
 
 class Writer(Protocol):
@@ -129,6 +136,7 @@ class TagServer:
             clock,
             max_clients=config.clients,
             admits=lambda address: within(address, config.networks),
+            idle_s=config.idle_s,
         )
 
     async def run(self) -> None:
@@ -154,13 +162,16 @@ class TagServer:
 
     def _answer(self, caller: Caller, pdu: bytes) -> Answer:
         function = pdu[0]
+        if not _is_one_of(caller.role, self.config.roles):
+            raise refusal(function, ILLEGAL_FUNCTION)  # MBTLS 8.5
         if function in (0x01, 0x02, 0x03, 0x04):
             (access,) = examine(pdu).accesses
             data = self._read(function, access)
             self.counters.reads += 1
             return bytes([function, len(data)]) + data
         table: ServedTable = "coil" if function in (0x05, 0x0F) else "holding"
-        if function not in (0x05, 0x06, 0x0F, 0x10) or table not in self._writable:
+        may_write = table in self._writable and _is_one_of(caller.role, self.config.write_roles)
+        if function not in (0x05, 0x06, 0x0F, 0x10) or not may_write:
             raise refusal(function, ILLEGAL_FUNCTION)
         (access,) = examine(pdu).accesses
         return self._write(caller, pdu, access)
@@ -232,8 +243,12 @@ class TagServer:
                 code = _code_of(error) if error is not None else 0
                 promise.set_result(exception_pdu(refusal(function, code)) if code else pdu[:5])
 
-        self._writer.request(served.tag, value, caller.name, done)
+        self._writer.request(served.tag, value, caller.on_record, done)
         return promise
+
+
+def _is_one_of(role: str, roles: frozenset[str] | None) -> bool:
+    return roles is None or role in roles
 
 
 def _written(pdu: bytes, served: ServedTag) -> bytes:

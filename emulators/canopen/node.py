@@ -57,9 +57,11 @@ class NodeContext:
 
     `source` plays values; `model` makes of them, and of what clients write, what the device does. `factory` replaces
     defaults (a serial number). `refusals` are objects that SDO clients get an abort for, whatever the data sheet says.
+
     `tolerate_short_sdo` takes SDO requests of fewer than 8 bytes as padded with zeros, as for old PLCs; by default they are
-    ignored. A TIME producer (1012h) tells its time every `time_period_ms`, 0 for never. `lss` decides about LSS, None lets the
-    data sheet; `lss_store` is what becomes of LSS's store command. `journal_size` bounds both journals: older lines fall off.
+    ignored. `sdo_block` is how many segments a client may send at once, 1 to 127. A TIME producer (1012h) tells its time every
+    `time_period_ms`, 0 for never. `lss` decides about LSS, None lets the data sheet; `lss_store` is what becomes of LSS's store
+    command. `journal_size` bounds both journals: older lines fall off.
     """
 
     source: Source | None = None
@@ -68,6 +70,7 @@ class NodeContext:
     refusals: Mapping[Key, Abort] = field(default_factory=dict)
     tolerate_short_sdo: bool = False
     sdo_timeout_ms: int = 1000
+    sdo_block: int = 127
     time_period_ms: int = 0
     lss: bool | None = None
     lss_store: LssStore = LssStore.WORKS
@@ -108,7 +111,7 @@ class CanopenNode:
         services += [self._lss] if self._lss else []
         view = ClientView(core, services, self._tpdos, context.refusals)
         timeout_ns = context.sdo_timeout_ms * NS_PER_MS
-        self._sdo = SdoChannels(core, view, timeout_ns, tolerate_short=context.tolerate_short_sdo)
+        self._sdo = SdoChannels(core, view, timeout_ns, context.sdo_block, tolerate_short=context.tolerate_short_sdo)
         view.add(self._sdo)
         self._services = (self._sdo, *services)
         if self._behaviour is not None:

@@ -30,6 +30,8 @@ class BlockDownload:
     crc: bool
     overflow: Abort = Abort.TOO_LONG
     """What more than `limit` is refused with."""
+    block: int = MAX_BLOCK
+    """Segments of a sub-block."""
     receiving: bool = True
     """False once the last segment is here and only the end is awaited."""
     data: bytearray = field(default_factory=bytearray)
@@ -39,20 +41,21 @@ class BlockDownload:
     def segment(self, data: bytes) -> bytes | None:
         """One segment; returns the acknowledgement where it ends a sub-block. Raises `SdoAborted`."""
         number = data[0] & 0x7F
-        if not number:
+        if not 1 <= number <= self.block:
             raise abort(self.index, self.subindex, Abort.SEQUENCE)
         last = bool(data[0] & _LAST)
         if number == self.good + 1:
             self.good = number
             self.data += data[1:8]
             self.receiving = not last
-            if len(self.data) >= self.limit + SEGMENT_BYTES:
+            room = max(-(-self.limit // SEGMENT_BYTES), 1) * SEGMENT_BYTES  # nothing at all takes a segment too
+            if len(self.data) > room:
                 raise abort(self.index, self.subindex, self.overflow)
-        return self.acknowledge() if last or number == MAX_BLOCK else None
+        return self.acknowledge() if last or number == self.block else None
 
     def acknowledge(self) -> bytes:
         """Says up to where the sub-block is good, and begins the next one."""
-        reply = bytes([0xA2, self.good, MAX_BLOCK]) + bytes(5)
+        reply = bytes([0xA2, self.good, self.block]) + bytes(5)
         self.good = 0
         return reply
 

@@ -21,11 +21,11 @@ _RESERVED = 0x3FFFF800
 class SdoChannels(Service):
     """All SDO servers of a node, each with its own transfer. `tolerate_short` takes requests of fewer than 8 bytes."""
 
-    def __init__(self, core: Core, access: ObjectAccess, timeout_ns: int, *, tolerate_short: bool) -> None:
+    def __init__(self, core: Core, access: ObjectAccess, timeout_ns: int, block: int, *, tolerate_short: bool) -> None:
         self._core = core
         self._tolerate_short = tolerate_short
         additional = [index for index in sorted(core.data.dictionary.objects) if index in _ADDITIONAL]
-        self._servers = {index: SdoServer(access, timeout_ns) for index in (DEFAULT, *additional)}
+        self._servers = {index: SdoServer(access, timeout_ns, block) for index in (DEFAULT, *additional)}
 
     def owns(self, index: int) -> bool:
         return index == DEFAULT or index in self._servers

@@ -66,11 +66,12 @@ class SdoServer:
     """One SDO channel. One transfer at a time; a new initiate replaces a running one.
 
     While a sub-block of a block download comes in, every frame but an abort is one of its segments: the standard leaves
-    no other way to tell them apart.
+    no other way to tell them apart. `block` is how many segments a client may send at once.
     """
 
-    def __init__(self, access: ObjectAccess, timeout_ns: int) -> None:
+    def __init__(self, access: ObjectAccess, timeout_ns: int, block: int = MAX_BLOCK) -> None:
         self._access = access
+        self._block = block
         self._timeout_ns = timeout_ns
         self._transfer: _Transfer | None = None
         self._deadline_ns: int | None = None
@@ -223,8 +224,10 @@ class SdoServer:
             self.reset()
             index, subindex = _MUX.unpack_from(data, 1)
             announced, limit, overflow = self._room(index, subindex, data[4:8] if data[0] & 0x02 else b"")
-            self._transfer = BlockDownload(index, subindex, announced, limit, bool(data[0] & 0x04), overflow)
-            return [b"\xa4" + data[1:4] + bytes([MAX_BLOCK, 0, 0, 0])]
+            self._transfer = BlockDownload(
+                index, subindex, announced, limit, bool(data[0] & 0x04), overflow, self._block
+            )
+            return [b"\xa4" + data[1:4] + bytes([self._block, 0, 0, 0])]
         if not isinstance(transfer, BlockDownload):
             raise self._out_of_turn()
         self._access.write(transfer.index, transfer.subindex, transfer.end(data), now_ns)

@@ -77,6 +77,13 @@ class Change:
     data: bytes
 
 
+_VALUES = frozenset({"write", "rpdo", "set"})
+"""Changes whose data are an object's value."""
+
+Held = Callable[[Mapping[tuple[int, int], bytes], int], None]
+"""Told (values by object, now_ns) of what the node's objects hold from now on: the oracle of a prototype run."""
+
+
 class Source(Protocol):
     """Values that change by themselves: a recorded or computed signal."""
 
@@ -103,6 +110,7 @@ class Core:
         """Reasons why nothing can be sent now."""
         self._source = source
         self._out: list[CanFrame] = []
+        self.held: Held | None = None
 
     @property
     def communicating(self) -> bool:
@@ -129,12 +137,17 @@ class Core:
     def refresh(self, now_ns: int) -> None:
         """Take the source's values of `now_ns`. Raises `UsageError` when they do not fit the dictionary."""
         if self._source is not None:
-            for (index, subindex), raw in self._source(now_ns).items():
+            values = self._source(now_ns)
+            for (index, subindex), raw in values.items():
                 self.data.put(index, subindex, raw)
+            if self.held is not None:
+                self.held(values, now_ns)
 
     def note(self, now_ns: int, what: str, index: int, subindex: int, data: bytes) -> None:
         """One line in the journal of changes."""
         self.changes.append(Change(now_ns, what, index, subindex, data))
+        if self.held is not None and what in _VALUES:
+            self.held({(index, subindex): data}, now_ns)
 
 
 class Service:

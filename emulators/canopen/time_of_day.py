@@ -67,7 +67,7 @@ class TimeService(Service):
 
     def check_write(self, index: int, subindex: int, raw: bytes) -> None:
         new, old = int.from_bytes(raw, "little"), self._core.data.number(COB_ID)
-        moved = (new ^ old) & 0x7FF and (new | old) & (_CONSUMES | _PRODUCES) and old & (_CONSUMES | _PRODUCES)
+        moved = (new ^ old) & 0x7FF and old & (_CONSUMES | _PRODUCES)
         if new & 0x3FFFF800 or moved:
             raise abort(index, subindex, Abort.VALUE)
 

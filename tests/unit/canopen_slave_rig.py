@@ -45,21 +45,41 @@ def pdo(comm: str, mapping: str, cob: str, kind: int, maps: list[int], room: int
 
 RICH = "".join(
     [
-        "[DeviceInfo]\nVendorName=rig\nVendorNumber=\nNrOfTXPDO=2\nNrOfRXPDO=2\n",
+        "[DeviceInfo]\nVendorName=rig\nVendorNumber=\nNrOfTXPDO=2\nNrOfRXPDO=2\nLSS_Supported=1\nBaudRate_125=1\nBaudRate_500=1\n",
         "[DummyUsage]\nDummy0005=1\n",
         var("1000", U32, "ro", "0x0"),
         var("1001", U8, "ro", 0, 1),
         record("1003", [var("1003sub0", U8), *(var(f"1003sub{n}", U32, "ro") for n in (1, 2, 3))], 8),
         var("1005", U32, "rw", "0x80"),
+        var("1006", U32, "rw", 0),
+        var("1007", U32, "rw", 0),
         var("1008", STRING, "const", "a node for tests"),
         var("100C", U16, "rw", 0),
+        var("100D", U8, "rw", 0),
         record("1010", [var("1010sub0", U8, "ro", 3), *(var(f"1010sub{n}", U32, "rw", 1) for n in (1, 2, 3))], 8),
         record("1011", [var("1011sub0", U8, "ro", 3), *(var(f"1011sub{n}", U32, "rw", 1) for n in (1, 2, 3))], 8),
+        var("1012", U32, "rw", "0x80000100"),
         var("1014", U32, "rw", "$NODEID+0x80"),
         var("1015", U16, "rw", 0),
         record("1016", [var("1016sub0", U8, "ro", 2), var("1016sub1", U32), var("1016sub2", U32)], 8),
         var("1017", U16, "rw", 0),
+        record(
+            "1018",
+            [
+                var("1018sub0", U8, "const", 4),
+                *(var(f"1018sub{n}", U32, "ro", v) for n, v in ((1, 0x1F4), (2, 0x20), (3, 3), (4, 0x12345678))),
+            ],
+        ),
         var("1019", U8, "rw", 0),
+        record(
+            "1201",
+            [
+                var("1201sub0", U8, "const", 3),
+                var("1201sub1", U32, "rw", "0x80000000"),
+                var("1201sub2", U32, "rw", "0x80000000"),
+                var("1201sub3", U8, "rw", 0),
+            ],
+        ),
         record("1029", [var("1029sub0", U8, "ro", 1), var("1029sub1", U8)], 8),
         pdo("1400", "1600", "$NODEID+0x200", 255, [0x20000010, 0x20010008]),
         pdo("1401", "1601", "$NODEID+0x300", 1, [0x00050008, 0x20000010]),

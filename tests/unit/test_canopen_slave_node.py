@@ -338,7 +338,7 @@ def test_communication_parameters(rig: Rig) -> None:
     assert rig.write(0x1800, 1, 0x585 + 1, 4) == "06090030", "restricted"
     assert rig.write(0x1800, 1, 1 << 29 | 0x185, 4) == "06090030", "no 29-bit identifiers"
     assert rig.write(0x1800, 1, 0x1A0, 4) == ""
-    assert rig.write(0x1005, 0, 1 << 30 | 0x80, 4) == "06090030", "produces no SYNC"
+    assert rig.write(0x1005, 0, 1 << 29 | 0x80, 4) == "06090030", "no 29-bit identifiers"
 
 
 # -- RPDO ---------------------------------------------------------------------------------------------------------

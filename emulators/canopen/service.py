@@ -7,6 +7,7 @@ know the core, never the SDO server nor each other, save where one is given to a
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import NamedTuple, Protocol

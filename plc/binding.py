@@ -25,8 +25,8 @@ _ST_SUFFIXES = (".st", ".xml")
 class InputBinding:
     """Where an input comes from, and what a program sees while that is BAD.
 
-    `if_bad` is ``"pass"`` (the value as it is, BAD), ``"hold"`` (the last one that was not, UNCERTAIN) or a number to
-    put in its place (SUBSTITUTED).
+    `if_bad` is ``"pass"`` (the value as it is, BAD), ``"hold"`` (the last one that was not, UNCERTAIN), a number to put in
+    its place (SUBSTITUTED), or ``"trip"``: a bad one, once it was good, stops the task with its outputs safe.
     """
 
     tag: str
@@ -160,8 +160,8 @@ def substitute(spec: TagSpec, if_bad: str | float) -> Scalar | None:
     Raises `FileInvalid` where it makes no sense.
     """
     if isinstance(if_bad, str):
-        if if_bad not in ("hold", "pass"):
-            raise FileInvalid(f"if_bad of {spec.name}", expected="hold, pass or a number", got=repr(if_bad))
+        if if_bad not in ("hold", "pass", "trip"):
+            raise FileInvalid(f"if_bad of {spec.name}", expected="hold, pass, trip or a number", got=repr(if_bad))
         return None
     if spec.kind is TagKind.REAL:
         return float(if_bad)

@@ -57,7 +57,8 @@ class Role(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A declared variable. `initial` is what it is before the first scan; `max_bytes` and `depth` are a message output's."""
+    """A declared variable. `initial` is what it is before the first scan; `max_bytes` and `depth` are a message output's;
+    `retain`: its value outlives the process."""
 
     name: str
     role: Role
@@ -66,6 +67,7 @@ class Variable:
     unit: str = ""
     max_bytes: int = 0
     depth: int = 0
+    retain: bool = False
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:
@@ -81,6 +83,11 @@ def var_output(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> 
 def var_local(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> Any:
     """Declare a local variable that watchers see as ``<program>.<name>``."""
     return Variable("", Role.LOCAL, kind, initial, unit)
+
+
+def var_retain(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> Any:
+    """Declare a local variable (VAR RETAIN) that a warm start finds as the last scan before left it."""
+    return Variable("", Role.LOCAL, kind, initial, unit, retain=True)
 
 
 def message_input() -> Any:
@@ -164,6 +171,20 @@ class Program(ABC):
     def execute(self, scan: ScanInfo) -> None:
         """One scan: read inputs, set outputs, return. What it raises stops the task."""
 
+    def put(self, name: str, value: Scalar) -> None:
+        """Set a variable from outside the logic: what a force does."""
+        self.__dict__[name] = value
+
+    def retained(self) -> dict[str, Any]:
+        """What a warm start needs: numbers, strings, lists and maps of those by variable."""
+        return {v.name: self.__dict__[v.name] for v in self.variables.values() if v.retain}
+
+    def restore(self, kept: dict[str, Any]) -> None:
+        """The inverse of `retained`; variables that are not in `kept` begin with their initial value."""
+        for v in self.variables.values():
+            if v.retain and v.name in kept:
+                self.__dict__[v.name] = kept[v.name]
+
     def tag(self, name: str) -> TagValue:
         """Input `name` with quality, reason and time, as this scan sees it (after its substitute policy)."""
         if self._lookup is None:
@@ -184,4 +205,5 @@ __all__ = [
     "var_input",
     "var_local",
     "var_output",
+    "var_retain",
 ]

@@ -163,15 +163,21 @@ class RegionWriter(_Region):
         now_ns: int,
         messages: Mapping[str, Sequence[tuple[int, bytes]]] | None = None,
         flags: RegionFlag = RegionFlag.NONE,
+        but: Mapping[int, Quality] | None = None,
     ) -> int:
         """`publish` for a writer whose values are all of one quality and instant (a scan): no object a tag is made.
 
-        A None has no value and is BAD, NEVER_READ.
+        `but` has the quality of the few tags, by index, that differ. A None has no value and is BAD, NEVER_READ.
         """
         count = len(values)
         marks, reasons = bytes([quality]) * count, bytes([reason]) * count
+        if but:
+            mixed = bytearray(marks)
+            for index, other in but.items():
+                mixed[index] = other
+            marks = bytes(mixed)
         if None in values:
-            marks = bytes([Quality.BAD | _NO_VALUE if v is None else quality for v in values])
+            marks = bytes([Quality.BAD | _NO_VALUE if v is None else m for v, m in zip(values, marks, strict=True)])
             reasons = bytes([Reason.NEVER_READ if v is None else reason for v in values])
         return self._publish(list(values), marks, reasons, [now_ns] * count, now_ns, messages, flags)
 

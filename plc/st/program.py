@@ -13,7 +13,7 @@ from typing import Any
 
 from gateway.core.errors import FileInvalid
 from gateway.core.image import Message, TagKind
-from gateway.core.values import Quality, TagValue
+from gateway.core.values import Quality, Scalar, TagValue
 from plc.blocks import BLOCKS
 from plc.program import Program, Role, ScanInfo, Variable, message_input, message_output
 from plc.st import types as ty
@@ -56,6 +56,7 @@ class StProgram(Program):
         self.body: Any = space[f"P_{self.declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
         self._inputs = [_Input(v) for v in self.declared.variables if v.role == "input"]
+        self._attributes = {v.name: _attribute(v) for v in self.declared.variables}
         self._outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
         for v in self.declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
@@ -79,6 +80,11 @@ class StProgram(Program):
         for name, attribute, convert in self._outputs:
             value = getattr(body, attribute)
             namespace[name] = convert(value) if convert else value
+
+    def put(self, name: str, value: Scalar) -> None:
+        super().put(name, value)
+        if name in self._attributes:
+            setattr(self.body, self._attributes[name], value)
 
     # -- what is kept over a restart --------------------------------------------------------------------------------------
 
@@ -138,11 +144,11 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
             if hasattr(StProgram, v.name) or v.name in _RESERVED:
                 raise FileInvalid(f"variable {v.name} of {found.name} needs another name", path=unit.path, got=v.name)
             unit_of = "ns" if ty.is_kind(v.kind, "duration") else ""
-            body[v.name] = Variable(v.name, _ROLES[v.role], kind, unit=unit_of)
+            body[v.name] = Variable(v.name, _ROLES[v.role], kind, unit=unit_of, retain=v.retain)
     return type(found.name, (StProgram,), body)
 
 
-_RESERVED = frozenset({"context", "body", "declared", "unit", "source_path", "_inputs", "_outputs"})
+_RESERVED = frozenset({"context", "body", "declared", "unit", "source_path", "_inputs", "_outputs", "_attributes"})
 
 
 def load_file(path: Path, name: str = "") -> type[StProgram]:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from gateway.core.errors import FileInvalid
+from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.image import (
     INPUTS,
     OUTPUTS,
@@ -321,7 +321,7 @@ def bind(**bindings: InputBinding) -> BoundProgram:
         ([bind()], "bound to no tag"),
         ([bind(x=InputBinding("d.nothing"))], "does not exist"),
         ([bind(x=InputBinding("d.bool"))], "differ in kind"),
-        ([bind(x=InputBinding("d.real", "trip"))], "if_bad"),
+        ([bind(x=InputBinding("d.real", "drop"))], "if_bad"),
         ([bind(x=InputBinding("d.int", 1.5))], "if_bad"),
     ],
 )
@@ -352,3 +352,94 @@ def test_sources_that_are_no_program_are_refused(source: str) -> None:
 
 def test_a_program_is_loaded_from_a_source() -> None:
     assert type(load_program("python: plc.relay:Relay")).__name__ == "Relay"
+
+
+# -- forces, trips, changes ------------------------------------------------------------------------------------------
+
+
+def force(rig: Rig, tag: str, value: Scalar) -> None:
+    regions = {spec.name: (spec, region.name == INPUTS) for region in rig.layout.regions for spec in region.tags}
+    spec, is_input = regions[tag]
+    rig.scan.output_image.forces.force(spec, value, is_input, 5, "test")
+
+
+def test_a_forced_input_is_what_the_logic_sees_whatever_the_plant_says() -> None:
+    rig = Rig(n="trip")
+    rig.feed(10, x=1.5, n=3)
+    force(rig, "d.real", 7)
+    force(rig, "d.int", 9)
+    seen: list[TagValue] = []
+    rig.program.also = lambda scan: seen.extend((rig.program.tag("x"), rig.program.tag("n")))
+    out = rig.execute(11)
+    assert seen == [TagValue(7.0, Quality.SIMULATED, t_ns=5), TagValue(9, Quality.SIMULATED, t_ns=5)]
+    assert out.value("d.out") == TagValue(7.0, Quality.GOOD, t_ns=11 * MS)
+    rig.feed(12, x=1.5, n=bad(3))
+    rig.execute(12)  # a forced input does not trip
+    rig.scan.output_image.forces.clear()
+    with pytest.raises(ProgramFailed, match=r"copy, d\.int.*timeout"):
+        rig.execute(13)
+
+
+def test_a_forced_output_is_published_simulated_and_the_logic_sees_it_before_it_runs() -> None:
+    rig = Rig()
+    rig.feed(10, x=1.5)
+    force(rig, "d.out", -4.0)
+    force(rig, "copy.count", 100)
+    out = rig.execute(11)
+    assert out.value("d.out") == TagValue(-4.0, Quality.SIMULATED, t_ns=11 * MS)
+    assert out.value("copy.count") == TagValue(100, Quality.SIMULATED, t_ns=11 * MS)
+    assert out.value("copy.first").quality is Quality.GOOD
+    rig.scan.output_image.forces.unforce("copy.count")
+    assert rig.execute(12).value("copy.count").value == 101
+
+
+def test_a_force_that_the_tag_cannot_hold_is_refused() -> None:
+    rig = Rig()
+    for tag, value in (("d.int", 1.5), ("d.bool", 2), ("d.real", "x"), ("m.inbox", 1)):
+        with pytest.raises(UsageError, match="cannot be forced"):
+            force(rig, tag, value)
+
+
+def test_trip_waits_until_the_input_was_good_once() -> None:
+    rig = Rig(x="trip")
+    rig.feed(10, x=bad(None))
+    rig.execute(11)
+    rig.feed(12, x=1.0)
+    rig.execute(12)
+    rig.feed(13, x=bad(1.0))
+    with pytest.raises(ProgramFailed, match="must not be bad is: timeout"):
+        rig.execute(13)
+
+
+def test_why_a_tag_changed_is_known() -> None:
+    rig = Rig()
+    rig.feed(10, x=1.5, n=7)
+    rig.execute(11)
+    rig.execute(12)
+    rig.feed(13, x=2.5, n=8)
+    rig.execute(13)
+    changes = rig.scan.output_image.changes["d.out"]
+    assert [(c.scan, c.program, c.before, c.after) for c in changes] == [(1, "copy", None, 1.5), (3, "copy", 1.5, 2.5)]
+    assert changes[-1].inputs == {"x": 2.5, "n": 8, "flag": False}
+    assert changes[-1].describe(14 * MS)["age_ms"] == 1.0
+
+
+def test_outputs_first_publishes_at_the_cycles_start_what_the_scan_before_computed() -> None:
+    rig = Rig()
+    scan = Scan(rig.image, [rig.bound], 100, outputs_first=True)
+    published = []
+    for ms in (10, 20, 30):
+        rig.feed(ms, x=float(ms))
+        rig.program.also = lambda info: published.append(rig.reader.snapshot().value("d.out").value)
+        scan.execute(ms * MS)
+    assert published == [None, 10.0, 20.0]
+
+
+def test_a_paused_task_keeps_publishing_what_it_had() -> None:
+    rig = Rig()
+    rig.feed(10, x=1.5)
+    rig.execute(11)
+    rig.feed(20, x=9.0)
+    rig.scan.hold(21 * MS)
+    out = rig.reader.snapshot()
+    assert (out.t_ns, out.value("d.out").value, out.stopped) == (21 * MS, 1.5, False)

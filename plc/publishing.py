@@ -1,0 +1,223 @@
+"""The output image of a PLC: what all programs of all tasks publish, as one region with one writer.
+
+Each scan publishes the whole region: its own programs' values as they are now, the others' as their last scan left them.
+Forced outputs are put in, messages are taken from the outboxes, and whatever cannot be a value of its tag is refused with the
+program's name. It must never know when a scan is due.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gateway.core.errors import FileInvalid
+from gateway.core.image import (
+    INPUTS,
+    OUTPUTS,
+    Image,
+    NotEncodable,
+    RegionFlag,
+    RegionReader,
+    RegionShape,
+    TagKind,
+    TagSpec,
+    consumed_name,
+    taken_name,
+)
+from gateway.core.values import Quality, Reason, Scalar
+from plc.binding import BoundProgram
+from plc.forces import Forces
+from plc.program import Outbox, ProgramFailed, Variable
+
+Seen = Callable[[], dict[str, Scalar | None]]
+"""A program's inputs as it read them, by variable."""
+
+MAX_CHANGES = 16
+"""Changes of a tag that are remembered, with what the program saw when it made them."""
+
+
+class Output:
+    """One published variable: where the program keeps it. `taken` is where INPUTS says how far its messages got."""
+
+    def __init__(self, bound: BoundProgram, variable: Variable, spec: TagSpec, index: int) -> None:
+        self.program = bound.program
+        self.namespace = bound.program.__dict__
+        self.name = variable.name
+        self.owner = bound.name
+        self.tag = spec.name
+        self.index = index
+        self.taken: int | None = None
+        self.outbox: Outbox | None = None
+        if spec.kind is TagKind.MESSAGE:
+            box: Outbox = self.namespace[variable.name]
+            box.max_bytes, box.depth = spec.max_bytes, spec.depth
+            self.outbox = box
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Who last changed a tag, and what it saw: the answer to "why". `inputs` are the program's, as it read them."""
+
+    tag: str
+    t_ns: int
+    scan: int
+    program: str
+    before: Scalar | None
+    after: Scalar | None
+    inputs: dict[str, Scalar | None]
+    forced: bool = False
+
+    def describe(self, now_ns: int) -> dict[str, Any]:
+        """JSON-able."""
+        return {
+            "tag": self.tag,
+            "age_ms": (now_ns - self.t_ns) / 1e6,
+            "scan": self.scan,
+            "program": self.program,
+            "before": self.before,
+            "after": self.after,
+            "inputs": self.inputs,
+            "forced": self.forced,
+        }
+
+
+class OutputImage:
+    """The writer of OUTPUTS for all programs. Raises `FileInvalid` when the image and the programs do not match."""
+
+    def __init__(self, image: Image, programs: Sequence[BoundProgram], forces: Forces | None = None) -> None:
+        self.forces = forces or Forces()
+        self.writer = image.writer(OUTPUTS)
+        self.outputs: list[Output] = []
+        self.outboxes: list[tuple[Output, Outbox]] = []
+        self.consumed: list[str] = []
+        self.changes: dict[str, deque[Change]] = {}
+        self._readers: dict[str, RegionReader] = {}
+        self._bind(programs, image.reader(INPUTS).shape)
+        layout = self.writer.shape.layout
+        self._reals = [o.index for o in self.outputs if layout.tags[o.index].kind is TagKind.REAL]
+        self._plain = [o for o in self.outputs if o.outbox is None]
+        self._resumed = self._before(image)
+        self._values: list[Scalar | None] = [None] * (len(self.outputs) + len(self.consumed))
+        for n, tag in enumerate(self.consumed, len(self.outputs)):
+            self._values[n] = self._resumed[tag]
+
+    def _bind(self, programs: Sequence[BoundProgram], inputs: RegionShape) -> None:
+        shape = self.writer.shape
+        made = {tag: (bound, variable) for bound in programs for variable, tag in bound.published()}
+        for tag in made:
+            find(shape, tag)
+        for index, spec in enumerate(shape.layout.tags):
+            if spec.name not in made:
+                if not spec.name.endswith(consumed_name("")):
+                    raise FileInvalid(f"no program writes {spec.name}", expected=", ".join(sorted(made)))
+                self.consumed.append(spec.name.removesuffix(consumed_name("")))
+                continue
+            if self.consumed:
+                raise FileInvalid(f"{spec.name} stands behind the consumed tags", expected="a layout of process_image")
+            bound, variable = made[spec.name]
+            source = Output(bound, variable, spec, index)
+            self.outputs.append(source)
+            if source.outbox is not None:
+                source.taken = inputs.index.get(taken_name(spec.name))
+                self.outboxes.append((source, source.outbox))
+
+    def _before(self, image: Image) -> dict[str, int]:
+        """What a process before this one had consumed, by message tag."""
+        before = image.reader(OUTPUTS).snapshot()
+        found = {}
+        for tag in self.consumed:
+            value = before.value(consumed_name(tag)).value
+            found[tag] = value if isinstance(value, int) else 0
+        return found
+
+    def reads(self, tag: str, reader: RegionReader) -> None:
+        """The messages of `tag` are consumed through `reader`. Raises `FileInvalid` when another reader does already."""
+        if self._readers.setdefault(tag, reader) is not reader:
+            raise FileInvalid(f"messages of {tag} go to programs of two tasks", expected="programs of one task")
+        reader.resume(tag, self._resumed[tag])
+
+    # -- the cycle ----------------------------------------------------------------------------------------------------
+
+    def force(self) -> None:
+        """Put forced outputs and locals into their programs, before the logic."""
+        forced = self.forces.outputs
+        if forced:
+            for output in self._plain:
+                if output.tag in forced:
+                    output.program.put(output.name, forced[output.tag].value)
+
+    def room(self, taken: Sequence[Scalar | None]) -> None:
+        """Learn from INPUTS how far the messages got that were sent."""
+        for output, outbox in self.outboxes:
+            got = taken[output.taken] if output.taken is not None else 0
+            outbox.outstanding = self.writer.last_sequence(output.tag) - (got if isinstance(got, int) else 0)
+
+    def collect(self, now_ns: int, scan: int, programs: Mapping[str, Seen]) -> None:
+        """Take the values of `programs` as they are; changes are remembered with what the program saw."""
+        values = self._values
+        forced = self.forces.outputs
+        for output in self.outputs:
+            seen = programs.get(output.owner)
+            if seen is None:
+                continue
+            value = output.namespace[output.name]
+            if output.outbox is not None:
+                if value is not output.outbox:
+                    raise ProgramFailed(output.owner, "an outbox was overwritten; call its send()", variable=output.tag)
+                continue
+            force = forced.get(output.tag)
+            if force is not None:
+                output.program.put(output.name, force.value)
+                value = force.value
+            before = values[output.index]
+            if value != before or value is None:
+                if value != value:  # not a number must not reach a plant
+                    value = None
+                if value != before:
+                    kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
+                    kept.append(
+                        Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None)
+                    )
+                values[output.index] = value
+
+    def publish(self, now_ns: int) -> None:
+        """Publish what was collected. Raises `ProgramFailed` naming the program whose value no tag can hold."""
+        values = self._values
+        messages = {}
+        for output, outbox in self.outboxes:
+            values[output.index] = 0
+            if outbox.pending:
+                messages[output.tag] = outbox.pending
+                outbox.pending = []
+        for n, tag in enumerate(self.consumed, len(self.outputs)):
+            reader = self._readers.get(tag)
+            if reader is not None:
+                values[n] = reader.seen(tag)
+        but = None
+        if self.forces.outputs:
+            but = {o.index: Quality.SIMULATED for o in self._plain if o.tag in self.forces.outputs}
+        try:
+            self.writer.publish_columns(values, Quality.GOOD, Reason.NONE, now_ns, messages, but=but)
+        except NotEncodable as e:
+            values[self.writer.shape.index[e.tag]] = None  # so that stopping can publish what is left
+            owner = next((output.owner for output in self.outputs if output.tag == e.tag), "?")
+            raise ProgramFailed(owner, f"{e.message}; expected {e.expected}; got {e.got}", variable=e.tag) from e
+
+    def stop(self, now_ns: int) -> None:
+        """Publish that nothing may be acted upon any more: flagged stopped, every tag BAD, values as last."""
+        self.writer.publish_columns(self._values, Quality.BAD, Reason.NOT_OPERATIONAL, now_ns, None, RegionFlag.STOPPED)
+
+    def last(self) -> dict[str, Scalar | None]:
+        """Every tag of OUTPUTS as last collected; a message tag's last sequence."""
+        shown = dict(zip(self.writer.shape.index, self._values, strict=True))
+        return shown | {output.tag: self.writer.last_sequence(output.tag) for output, _ in self.outboxes}
+
+
+def find(shape: RegionShape, tag: str) -> tuple[TagSpec, int]:
+    """A tag's place in a region. Raises `FileInvalid`."""
+    index = shape.index.get(tag)
+    if index is None:
+        raise FileInvalid(f"tag {tag} is not in the process image", expected=f"a tag of region {shape.layout.name}")
+    return shape.layout.tags[index], index

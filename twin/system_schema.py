@@ -166,7 +166,7 @@ class BridgeForm(Strict):
     to: Name | None = Field(default=None, description="the bus on which units keep their ids")
     units: dict[int, str] = Field(default={}, description="unit id of a client -> BUS/UNIT")
     allow: list[AllowForm] = Field(default=[], description="default: reading functions, from this host")
-    broadcast: bool = Field(default=False, description="pass unit 0 on to serial lines")
+    broadcast: bool | Literal["answer"] = Field(default=False, description="pass unit 0 on to lines; answer: say so")
     cache_ms: int = Field(default=0, ge=0, le=60_000)
     clients: int = Field(default=16, ge=1, le=1000)
     queue: int = Field(default=32, ge=1, le=64)

@@ -38,6 +38,12 @@ ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
 @click.option("--clients", type=click.IntRange(1, 1000), default=16, show_default=True, help="Connections at a time.")
 @click.option("--queue", type=click.IntRange(1, 64), default=32, show_default=True, help="Requests that may wait.")
 @click.option("--broadcast", is_flag=True, help="Pass unit 0 on to the line; nobody answers.")
+@click.option("--answer-broadcast", is_flag=True, help="The same, and tell the client that it went out.")
+@click.option("--pause", "pause_s", type=Duration(), default="0", help="Between one exchange and the next on TARGET.")
+@click.option("--idle", "idle_s", type=Duration(), default="0", help="Close clients that were silent for so long.")
+@click.option(
+    "--role", "roles", multiple=True, metavar="ROLE", help="tls: only clients whose certificate says so. Repeatable."
+)
 @click.option("--instance", default="", help="Name of the run directory, where the audit log is.")
 @json_option
 def command(
@@ -52,6 +58,10 @@ def command(
     clients: int,
     queue: int,
     broadcast: bool,
+    answer_broadcast: bool,
+    pause_s: float,
+    idle_s: float,
+    roles: tuple[str, ...],
     instance: str,
     as_json: bool,
 ) -> int:
@@ -59,13 +69,17 @@ def command(
 
     \b
     fieldtwin bridge tcp://0.0.0.0:502 "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1" --allow 10.0.0.0/24
+    fieldtwin bridge "tls://0.0.0.0:802?cert=us.pem&key=us.key&ca=clients.pem" rtu:/dev/ttyUSB0 --allow 0.0.0.0/0
     fieldtwin bridge "rtu:/dev/ttyS1?baudrate=19200" tcp://plc:502 --unit 1=255     a master on a line asks a TCP device
 
     Read-only and for this host, unless told otherwise. Unknown units are refused with exception 0A, silent ones with 0B, and
     those are then left alone for a while.
     """
+    here = Endpoint.parse(listen)
+    if roles and here.scheme != "tls":
+        raise UsageError("roles are in clients' certificates", expected="tls://HOST:PORT", got=listen)
     options = BridgeOptions(
-        listen=Endpoint.parse(listen),
+        listen=here,
         target=Endpoint.parse(target),
         networks=tuple(network(text) for text in networks) or LOOPBACK,
         allow_writes=allow_writes,
@@ -76,6 +90,10 @@ def command(
         clients=clients,
         queue=queue,
         broadcast=broadcast,
+        answer_broadcast=answer_broadcast,
+        pause_s=pause_s,
+        idle_s=idle_s,
+        roles=frozenset(roles) or None,
         instance=instance,
     )
     if not networks and options.listen.host not in ANYWHERE:

@@ -35,7 +35,9 @@ WATCH_NS = NS_PER_S // 5
 
 @dataclass(frozen=True)
 class BridgeOptions:
-    """What the command line said. `units` maps a client's unit id to the target's; empty: every unit keeps its own."""
+    """What the command line said. `units` maps a client's unit id to the target's; empty: every unit keeps its own.
+    `pause_s` is kept behind each exchange with the target.
+    """
 
     listen: Endpoint
     target: Endpoint
@@ -48,6 +50,10 @@ class BridgeOptions:
     clients: int = 16
     queue: int = 32
     broadcast: bool = False
+    answer_broadcast: bool = False
+    pause_s: float = 0.0
+    idle_s: float = 0.0
+    roles: frozenset[str] | None = None
     instance: str = ""
 
 
@@ -59,11 +65,15 @@ def bridge_config(options: BridgeOptions) -> BridgeConfig:
         listen=options.listen,
         to=None if options.units else TARGET,
         routes={unit: Route(TARGET, there) for unit, there in options.units},
-        policy=Policy((AllowRule(networks=options.networks, functions=functions),), options.allow_writes),
-        broadcast=options.broadcast,
+        policy=Policy(
+            (AllowRule(networks=options.networks, functions=functions, roles=options.roles),), options.allow_writes
+        ),
+        broadcast=options.broadcast or options.answer_broadcast,
+        answer_broadcast=options.answer_broadcast,
         cache_ms=options.cache_ms,
         clients=options.clients,
         queue=options.queue,
+        idle_s=options.idle_s,
         insist=False,
     )
 
@@ -91,7 +101,7 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
     with Instance(instance_name(options)) as instance:
         audit = AuditLog(instance.path("audit.jsonl"), clock)
         try:
-            config = BusConfig(TARGET, options.target, options.timeout_s, options.retries)
+            config = BusConfig(TARGET, options.target, options.timeout_s, options.retries, spacing_s=options.pause_s)
             bus = ModbusBus(config, [], connector, clock, TagTable(clock), lambda driver: None)
             bridge = Bridge(bridge_config(options), {TARGET: bus}, connector, clock, audit)
             if options.allow_writes:

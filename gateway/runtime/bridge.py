@@ -44,6 +44,7 @@ from gateway.protocols.modbus.server_forward import ForwardedReply
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.bridge_audit import WriteRecord
+from gateway.runtime.bridge_broadcast import when_all_are_out
 from gateway.runtime.bridge_cache import ReplyCache
 from gateway.runtime.bridge_line import LineFront
 from gateway.runtime.bridge_policy import Policy
@@ -68,8 +69,9 @@ class BridgeConfig:
     """`listen` is ``tcp://HOST:PORT`` or ``tls://HOST:PORT`` for clients, or a serial line whose master asks us.
 
     `routes` go first; a unit that is not in them keeps its id on `to`, where that is given. `broadcast`: unit 0 is passed on
-    to every serial line that the bridge reaches, and nobody answers. `queue` bounds what waits for one bus, `in_flight` what
-    one client may have under way. `cache_ms` 0: no cache. `idle_s`: a client that is silent for so long is closed; 0: never.
+    to every serial line that the bridge reaches, and nobody answers; with `answer_broadcast` we do, once it went out. `queue`
+    bounds what waits for one bus, `in_flight` what one client may have under way. `cache_ms` 0: no cache. `idle_s`: a client
+    that is silent for so long is closed; 0: never.
     """
 
     name: str
@@ -78,6 +80,7 @@ class BridgeConfig:
     routes: Mapping[int, Route] = field(default_factory=dict)
     policy: Policy = field(default_factory=Policy)
     broadcast: bool = False
+    answer_broadcast: bool = False
     cache_ms: int = 0
     clients: int = 16
     queue: int = 32
@@ -180,8 +183,8 @@ class Bridge:
         try:
             asked, route = self._judged(caller, unit, pdu)
             if route is None:
-                self._broadcast(caller, pdu, asked)
-                return None
+                sent = self._broadcast(caller, pdu, asked)
+                return when_all_are_out(pdu, sent) if self.config.answer_broadcast else None
             return self._forward(caller, route, pdu, asked)
         except ModbusExceptionReply as e:
             return exception_pdu(e)
@@ -313,8 +316,9 @@ class Bridge:
             case _:
                 return SERVER_FAILURE
 
-    def _broadcast(self, caller: Caller, pdu: bytes, asked: Asked) -> None:
-        """To every serial line, once, without retry; nobody answers, nor do we (case MB-028)."""
+    def _broadcast(self, caller: Caller, pdu: bytes, asked: Asked) -> list[asyncio.Future[bytes | None]]:
+        """To every serial line, once, without retry; nobody answers (case MB-028). What becomes of it on each line."""
+        sent = []
         for name, bus in self._buses.items():
             if not self._is_line(name) or bus.down is not None:
                 continue
@@ -327,3 +331,5 @@ class Bridge:
                 self._under_way[name] += 1
                 promise.add_done_callback(lambda _, name=name: self._ended(name))  # type: ignore[misc]
                 bus.guests.put(self._guest(caller, Route(name, 0), pdu, asked, promise, attempts=1))
+                sent.append(promise)
+        return sent

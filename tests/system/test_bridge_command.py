@@ -79,7 +79,7 @@ async def mbpoll(port: int, unit: int, *args: str, values: tuple[str, ...] = ())
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
 def test_mbpoll_through_the_bridge(tmp_path: Path) -> None:
     async def main() -> None:
-        writable = ("--allow-writes", "--unit", "21=1", "--unit", "22=2")
+        writable = ("--allow-writes", "--unit", "21=1", "--unit", "22=2", "--pause", "20ms", "--idle", "60s")
         async with line_of_two(tmp_path) as banks, bridge(tmp_path, *writable) as (program, port):
             text = await mbpoll(port, 21, "-r", "5", "-c", "2")
             assert re.findall(r"^\[(\d+)\]:\s+(\d+)", text, re.MULTILINE) == [("5", "105"), ("6", "106")]
@@ -130,6 +130,8 @@ def test_pymodbus_clients_through_the_bridge_and_read_only_unless_told(tmp_path:
 def test_what_cannot_be_bridged_is_said(tmp_path: Path) -> None:
     for args, says, code in (
         (("tcp://127.0.0.1:0", "can:socketcan/can0"), "Modbus is not spoken there", 2),
+        (("tcp://127.0.0.1:0", "rtu:/dev/ttyNONE", "--role", "x"), "roles are in clients' certificates", 2),
+        (("tls://127.0.0.1:0?cert=c.pem", "rtu:/dev/ttyNONE"), "no ca", 2),
         (("udp://127.0.0.1:0", "rtu:/dev/ttyNONE"), "cannot listen there", 2),
         (("tcp://127.0.0.1:0", "rtu:/dev/ttyNONE", "--allow", "10.0.0.300"), "a network of clients", 2),
         (("tcp://192.0.2.1:1502", "rtu:/dev/ttyNONE"), "cannot listen", 4),

@@ -270,6 +270,22 @@ def test_mb_028_a_broadcast_goes_out_once_and_nobody_answers(tmp_path: Path) -> 
     run(main())
 
 
+def test_mb_028_a_broadcast_is_answered_where_that_is_wanted_and_only_when_it_went_out(tmp_path: Path) -> None:
+    async def main() -> None:
+        config = BridgeConfig("b", ANY_PORT, to="line", policy=WRITERS, broadcast=True, answer_broadcast=True)
+        async with rig(tmp_path, config) as r, r.raw() as raw:
+            await raw.write(bytes.fromhex("0001 0000 0009 00 10 0005 0001 02 4321"))
+            assert await take(raw, 12) == bytes.fromhex("0001 0000 0006 00 10 0005 0001")
+            assert r.units[2].bank.read("holding", 5, 1, 0) == [0x4321]
+        blocked = rig(tmp_path / "again", config, blocked=lambda bus, unit: "held")
+        (tmp_path / "again").mkdir()
+        async with blocked as r, r.raw() as raw:
+            await raw.write(bytes.fromhex("0001 0000 0006 00 06 0005 1234"))
+            assert await take(raw, 9) == bytes.fromhex("0001 0000 0003 00 86 0A")
+
+    run(main())
+
+
 async def refused_raw(raw: TcpConnection, unit: int) -> int:
     await raw.write(read_adu(9, unit, 0, 1))
     return (await take(raw, 9))[-1]

@@ -1,0 +1,41 @@
+"""An answer to whoever broadcast through a bridge, for clients that know no request without one.
+
+On a line nobody answers a broadcast (SL 2.1), so this says only that it went out. It must never know a wire.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterable
+
+from gateway.protocols.modbus.refusals import refusal
+from gateway.protocols.modbus.server import NO_PATH, exception_pdu
+
+_REPEATED = {0x05: 5, 0x06: 5, 0x0F: 5, 0x10: 5, 0x16: 7}
+"""How much of the request the normal reply repeats (AP 6); of 15h all of it."""
+
+
+def when_all_are_out(pdu: bytes, lines: Iterable[asyncio.Future[bytes | None]]) -> asyncio.Future[bytes | None]:
+    """The normal reply to `pdu` once every line is through with it and it went out on one of them; else exception 0A.
+
+    `lines` hold what became of it on each line: an exception response where it did not go out.
+    """
+    answer: asyncio.Future[bytes | None] = asyncio.get_running_loop().create_future()
+    open_ones = list(lines)
+    went_out = False
+
+    def ended(line: asyncio.Future[bytes | None]) -> None:
+        nonlocal went_out
+        open_ones.remove(line)
+        went_out = went_out or not line.result()
+        if not open_ones and not answer.done():
+            answer.set_result(result())
+
+    def result() -> bytes:
+        return pdu[: _REPEATED.get(pdu[0], len(pdu))] if went_out else exception_pdu(refusal(pdu[0], NO_PATH))
+
+    if not open_ones:
+        answer.set_result(result())
+    for line in tuple(open_ones):
+        line.add_done_callback(ended)
+    return answer

@@ -118,7 +118,6 @@ class CanopenDriver(DeviceDriver):
         These are writes: the caller has leave to write.
         """
         if self.config.canopen.configuration is not None:
-            await self._stay_unconfigured()
             await download_configuration(self.master, self.node, self.config.canopen.configuration)
         if self.config.heartbeat is not None:
             await set_heartbeat_producer(self.master, self.node, self.config.heartbeat.producer_ms)
@@ -140,12 +139,12 @@ class CanopenDriver(DeviceDriver):
             mappings |= {held.cob_id: held.mapping} if held.enabled else {}
         self._listen(mappings)
 
-    async def _stay_unconfigured(self) -> None:
-        """A node that runs is brought to PRE-OPERATIONAL before its configuration changes under it."""
-        configuration = self.config.canopen.configuration
-        running = self.master.node_state(self.node) is NmtState.OPERATIONAL
-        if running and configuration and not await holds_configuration(self.master, self.node, configuration.date):
-            await self.master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL, self.node)
+    async def to_be_halted(self) -> bool:
+        """Whether the node has to be brought to PRE-OPERATIONAL first: its configuration will change, and it may run."""
+        configuration, state = self.config.canopen.configuration, self.master.node_state(self.node)
+        if configuration is None or state in (NmtState.PRE_OPERATIONAL, NmtState.INITIALISING):
+            return False
+        return not await holds_configuration(self.master, self.node, configuration.date)
 
     async def _other_tpdos(self) -> dict[int, PdoMapping]:
         """COB-IDs and mappings besides what `tpdo1` says of TPDO1: from the DCF, or read from the node."""

@@ -211,6 +211,10 @@ class CanopenBus:
             await driver.adopt()
             return
         name = driver.config.name
+        if await driver.to_be_halted():
+            self._audit.note("nmt", name, by="start-up", result="asked", what="pre-operational")
+            driver.consumer.observe(COMMAND(b"", "nmt_preoperational"))
+            await driver.send()
         dcf = f"{driver.config.canopen.dcf} unless it holds that, " if driver.config.canopen.configuration else ""
         what = f"{dcf}heartbeat and TPDO1 as in the system file"
         self._audit.note("sdo", name, by="start-up", result="asked", what=what)

@@ -10,9 +10,7 @@ from collections.abc import Mapping, Sized
 from pathlib import Path
 from typing import Any
 
-from emulators.canopen.codec import encode as encode_object
-from emulators.canopen.dictionary import load_eds
-from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.canopen.node import CanopenNode
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
 from emulators.emulator import EmulatedUnit
@@ -29,14 +27,14 @@ from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit, UnitLimits
+from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
-from emulators.models.played_objects import PlayedObjects
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.signals import SignalPlayer, SignalTrack
 from gateway.core.clock import Clock
 from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid
+from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.profile import DeviceProfile
 from gateway.devices.config import DeviceConfig
@@ -225,27 +223,18 @@ class FieldSide:
 
     def _canopen_node(self, config: DeviceConfig) -> CanopenNode:
         emulated = self.prototype.devices[config.name]
-        eds = emulated.profile.eds_path
-        assert eds is not None
-        dictionary = load_eds(eds)
-        played = PlayedObjects(emulated.profile.tags.values(), dictionary, self._player(emulated))
-        factory: dict[tuple[int, int], bytes] = {}
-        for name, text in emulated.form.identity.items():
-            tag = emulated.profile.tags[name]
-            assert tag.object is not None
-            entry = dictionary.entry(*tag.object)
-            if entry is None or not text.lstrip("-").isdigit():
-                raise FileInvalid(
-                    f"identity {name!r} of {config.name!r}", path=str(self.prototype.path), expected="a number"
-                )
-            factory[tag.object] = encode_object(entry.data_type, int(text))
-        node = CanopenNode(dictionary, config.address, NodeContext(source=played, factory=factory))
-        for name, tag in emulated.profile.tags.items():  # what nobody plays is held as well: by the data sheet
-            if tag.object is not None and node.data.has(*tag.object):
-                played.journal.note(name, node.data.get(*tag.object), self._clock.monotonic_ns())
-        device = self.devices[config.name] = FieldDevice(emulated, None, node)
-        device.journal = played.journal
-        return node
+        player = None if emulated.recording is None else self._player(emulated)
+        try:
+            made = emulated_node(
+                emulated.profile, config.address, player, self._clock.monotonic_ns(), emulated.form.identity
+            )
+        except UsageError as e:
+            raise FileInvalid(
+                f"{config.name!r}: {e.message}", path=str(self.prototype.path), expected=e.expected, got=e.got
+            ) from e
+        device = self.devices[config.name] = FieldDevice(emulated, None, made.node)
+        device.journal = made.journal
+        return made.node
 
     def _player(self, emulated: EmulatedDevice) -> SignalPlayer:
         assert emulated.recording is not None

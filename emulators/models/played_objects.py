@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from emulators.canopen.codec import encode
 from emulators.canopen.dictionary import Dictionary
@@ -19,11 +19,10 @@ class PlayedObjects:
     """A node's value source: called with the time, returns raw values by (index, subindex).
 
     Signals are in engineering units under the tags' names; scale and offset of the profile and the data type of the EDS make
-    object values of them. What was given out is journalled.
+    object values of them. Raises `FileInvalid` for a tag whose object the EDS does not have.
     """
 
     def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: SignalPlayer) -> None:
-        self.journal = HeldJournal()
         self._player = player
         self._objects: list[tuple[Tag, Key, int]] = []
         for tag in tags:
@@ -42,7 +41,21 @@ class PlayedObjects:
             number = (values[tag.name] - tag.offset) / tag.scale
             if math.isnan(number) and not tag.type.startswith("float"):
                 continue  # no integer says "no value": the object keeps what it has
-            raw = encode(data_type, number if tag.type.startswith("float") else round(number))
-            self.journal.note(tag.name, raw, now_ns)
-            out[key] = raw
+            out[key] = encode(data_type, number if tag.type.startswith("float") else round(number))
         return out
+
+
+class HeldObjects:
+    """What a node's objects held, by the profile's tags: `NodeContext.held` of a node whose prototype run has an oracle."""
+
+    def __init__(self, tags: Iterable[Tag]) -> None:
+        self.journal = HeldJournal()
+        self._names: dict[Key, list[str]] = {}
+        for tag in tags:
+            if tag.object is not None:
+                self._names.setdefault(tag.object, []).append(tag.name)
+
+    def __call__(self, values: Mapping[Key, bytes], now_ns: int) -> None:
+        for key, raw in values.items():
+            for name in self._names.get(key, ()):
+                self.journal.note(name, raw, now_ns)

@@ -10,8 +10,6 @@ import signal
 from dataclasses import replace
 from pathlib import Path
 
-from emulators.canopen.dictionary import load_eds
-from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
 from emulators.endpoints.bus_server import SoftBusServer
@@ -25,8 +23,8 @@ from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit
+from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
-from emulators.models.played_objects import PlayedObjects
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.unit import ReplayUnit
@@ -43,7 +41,7 @@ from twin.data_files import find_recording
 from twin.field import unit_limits
 
 DEFAULT_RECORDINGS = {"fieldtwin/ctd-reference": "cast.jsonl", "fieldtwin/inclinometer-cia410": "incl.jsonl"}
-"""What a shipped reference device plays when nothing else is said."""
+"""Shipped reference devices whose recording has another name than their profile."""
 MAX_CLIENTS = 32
 LINE_PARAMS = ("mode", "echo")
 """Parameters of an emulated line that are none of its serial settings."""
@@ -117,8 +115,17 @@ class DeviceHost:
         wanted = [unit_id] if unit_id is not None else list(replay.units)
         return {number: ReplayUnit(replay, number, f"{path.name}:{number}") for number in wanted}
 
+    @staticmethod
+    def _recording_of(profile: DeviceProfile) -> str | None:
+        """What a shipped device plays when nothing else is said: the recording under its profile's name."""
+        name = DEFAULT_RECORDINGS.get(profile.name, f"{Path(profile.path).stem}.jsonl")
+        try:
+            return str(find_recording(name))
+        except UsageError:
+            return None
+
     def _player(self, profile: DeviceProfile, recording: Path | None) -> SignalPlayer:
-        name = recording or DEFAULT_RECORDINGS.get(profile.name)
+        name = recording or self._recording_of(profile)
         if name is None:
             raise UsageError(f"{profile.name} needs a recording to play", hint="--recording FILE")
         track = SignalTrack.load(find_recording(str(name)))
@@ -181,11 +188,8 @@ class DeviceHost:
             raise UsageError(
                 "a CANopen node stands on one bus", expected="--on can:fieldtwin/127.0.0.1:0 or can:socketcan/vcan0"
             )
-        eds = profile.eds_path
-        assert eds is not None
-        dictionary = load_eds(eds)
-        source = PlayedObjects(profile.tags.values(), dictionary, self._player(profile, recording))
-        node = CanopenNode(dictionary, node_id or profile.form.factory.node, NodeContext(source=source))
+        player = self._player(profile, recording) if recording or self._recording_of(profile) else None
+        node = emulated_node(profile, node_id or profile.form.factory.node, player, self._clock.monotonic_ns()).node
         if wires[0].interface == "fieldtwin":
             bus = await SoftBusServer.open(wires[0], 125_000)
             self._closing.append(bus)

@@ -73,7 +73,6 @@ class Rig:
     def status(self) -> int:
         return self.read(0x6041, signed=False)
 
-    @property
     def state(self) -> DriveState:
         """As a master reads it from the statusword."""
         word = self.status
@@ -93,7 +92,7 @@ class Rig:
             self.command(word)
         if state in (S.FAULT, S.FAULT_REACTION):
             self.node.raise_error(0x2310, self.now_ns)
-        assert self.state is state
+        assert self.state() is state
 
     def spin(self, speed: int = 10_000) -> None:
         """Operation enabled in profile velocity mode, and at speed."""
@@ -137,27 +136,27 @@ def test_every_command_in_every_state(state: DriveState, word: int) -> None:
     before = len(rig.drive.transitions)
     rig.command(word)
     target, numbers = COMMANDED.get((state, word), (state, []))
-    assert rig.state is target
+    assert rig.state() is target
     assert rig.drive.transitions[before:] == numbers
 
 
 def test_the_arrows_by_itself_and_how_long_they_take() -> None:
     rig = Rig(ready=False)
-    assert rig.state is S.NOT_READY
+    assert rig.state() is S.NOT_READY
     rig.command(SHUTDOWN)
-    assert rig.state is S.NOT_READY  # too early, and forgotten
+    assert rig.state() is S.NOT_READY  # too early, and forgotten
     rig.run(20)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
     assert rig.drive.transitions == [1]
     rig.spin(40_000)
     rig.command(QUICK_STOP)
-    assert rig.state is S.QUICK_STOP
+    assert rig.state() is S.QUICK_STOP
     assert rig.drive.transitions[-1] == 11
     rig.run(99)  # 40,000 inc/s at 400,000 inc/s2
-    assert rig.state is S.QUICK_STOP
+    assert rig.state() is S.QUICK_STOP
     assert rig.read(0x606C) > 0
     rig.run(1)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
     assert rig.drive.transitions[-1] == 12
     assert rig.read(0x606C) == 0
 
@@ -169,10 +168,10 @@ def test_a_quick_stop_that_stays_can_be_left_for_operation(option: int) -> None:
     rig.spin()
     rig.command(QUICK_STOP)
     rig.run(500)
-    assert rig.state is S.QUICK_STOP
+    assert rig.state() is S.QUICK_STOP
     assert rig.status & 1 << 10
     rig.command(ENABLE)
-    assert rig.state is S.OPERATION_ENABLED
+    assert rig.state() is S.OPERATION_ENABLED
     assert rig.drive.transitions[-1] == 16
     rig.run(500)
     assert rig.read(0x606C) == 10_000
@@ -183,7 +182,7 @@ def test_without_such_an_option_there_is_no_way_back_from_a_quick_stop() -> None
     rig.spin()
     rig.command(QUICK_STOP)
     rig.command(ENABLE)
-    assert rig.state is S.QUICK_STOP
+    assert rig.state() is S.QUICK_STOP
 
 
 def test_quick_stop_option_0_disables_at_once() -> None:
@@ -191,7 +190,7 @@ def test_quick_stop_option_0_disables_at_once() -> None:
     rig.write(0x605A, 0)
     rig.spin()
     rig.command(QUICK_STOP)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
     assert rig.drive.transitions[-2:] == [11, 12]
     assert rig.read(0x606C) == 10_000  # and the motor coasts
     rig.run(501)
@@ -205,13 +204,13 @@ def test_an_error_is_a_fault_from_every_state(state: DriveState) -> None:
     rig.sent.clear()
     rig.node.raise_error(0x2310, rig.now_ns)
     moving = state is S.QUICK_STOP
-    assert rig.state is (S.FAULT_REACTION if moving else S.FAULT)
+    assert rig.state() is (S.FAULT_REACTION if moving else S.FAULT)
     rig.run(200)
-    assert rig.state is S.FAULT
+    assert rig.state() is S.FAULT
     assert rig.drive.transitions[-2:] == [13, 14]
     assert rig.read(0x603F, signed=False) == 0x2310
     rig.command(RESET)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
     assert rig.node.active_errors == ()
     assert rig.read(0x603F, signed=False) == 0
     assert rig.node.data.get(0x1001) == b"\0"
@@ -222,10 +221,10 @@ def test_a_fault_reset_is_an_edge() -> None:
     rig.command(RESET)
     rig.bring_to(S.FAULT)
     rig.command(RESET)  # bit 7 was set before: no edge
-    assert rig.state is S.FAULT
+    assert rig.state() is S.FAULT
     rig.command(0)
     rig.command(RESET)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
 
 
 @pytest.mark.parametrize(
@@ -242,7 +241,7 @@ def test_what_a_lost_connection_does_is_the_abort_connection_option(option: int,
     rig.node.feed(CanFrame(0x701, b"\x05"), rig.now_ns)
     rig.run(300)
     assert 0x8130 in rig.node.active_errors
-    assert rig.state is state
+    assert rig.state() is state
 
 
 def test_a_fault_by_a_lost_connection_cannot_be_reset_before_it_is_back() -> None:
@@ -252,11 +251,11 @@ def test_a_fault_by_a_lost_connection_cannot_be_reset_before_it_is_back() -> Non
     rig.node.feed(CanFrame(0x701, b"\x05"), rig.now_ns)
     rig.run(200)
     rig.command(RESET)
-    assert rig.state is S.FAULT
+    assert rig.state() is S.FAULT
     rig.node.feed(CanFrame(0x701, b"\x05"), rig.now_ns)
     rig.command(0)
     rig.command(RESET)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
 
 
 def test_profile_position_with_its_handshake() -> None:
@@ -314,7 +313,7 @@ def test_halt_stops_and_goes_on() -> None:
     rig.run(200)
     assert rig.read(0x606C) == 0
     assert rig.status & 1 << 10
-    assert rig.state is S.OPERATION_ENABLED
+    assert rig.state() is S.OPERATION_ENABLED
     rig.command(ENABLE)
     rig.run(200)
     assert rig.read(0x606C) == 10_000
@@ -369,9 +368,9 @@ def test_the_same_controlword_again_is_a_command_again() -> None:
     pdo = CanFrame(0x200 + NODE, SHUTDOWN.to_bytes(2, "little"))
     rig.node.feed(pdo, rig.now_ns)
     rig.run(20)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
     rig.node.feed(pdo, rig.now_ns)
-    assert rig.state is S.READY
+    assert rig.state() is S.READY
 
 
 def test_reset_node_starts_anew_and_reset_communication_leaves_the_drive_alone() -> None:
@@ -379,12 +378,12 @@ def test_reset_node_starts_anew_and_reset_communication_leaves_the_drive_alone()
     rig.spin()
     rig.node.feed(CanFrame(0, bytes([130, NODE])), rig.now_ns)
     assert rig.node.state is NmtState.PRE_OPERATIONAL
-    assert rig.state is S.OPERATION_ENABLED
+    assert rig.state() is S.OPERATION_ENABLED
     assert rig.read(0x606C) == 10_000
     rig.node.feed(CanFrame(0, bytes([129, NODE])), rig.now_ns)
-    assert rig.state is S.NOT_READY
+    assert rig.state() is S.NOT_READY
     rig.run(1_000)
-    assert rig.state is S.SWITCH_ON_DISABLED
+    assert rig.state() is S.SWITCH_ON_DISABLED
     assert rig.read(0x606C) == 0
 
 

@@ -1,0 +1,73 @@
+"""A CANopen device as its profile describes it: data sheet, model, recording and journal put together to one node.
+
+It must never know buses nor clocks: the player that it is given has its start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from emulators.canopen.codec import encode
+from emulators.canopen.dictionary import Dictionary, Key, load_eds
+from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.journal import HeldJournal
+from emulators.models.by_profile import model_for
+from emulators.models.played_objects import HeldObjects, PlayedObjects
+from emulators.signals import SignalPlayer
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.profile import DeviceProfile
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatedNode:
+    """The node and what it held, by tag."""
+
+    node: CanopenNode
+    journal: HeldJournal
+
+
+def emulated_node(
+    profile: DeviceProfile,
+    node_id: int,
+    player: SignalPlayer | None,
+    now_ns: int,
+    identity: Mapping[str, str] | None = None,
+) -> EmulatedNode:
+    """The node of a CANopen profile. Without a `player` it holds what the data sheet says and what its model does.
+
+    `identity` are values by tag that this one device has instead of the data sheet's. Raises `FileInvalid` for a data sheet
+    that cannot be read or lacks an object of a tag, `UsageError` for an identity that is no number.
+    """
+    if profile.eds_path is None:
+        raise UsageError("a node needs a data sheet", where=profile.path, expected="`eds: FILE.eds` in the profile")
+    dictionary = load_eds(profile.eds_path)
+    tags = profile.tags.values()
+    held = HeldObjects(tags)
+    context = NodeContext(
+        source=PlayedObjects(tags, dictionary, player) if player is not None else None,
+        model=model_for(dictionary),
+        held=held,
+        factory=_factory(profile, dictionary, identity or {}),
+    )
+    node = CanopenNode(dictionary, node_id, context)
+    for tag in tags:  # what nobody plays is held as well: by the data sheet
+        if tag.object is not None and node.data.has(*tag.object):
+            held({tag.object: node.data.get(*tag.object)}, now_ns)
+    return EmulatedNode(node, held.journal)
+
+
+def _factory(profile: DeviceProfile, dictionary: Dictionary, identity: Mapping[str, str]) -> dict[Key, bytes]:
+    factory: dict[Key, bytes] = {}
+    for name, text in identity.items():
+        key = profile.tags[name].object
+        entry = dictionary.entry(*key) if key else None
+        if key is None or entry is None:
+            raise FileInvalid(f"the EDS has no object for tag {name!r}", path=dictionary.path)
+        try:
+            factory[key] = encode(entry.data_type, int(text, 0))
+        except ValueError:
+            raise UsageError(
+                f"identity {name!r}", where=profile.name, expected="a number that fits", got=text
+            ) from None
+    return factory

@@ -1,0 +1,107 @@
+"""The CANopen keys of a system file: what they become, and what is wrong with them, told with file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from test_concise_dcf import TPDO1, var
+
+from gateway.core.errors import FileInvalid
+from gateway.devices.canopen_config import CanopenBusConfig
+from gateway.protocols.canopen.boot import ExpectedIdentity
+from gateway.protocols.canopen.lss import LssAddress
+from twin.system import load_system
+
+SYSTEM = """\
+fieldtwin: 1
+system: s
+buses:
+  can0: {url: "can:socketcan/can0", BUS}
+  lan: {url: "tcp://h:502", LAN}
+devices:
+  incl: {profile: inclinometer-cia410, bus: can0, node: 5, NODE}
+  ctd: {profile: ctd-reference, bus: lan, unit: 1, CTD}
+plc:
+  programs: {p: {source: "python: plc.relay:Relay"}}
+"""
+DCF = "[DeviceInfo]\nVendorName=x\n\n" + TPDO1 + var("2001", 6, "rw", "0", "0x1234")
+
+
+def write(tmp_path: Path, dcf: str = DCF, **keys: str) -> str:
+    text = SYSTEM
+    for mark in ("BUS", "LAN", "NODE", "CTD"):
+        text = text.replace(", " + mark, ", " + keys[mark] if mark in keys else "")
+    (tmp_path / "node5.dcf").write_text(dcf, encoding="utf-8")
+    path = tmp_path / "s.yaml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def test_what_the_keys_become(tmp_path: Path) -> None:
+    who = "identity: {vendor: 1, product: 0x10, revision: 3, serial: 4}"
+    system = load_system(
+        write(
+            tmp_path,
+            BUS="sync: {period_ms: 100, counter: 240}, time_ms: 60000, short_sdo: true",
+            NODE=f"{who}, lss: true, dcf: node5.dcf, store: true, tpdos: dcf",
+        )
+    )
+    assert system.buses["can0"].canopen == CanopenBusConfig(100, 240, 60_000, True)
+    boot = system.devices["incl"].canopen
+    assert boot.identity == ExpectedIdentity(None, 1, 16, 3, 4)
+    assert boot.lss == LssAddress(1, 16, 3, 4)
+    assert boot.dcf == "node5.dcf"
+    assert boot.configuration is not None
+    assert (len(boot.configuration.settings), boot.configuration.store, boot.configuration.date) == (9, True, None)
+    assert boot.tpdos is not None
+    assert [t.cob_id for t in boot.tpdos] == [0x185]
+    assert not boot.adopt_tpdos
+    plain = load_system(write(tmp_path, NODE="tpdos: node"))
+    assert plain.devices["incl"].canopen.adopt_tpdos
+    assert plain.buses["can0"].canopen == CanopenBusConfig()
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"BUS": "sync: {period_ms: 10, counter: 1}"}, "2 to 240"),
+        ({"LAN": "sync: {period_ms: 10}"}, "a CAN bus"),
+        ({"CTD": "dcf: node5.dcf"}, "a CANopen node"),
+        ({"NODE": "lss: true"}, "`identity` with vendor to serial"),
+        ({"NODE": "lss: true, identity: {vendor: 1}"}, "`identity` with vendor to serial"),
+        ({"NODE": "identity: {vendor: 0x100000000}"}, "4294967295"),
+        ({"NODE": "store: true"}, "`dcf`, a DCF file"),
+        ({"NODE": "tpdos: dcf"}, "`dcf`, a DCF file"),
+        ({"NODE": "dcf: nothing.dcf"}, "no such file"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_line(tmp_path: Path, keys: dict[str, str], says: str) -> None:
+    with pytest.raises(FileInvalid) as told:
+        load_system(write(tmp_path, **keys))
+    assert says in str(told.value)
+    assert "s.yaml:" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("dcf", "says"),
+    [
+        ("[DeviceInfo]\nVendorName=x\n", "node5.dcf: no object in this file"),
+        (DCF.replace("DataType=0x0006", "DataType=six", 1), r"node5.dcf:"),
+        (DCF.replace("ParameterValue=0x1234", "ParameterValue=0x12345"), "[2001sub0] ParameterValue"),
+        (DCF.replace("ParameterValue=0x1234", "ParameterValue=lots"), "ParameterValue"),
+        (DCF + "[2001]\nParameterName=again\n", "2001"),
+    ],
+)
+def test_a_malformed_dcf_is_told_with_file_section_and_key(tmp_path: Path, dcf: str, says: str) -> None:
+    with pytest.raises(FileInvalid) as told:
+        load_system(write(tmp_path, dcf, NODE="dcf: node5.dcf"))
+    assert says in str(told.value), str(told.value)
+    assert "node5.dcf" in str(told.value)
+
+
+def test_a_dcf_that_sets_nothing_is_told(tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid, match="sets nothing"):
+        load_system(
+            write(tmp_path, "[DeviceInfo]\nVendorName=x\n\n" + var("2001", 6, "rw", "0"), NODE="dcf: node5.dcf")
+        )

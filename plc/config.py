@@ -14,17 +14,17 @@ import msgspec
 from gateway.core.errors import FileInvalid
 from gateway.core.image import ImageLayout
 from plc.binding import BoundProgram, InputBinding, load_program
-from plc.task import TaskConfig
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramConfig:
-    """A program: its source (``python: module:Class``) and its bindings, variable to tag."""
+    """A program: its source (`plc.binding.load_program`), its bindings, variable to tag, and its task (the first if empty)."""
 
     name: str
     source: str
     inputs: dict[str, InputBinding] = field(default_factory=dict)
     outputs: dict[str, str] = field(default_factory=dict)
+    task: str = ""
 
     def bind(self, python_path: tuple[str, ...] = ()) -> BoundProgram:
         """Make the program. Raises `FileInvalid`."""
@@ -32,11 +32,28 @@ class ProgramConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class TaskSpec:
+    """A task (IEC 61131-3, 6.8.2): every `interval_ms`, or once at each rising edge of the tag `single`.
+
+    `priority` 0 is the highest.
+    """
+
+    name: str
+    interval_ms: float = 0.0
+    priority: int = 10
+    single: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class PlcConfig:
     """A PLC process. `layout` is `ImageLayout.describe()`; `image_path` a file that holds a formatted image of it.
 
     `heartbeat_limit_ms`: age of the gateway's last publication beyond which inputs are BAD. `priority`: of SCHED_FIFO,
-    0 to stay in the normal class. `python_path`: folders that programs are searched in first.
+    0 to stay in the normal class. `python_path`: folders that programs are searched in first. Without `tasks` there is one,
+    with `cycle_ms`. A scan of more than `stuck_ms` is ended by force (0: never). After that, or a stop by the watchdog, the
+    programs begin again `restart_after_ms` later, at most `max_restarts` times in a row. `retain_path`: where retained
+    variables are kept, ``""`` nowhere; with `cold` they begin with their initial values. `outputs_first`: outputs are
+    published at the cycle's start.
     """
 
     image_path: str
@@ -49,12 +66,16 @@ class PlcConfig:
     heartbeat_limit_ms: float = 1000.0
     priority: int = 10
     python_path: tuple[str, ...] = ()
+    tasks: tuple[TaskSpec, ...] = ()
+    stuck_ms: float = 0.0
+    restart_after_ms: float = 1000.0
+    max_restarts: int = 3
+    retain_path: str = ""
+    cold: bool = False
+    outputs_first: bool = False
 
     def image_layout(self) -> ImageLayout:
         return ImageLayout.from_description(self.layout)
-
-    def task(self) -> TaskConfig:
-        return TaskConfig(self.cycle_ms, self.late_ms, self.stop_after)
 
     def to_json(self) -> bytes:
         """The inverse of `from_json`."""

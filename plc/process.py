@@ -1,13 +1,18 @@
-"""The PLC process: an image file, programs, one task on the wall clock, and a control channel.
+"""The PLC process: an image file, programs, their tasks on the wall clock, and a control channel.
 
 Control verbs (gateway.core.control, on the configured Unix socket):
 
-    ready   {"ready": true, "state": ...}: the image is attached and the task was started
-    get     everything a display shows: state, error, statistics, inputs with quality and age, outputs, variables
-    stop    outputs safe, then the process ends
+    ready     {"ready": true, "state": ...}: the image is attached and the tasks were started
+    get       everything a display shows: state, error, statistics, inputs with quality and age, outputs, variables, forces
+    force     {"tag": ..., "value": ..., "by": ...}: until `unforce` {"tag": ...}, or all with {"all": true}
+    pause     execute nothing more, outputs stay; `go` goes on; `step` {"count": n} executes n scans while paused
+    why       {"tag": ...}: which program last changed it, when, and what it saw
+    restart   make the programs anew: {"cold": true} without what is retained
+    stop      outputs safe, then the process ends
 
 SIGTERM and SIGINT do what stop does. The process ends within a second, with its outputs region flagged stopped. A task
-that stopped by itself (watchdog, a program that raised) leaves the process up, outputs safe, so that it can be asked.
+that stopped by itself for good (a program that raised, an input that tripped, restarts used up) leaves the process up,
+outputs safe, so that it can be asked.
 """
 
 from __future__ import annotations
@@ -20,13 +25,14 @@ from pathlib import Path
 from typing import Any
 
 from gateway.core.control import ControlServer
-from gateway.core.errors import FileInvalid, Unreachable
+from gateway.core.errors import FileInvalid, Unreachable, UsageError
 from gateway.core.image import Image
-from plc.binding import BoundProgram
 from plc.config import PlcConfig
-from plc.realtime import RealtimeReport, monotonic_ns, prepare, run_task
-from plc.scan import Scan
-from plc.task import CyclicTask, StopReason
+from plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task
+from plc.runner import Runner
+from plc.task import StopReason
+
+MAX_STEPS = 10_000
 
 
 class PlcProcess:
@@ -34,28 +40,43 @@ class PlcProcess:
 
     def __init__(self, config: PlcConfig, image: Image) -> None:
         self._config = config
-        self._programs: list[BoundProgram] = [p.bind(config.python_path) for p in config.programs]
-        self._scan = Scan(image, self._programs, config.heartbeat_limit_ms)
-        self._task = CyclicTask(self._scan, config.task(), monotonic_ns)
+        self._alarm = StuckAlarm(config.stuck_ms) if config.stuck_ms and hasattr(signal, "setitimer") else None
+        self._runner = Runner(config, image, monotonic_ns, self._alarm)
         self._loop = asyncio.new_event_loop()
-        self._server = ControlServer({"ready": self._ready, "get": self._get, "stop": self._stop})
+        self._server = ControlServer(
+            {
+                "ready": self._ready,
+                "get": self._get,
+                "stop": self._stop,
+                "force": self._force,
+                "unforce": self._unforce,
+                "pause": self._pause,
+                "go": self._go,
+                "step": self._step,
+                "why": self._why,
+                "restart": self._restart,
+            }
+        )
         self._realtime = RealtimeReport((), ())
         self._stopping = False
 
     def run(self) -> int:
-        """Run until told to stop; the exit code: 0, or the error's when the task stopped by itself."""
+        """Run until told to stop; the exit code: 0, or the error's when a task stopped by itself."""
         before = {s: signal.signal(s, self._on_signal) for s in (signal.SIGTERM, signal.SIGINT)}
         try:
             self._loop.run_until_complete(self._server.listen_unix(Path(self._config.control_path)))
             self._realtime = prepare(self._config.priority)
-            run_task(self._task, self._loop, lambda: self._stopping)
+            run_task(self._runner, self._loop, lambda: self._stopping)
         finally:
             self._loop.run_until_complete(self._close())
             self._loop.close()
+            self._runner.close()
+            if self._alarm is not None:
+                self._alarm.close()
             for number, handler in before.items():
                 signal.signal(number, handler)
-        error = self._task.error
-        return error.exit_code if error is not None and self._task.stop_reason is not StopReason.REQUESTED else 0
+        error = self._runner.error
+        return error.exit_code if error is not None and self._runner.stop_reason is not StopReason.REQUESTED else 0
 
     async def _close(self) -> None:
         await self._server.aclose()
@@ -67,32 +88,76 @@ class PlcProcess:
     def _on_signal(self, number: int, frame: object) -> None:
         self._stopping = True
 
+    # -- verbs ------------------------------------------------------------------------------------------------------
+
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {"ready": True, "state": self._task.state.value, "pid": os.getpid()}
+        return {"ready": True, "state": self._runner.describe()["state"], "pid": os.getpid()}
 
     async def _stop(self, args: dict[str, Any]) -> dict[str, Any]:
-        self._task.stop()  # before the answer: whoever asked may rely on it
+        self._runner.stop()  # before the answer: whoever asked may rely on it
         self._loop.call_later(0.02, self._end)  # after it, so that it gets out
-        return {"state": self._task.state.value}
+        return {"state": self._runner.describe()["state"]}
 
     def _end(self) -> None:
         self._stopping = True
         self._loop.stop()
 
     async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
-        now_ns = monotonic_ns()
-        outputs = self._scan.outputs()
+        now_ns, runner = monotonic_ns(), self._runner
+        outputs = runner.outputs.last()
         return {
-            **self._task.describe(),
+            **runner.describe(),
             "pid": os.getpid(),
-            "gateway_alive": self._scan.gateway_alive,
-            "counters": self._scan.counters(),
+            "gateway_alive": runner.gateway_alive,
+            "counters": runner.counters(),
             "realtime": self._realtime.describe(),
-            "programs": {p.name: type(p.program).__name__ for p in self._programs},
-            "inputs": {tag: value.describe(now_ns) for tag, value in self._scan.inputs().items()},
+            "programs": {p.name: type(p.program).__name__ for p in runner.programs},
+            "inputs": {tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
             "outputs": outputs,
-            "variables": {f"{p.name}.{v.name}": outputs[tag] for p in self._programs for v, tag in p.published()},
+            "variables": {f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
         }
+
+    async def _force(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._runner.force(_text(args, "tag"), args.get("value", ""), str(args.get("by", "")))
+        return {"forces": self._runner.forces.describe(monotonic_ns())}
+
+    async def _unforce(self, args: dict[str, Any]) -> dict[str, Any]:
+        forces = self._runner.forces
+        if args.get("all") is True:
+            return {"removed": forces.clear()}
+        tag = _text(args, "tag")
+        if not forces.unforce(tag):
+            raise UsageError(f"{tag} is not forced", expected=", ".join(forces.describe(0)) or "a force; there is none")
+        return {"removed": 1, "forces": forces.describe(monotonic_ns())}
+
+    async def _pause(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._runner.pause(True)
+        return {"paused": True}
+
+    async def _go(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._runner.pause(False)
+        return {"paused": False}
+
+    async def _step(self, args: dict[str, Any]) -> dict[str, Any]:
+        count = args.get("count", 1)
+        if type(count) is not int or not 1 <= count <= MAX_STEPS:
+            raise UsageError("how many scans", expected=f"1 to {MAX_STEPS}", got=repr(count))
+        self._runner.step(count)
+        return {"steps": count}
+
+    async def _why(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"changes": self._runner.why(_text(args, "tag"))}
+
+    async def _restart(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._runner.restart(cold=args.get("cold") is True)
+        return {"start": self._runner.retained.start}
+
+
+def _text(args: dict[str, Any], name: str) -> str:
+    value = args.get(name)
+    if not isinstance(value, str) or not value:
+        raise UsageError(f"{name} is missing", expected="the name of a tag")
+    return value
 
 
 def plc_main(config: PlcConfig) -> int:

@@ -47,6 +47,18 @@ class ProgramFailed(FieldtwinError):
         super().__init__(message, where=spot)
 
 
+class InputTripped(ProgramFailed):
+    """An input whose policy is ``trip`` went bad: the task stops, its outputs become safe."""
+
+
+class ProgramStuck(ProgramFailed):
+    """A program did not end its scan: the task stops, its outputs become safe."""
+
+
+class ScanStuck(BaseException):
+    """Raised inside logic that does not end, by whoever watches over it. No `Exception`, so that no program catches it."""
+
+
 class Role(Enum):
     """VAR_INPUT, VAR_OUTPUT and VAR of IEC 61131-3. A local is shown to watchers and bound to nothing."""
 
@@ -193,12 +205,15 @@ class Program(ABC):
 
 
 __all__ = [
+    "InputTripped",
     "Message",
     "Outbox",
     "Program",
     "ProgramFailed",
+    "ProgramStuck",
     "Role",
     "ScanInfo",
+    "ScanStuck",
     "Variable",
     "message_input",
     "message_output",

@@ -209,6 +209,9 @@ class OutputImage:
         """Publish that nothing may be acted upon any more: flagged stopped, every tag BAD, values as last."""
         self.writer.publish_columns(self._values, Quality.BAD, Reason.NOT_OPERATIONAL, now_ns, None, RegionFlag.STOPPED)
 
+    def release(self) -> None:
+        self.writer.release()
+
     def last(self) -> dict[str, Scalar | None]:
         """Every tag of OUTPUTS as last collected; a message tag's last sequence."""
         shown = dict(zip(self.writer.shape.index, self._values, strict=True))

@@ -29,14 +29,15 @@ import errno
 import gc
 import os
 import resource
+import signal
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
-from plc.task import CyclicTask
+from plc.program import ScanStuck
 
 GUARD_NS = 2 * NS_PER_MS
 POLL_NS = 10 * NS_PER_MS
@@ -138,7 +139,52 @@ def _check(result: int) -> None:
         raise OSError(code, os.strerror(code))
 
 
-def run_task(task: CyclicTask, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:
+class StuckAlarm:
+    """Ends a scan that does not end: a signal, `stuck_ms` after it was armed, raises `ScanStuck` in the logic, again and again.
+
+    The main thread's, since that is where signals arrive. Logic that never comes back to the interpreter (a C function that
+    waits for ever) cannot be ended like this: then the gateway misses the heartbeat and makes the outputs safe.
+    """
+
+    def __init__(self, stuck_ms: float) -> None:
+        self._s = stuck_ms / 1000
+        self._armed = False
+        self._before = signal.signal(signal.SIGALRM, self._on_alarm)
+
+    def arm(self) -> None:
+        self._armed = True
+        signal.setitimer(signal.ITIMER_REAL, self._s, self._s)
+
+    def disarm(self) -> None:
+        self._armed = False
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+    def close(self) -> None:
+        self.disarm()
+        signal.signal(signal.SIGALRM, self._before)
+
+    def _on_alarm(self, number: int, frame: object) -> None:
+        if self._armed:
+            raise ScanStuck(f"{self._s * 1000:g} ms and no end")
+
+
+class Driven(Protocol):
+    """What is driven: plc.runner.Runner, plc.task.CyclicTask."""
+
+    @property
+    def running(self) -> bool: ...
+
+    @property
+    def deadline_ns(self) -> int: ...
+
+    def start(self) -> None: ...
+
+    def run_once(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:
     """Drive `task` on the wall clock, and `loop` in its slack, until `stop_requested()`; outputs are safe afterwards.
 
     A task that stops by itself leaves the loop running, so that it can be asked why. To end a wait early stop the loop.

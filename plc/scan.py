@@ -19,16 +19,17 @@ from gateway.core.errors import FieldtwinError, FileInvalid
 from gateway.core.image import INPUTS, Image, TagKind, TagSpec
 from gateway.core.values import Quality, Reason, Scalar, TagValue
 from plc.binding import BoundProgram, InputBinding, substitute
-from plc.program import Program, ProgramFailed, Role, ScanInfo, Variable
+from plc.program import (
+    InputTripped,
+    Program,
+    ProgramFailed,
+    ProgramStuck,
+    Role,
+    ScanInfo,
+    ScanStuck,
+    Variable,
+)
 from plc.publishing import OutputImage, find
-
-
-class InputTripped(ProgramFailed):
-    """An input whose policy is ``trip`` went bad: the task stops, its outputs become safe."""
-
-
-class ScanStuck(BaseException):
-    """Raised inside logic that does not end, by whoever watches over it. No `Exception`, so that no program catches it."""
 
 
 class _Input:
@@ -144,6 +145,9 @@ class Scan:
         """Publish that nothing in OUTPUTS may be acted upon any more: flagged stopped, every tag BAD, values as last."""
         self.output_image.stop(now_ns)
 
+    def release(self) -> None:
+        self._reader.release()
+
     def _alive(self, now_ns: int) -> bool:
         return not self._snapshot.stopped and self._snapshot.age_ns(now_ns) <= self._limit_ns
 
@@ -192,6 +196,15 @@ class Scan:
             return TagValue(force.value, Quality.SIMULATED, t_ns=force.since_ns)
         return self._seen_at(item.index)
 
+    def value(self, tag: str) -> Scalar | None:
+        """A tag of either region, as this scan last knew it; None while an input is bad."""
+        index = self._reader.shape.index.get(tag)
+        if index is not None:
+            force = self.output_image.forces.inputs.get(tag)
+            seen = self._seen_at(index)
+            return force.value if force else None if seen.quality is Quality.BAD else seen.value
+        return self.output_image.last().get(tag)
+
     def inputs(self) -> dict[str, TagValue]:
         """Every tag of INPUTS as the last scan found it, before substitution and forces: all BAD while the gateway is dead."""
         return {name: self._seen_at(i) for name, i in self._reader.shape.index.items()}
@@ -222,6 +235,6 @@ def _failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
             path, line, inside = here, tb.tb_lineno, here == own
         tb = tb.tb_next
     if isinstance(error, ScanStuck):
-        return ProgramFailed(bound.name, f"the scan did not end: {error}", path=path, line=line)
+        return ProgramStuck(bound.name, f"the scan did not end: {error}", path=path, line=line)
     text = error.message if isinstance(error, FieldtwinError) else str(error)
     return ProgramFailed(bound.name, f"{type(error).__name__}: {text}", path=path, line=line)

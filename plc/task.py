@@ -6,6 +6,8 @@ still to come: missed periods are skipped and counted, never made up for in a bu
     READY --start--> RUNNING --stop------------------------------> STOPPED (requested)
                         | ---`stop_after` overruns in a row------> STOPPED (watchdog)
                         | ---a program raises--------------------> STOPPED (failed; `error` says where)
+                        | ---a scan does not end-----------------> STOPPED (stuck; `error` says where)
+                        | ---an input that must not goes bad-----> STOPPED (tripped)
 
 On every way to STOPPED the outputs are published as stopped, which makes the gateway write their safe values. The task
 waits for nothing by itself: whoever drives it sleeps until `deadline_ns` and calls `run_once`. So the same object runs
@@ -22,6 +24,7 @@ from typing import Any, Protocol
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.errors import Bug, CheckFailed, FieldtwinError
 from plc.histogram import Histogram
+from plc.program import InputTripped, ProgramStuck, ScanStuck
 
 
 class Executable(Protocol):
@@ -29,7 +32,17 @@ class Executable(Protocol):
 
     def execute(self, now_ns: int) -> None: ...
 
+    def hold(self, now_ns: int) -> None: ...
+
     def stop(self, now_ns: int) -> None: ...
+
+
+class Guard(Protocol):
+    """Watches over a scan that may never end: armed before it, disarmed after it."""
+
+    def arm(self) -> None: ...
+
+    def disarm(self) -> None: ...
 
 
 class TaskState(Enum):
@@ -43,6 +56,8 @@ class StopReason(Enum):
     REQUESTED = "requested"
     WATCHDOG = "watchdog"
     FAILED = "failed"
+    STUCK = "stuck"
+    TRIPPED = "tripped"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +83,14 @@ class CyclicTask:
     `missed_periods`, `overruns`.
     """
 
-    def __init__(self, scan: Executable, config: TaskConfig, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, scan: Executable, config: TaskConfig, now_ns: Callable[[], int], guard: Guard | None = None
+    ) -> None:
         self.config = config
+        self.paused = False
+        """While paused each deadline holds the outputs instead of running the logic, but for `steps` scans."""
+        self.steps = 0
+        self._guard = guard
         self.state = TaskState.READY
         self.stop_reason = StopReason.NONE
         self.error: FieldtwinError | None = None
@@ -101,12 +122,18 @@ class CyclicTask:
             raise Bug("a scan of a task that does not run", got=self.state.value)
         began_ns = self._now_ns()
         late_ns = began_ns - self.deadline_ns
+        if self.paused and not self.steps:
+            self._scan.hold(began_ns)
+            self.deadline_ns += ((began_ns - self.deadline_ns) // self._cycle_ns + 1) * self._cycle_ns
+            return
+        self.steps = max(0, self.steps - 1)
         self.lateness.record(late_ns)
         try:
-            self._scan.execute(began_ns)
+            self._execute(began_ns)
         except FieldtwinError as e:
             self.error = e
-            self._stop(StopReason.FAILED)
+            stuck, tripped = isinstance(e, ProgramStuck), isinstance(e, InputTripped)
+            self._stop(StopReason.STUCK if stuck else StopReason.TRIPPED if tripped else StopReason.FAILED)
             return
         self.scans += 1
         ended_ns = self._now_ns()
@@ -115,6 +142,18 @@ class CyclicTask:
         self.missed_periods += missed
         self.deadline_ns += (missed + 1) * self._cycle_ns
         self._watch(overrun=late_ns > self._late_ns or missed > 0)
+
+    def _execute(self, now_ns: int) -> None:
+        if self._guard is None:
+            self._scan.execute(now_ns)
+            return
+        self._guard.arm()
+        try:
+            self._scan.execute(now_ns)
+        except ScanStuck as e:  # between two programs
+            raise ProgramStuck("(all)", f"the scan did not end: {e}") from e
+        finally:
+            self._guard.disarm()
 
     def stop(self) -> None:
         """Stop on request: outputs safe. A task that has stopped already stays as it is."""
@@ -143,7 +182,7 @@ class CyclicTask:
     def describe(self) -> dict[str, Any]:
         """JSON-able: state, reason, error, counters, lateness and duration in microseconds."""
         return {
-            "state": self.state.value,
+            "state": "paused" if self.running and self.paused else self.state.value,
             "stop_reason": self.stop_reason.value,
             "error": str(self.error) if self.error else "",
             "cycle_ms": self.config.cycle_ms,

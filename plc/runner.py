@@ -1,0 +1,268 @@
+"""Everything that a PLC runs: its programs in their tasks, one after the other by priority, restarted where that helps.
+
+Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), as in IEC 61131-3, 6.8.2. They share one
+thread: a task is never interrupted; of those that are due the one with the smallest PRIORITY number goes first, and of equals
+the one that has waited longest. If one stops by itself all stop, with the outputs safe. After a stop by the watchdog or a
+scan that did not end, the programs are made anew and begin warm, at most `max_restarts` times in a row.
+
+Driven like a `CyclicTask`: by `deadline_ns` and `run_once`, on the wall clock or in virtual time, and never knows which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gateway.core.clock import NS_PER_MS, NS_PER_S
+from gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
+from gateway.core.image import INPUTS, Image
+from gateway.core.values import Scalar, TagValue
+from plc.binding import BoundProgram
+from plc.config import PlcConfig, TaskSpec
+from plc.forces import Forces
+from plc.publishing import OutputImage
+from plc.retain import Retained
+from plc.scan import Scan
+from plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
+
+RESTARTABLE = (StopReason.WATCHDOG, StopReason.STUCK)
+STEADY_NS = 60 * NS_PER_S
+"""Running this long makes earlier restarts forgotten."""
+_NEVER_NS = 2**62
+_EVENT_MS = 1e9
+
+
+@dataclass
+class Entry:
+    """A task, its scan, and for a SINGLE one what its trigger was when that was looked at last."""
+
+    spec: TaskSpec
+    scan: Scan
+    task: CyclicTask
+    before: bool = True
+
+    @property
+    def single(self) -> str:
+        return self.spec.single
+
+
+class Runner:
+    """All tasks over an attached image. Raises `FileInvalid` for a configuration that cannot run, `Unreachable` where what
+    is retained cannot be kept."""
+
+    def __init__(self, config: PlcConfig, image: Image, now_ns: Callable[[], int], guard: Guard | None = None) -> None:
+        self.config = config
+        self.forces = Forces()
+        self.restarts = 0
+        self.entries: list[Entry] = []
+        self.programs: list[BoundProgram] = []
+        self.outputs: OutputImage
+        self.retained: Retained
+        self._image = image
+        self._now_ns = now_ns
+        self._guard = guard
+        self._in_a_row = 0
+        self._restart_ns = _NEVER_NS
+        self._started_ns = 0
+        self._began = False
+        self._stopped: Entry | None = None
+        self._ended: StopReason | None = None
+        self._assemble(cold=config.cold)
+
+    # -- assembly -----------------------------------------------------------------------------------------------------
+
+    def _assemble(self, cold: bool) -> None:
+        config = self.config
+        self.programs = [p.bind(config.python_path) for p in config.programs]
+        path = Path(config.retain_path) if config.retain_path else None
+        self.retained = Retained(self.programs, path, cold=cold)
+        self.outputs = OutputImage(self._image, self.programs, self.forces)
+        specs = config.tasks or (TaskSpec("main", config.cycle_ms),)
+        names = {s.name for s in specs}
+        if all(s.single for s in specs):
+            raise FileInvalid(
+                "only SINGLE tasks", expected="at least one with an interval, which looks at their triggers"
+            )
+        self.entries = []
+        for spec in specs:
+            mine = [
+                b for b, p in zip(self.programs, config.programs, strict=True) if (p.task or specs[0].name) == spec.name
+            ]
+            scan = Scan(self._image, mine, config.heartbeat_limit_ms, self.outputs, outputs_first=config.outputs_first)
+            timing = TaskConfig(_EVENT_MS if spec.single else spec.interval_ms, config.late_ms, config.stop_after)
+            self.entries.append(Entry(spec, scan, CyclicTask(scan, timing, self._now_ns, self._guard)))
+        for p in config.programs:
+            if p.task and p.task not in names:
+                raise FileInvalid(
+                    f"program {p.name} is in task {p.task}", expected=f"one of {', '.join(sorted(names))}"
+                )
+
+    def _start_all(self) -> None:
+        self._started_ns = self._now_ns()
+        for entry in self.entries:
+            entry.task.start()
+            if entry.single:
+                entry.task.deadline_ns = _NEVER_NS
+
+    # -- being driven -------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        self._began = True
+        self._start_all()
+
+    @property
+    def running(self) -> bool:
+        """Whether there is anything to wait for: a scan, or a restart."""
+        return self._ended is None and self._began
+
+    @property
+    def deadline_ns(self) -> int:
+        if self._stopped is not None:
+            return self._restart_ns
+        return min(entry.task.deadline_ns for entry in self.entries)
+
+    def run_once(self) -> None:
+        """What is due first: one scan, or a restart."""
+        if not self.running:
+            raise Bug("a scan of a PLC that does not run")
+        now_ns = self._now_ns()
+        if self._stopped is not None:
+            if now_ns >= self._restart_ns:
+                self.restart()
+            return
+        due = [e for e in self.entries if e.task.deadline_ns <= now_ns]
+        if not due:
+            due = [min(self.entries, key=lambda e: e.task.deadline_ns)]
+        entry = min(due, key=lambda e: (e.spec.priority, e.task.deadline_ns))
+        entry.task.run_once()
+        if entry.task.state is TaskState.STOPPED:
+            self._on_stopped(entry)
+            return
+        if entry.single:
+            entry.task.deadline_ns = _NEVER_NS
+        self._look_at_triggers(entry.scan)
+        if self._in_a_row and now_ns - self._started_ns > STEADY_NS:
+            self._in_a_row = 0
+        try:
+            self.retained.save()
+        except FieldtwinError as e:
+            entry.task.error = e
+            entry.task.stop()
+            self._on_stopped(entry)
+
+    def _look_at_triggers(self, scan: Scan) -> None:
+        for entry in self.entries:
+            if entry.single:
+                now = bool(scan.value(entry.single))
+                if now and not entry.before:
+                    entry.task.deadline_ns = self._now_ns()
+                entry.before = now
+
+    def _on_stopped(self, entry: Entry) -> None:
+        for other in self.entries:
+            other.task.stop()
+        self._stopped = entry
+        if entry.task.stop_reason in RESTARTABLE and self._in_a_row < self.config.max_restarts:
+            self._restart_ns = self._now_ns() + round(self.config.restart_after_ms * NS_PER_MS)
+        else:
+            self._ended = entry.task.stop_reason
+
+    def restart(self, *, cold: bool = False) -> None:
+        """Make the programs anew, with what is retained unless `cold`, and start. Forces stay."""
+        for entry in self.entries:
+            entry.task.stop()
+        self.retained.close()
+        self.outputs.release()
+        for entry in self.entries:
+            entry.scan.release()
+        self._assemble(cold)
+        self.restarts += 1
+        self._in_a_row += 1
+        self._stopped = self._ended = None
+        self._restart_ns = _NEVER_NS
+        self._start_all()
+
+    def stop(self) -> None:
+        """On request: all tasks stopped, outputs safe. What had stopped already stays as it is."""
+        for entry in self.entries:
+            entry.task.stop()
+        if self._ended is None:
+            self._ended = self._stopped.task.stop_reason if self._stopped else StopReason.REQUESTED
+
+    def close(self) -> None:
+        self.retained.close()
+
+    # -- people -------------------------------------------------------------------------------------------------------
+
+    @property
+    def error(self) -> FieldtwinError | None:
+        """Why it stopped by itself."""
+        return self._stopped.task.error if self._stopped else None
+
+    @property
+    def stop_reason(self) -> StopReason:
+        return self._stopped.task.stop_reason if self._stopped else self._ended or StopReason.NONE
+
+    @property
+    def paused(self) -> bool:
+        return any(e.task.paused for e in self.entries)
+
+    def pause(self, on: bool) -> None:
+        """Stop executing, or go on; outputs stay as they are, and are still being published."""
+        for entry in self.entries:
+            entry.task.paused, entry.task.steps = on, 0
+
+    def step(self, count: int) -> None:
+        """While paused, execute `count` scans of each cyclic task. Raises `UsageError` while it is not paused."""
+        if not self.paused:
+            raise UsageError("a PLC is stepped while it is paused", hint="pause it first")
+        for entry in self.entries:
+            entry.task.steps += 0 if entry.single else count
+
+    def force(self, tag: str, value: Scalar, by: str = "") -> None:
+        """Raises `UsageError` for an unknown tag or a value that it cannot hold."""
+        for region in self._image.layout.regions:
+            for spec in region.tags:
+                if spec.name == tag:
+                    self.forces.force(spec, value, region.name == INPUTS, self._now_ns(), by)
+                    return
+        raise UsageError(f"no tag {tag!r} in the process image", expected="one that status shows")
+
+    def why(self, tag: str) -> list[dict[str, Any]]:
+        """The last changes of an output or local, the newest first. Raises `UsageError` for what no program writes."""
+        if tag not in self.outputs.last():
+            raise UsageError(f"no program writes {tag!r}", expected="an output or local of a program")
+        now_ns = self._now_ns()
+        return [change.describe(now_ns) for change in reversed(self.outputs.changes.get(tag, ()))]
+
+    def inputs(self) -> dict[str, TagValue]:
+        return self.entries[0].scan.inputs()
+
+    @property
+    def gateway_alive(self) -> bool:
+        return self.entries[0].scan.gateway_alive
+
+    def counters(self) -> dict[str, int]:
+        total: dict[str, int] = {}
+        for entry in self.entries:
+            for name, count in entry.scan.counters().items():
+                total[name] = count if name == "mailbox_waits" else total.get(name, 0) + count
+        return total
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able: the first task's figures as those of the whole, and each task's own."""
+        now_ns = self._now_ns()
+        shown = self._stopped or self.entries[0]
+        return {
+            **shown.task.describe(),
+            "restarts": self.restarts,
+            "restart_in_ms": max(0.0, (self._restart_ns - now_ns) / 1e6) if self._restart_ns < _NEVER_NS else None,
+            "retain": self.retained.describe(),
+            "forces": self.forces.describe(now_ns),
+            "tasks": {
+                e.spec.name: {"priority": e.spec.priority, "single": e.single, **e.task.describe()}
+                for e in self.entries
+            },
+        }

@@ -80,11 +80,7 @@ class Runner:
         self.retained = Retained(self.programs, path, cold=cold)
         self.outputs = OutputImage(self._image, self.programs, self.forces)
         specs = config.tasks or (TaskSpec("main", config.cycle_ms),)
-        names = {s.name for s in specs}
-        if all(s.single for s in specs):
-            raise FileInvalid(
-                "only SINGLE tasks", expected="at least one with an interval, which looks at their triggers"
-            )
+        self._check(specs)
         self.entries = []
         for spec in specs:
             mine = [

@@ -1,0 +1,115 @@
+"""The `canopen` package's own slave, LocalNode, in the place of ours: rows of canopen_slave.toml played on it without threads.
+
+It has no timers to speak of (a heartbeat is a thread of python-can's), so that only the order of frames is asked of it.
+"""
+
+from __future__ import annotations
+
+import io
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+from canopen_rows import Row, key_of, parse_frame
+from canopen_slave_rig import NODE, RICH
+
+from gateway.core.canframe import CanFrame
+
+FILE = Path(__file__).parents[1] / "vectors" / "canopen_localnode.toml"
+DUMMIES = "".join(f"Dummy{n:04}={n // 5 % 2}\n" for n in range(1, 8))
+EVENTS = ("error", "clear", "set")
+"""Events of a device that LocalNode has a call for."""
+
+
+class _Periodic:
+    """What python-can would run in a thread; here it never sends."""
+
+    def stop(self) -> None: ...
+
+    def modify_data(self, message: can.Message) -> None: ...
+
+    update = modify_data
+
+
+class SilentBus:
+    """Keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[str] = []
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None:
+        data = b"" if message.is_remote_frame else bytes(message.data)
+        self.sent.append(str(CanFrame(message.arbitration_id, data, remote=message.is_remote_frame)))
+
+    def send_periodic(self, *_: Any, **__: Any) -> _Periodic:
+        return _Periodic()
+
+    def shutdown(self) -> None: ...
+
+
+def load_known() -> tuple[str, dict[str, str]]:
+    """The version that was looked at, and what it does otherwise, by the rows' ids."""
+    file = tomllib.loads(FILE.read_text())
+    return file["version"], {entry["id"]: entry["instead"] for entry in file["known"]}
+
+
+def can_be_asked(row: Row) -> bool:
+    """Whether the row needs nothing but frames and what LocalNode can be told."""
+    events = [what[1:].split()[0] for _, what in row.hear if what.startswith("!")]
+    return row.node_id == NODE and not row.options and all(event in EVENTS for event in events)
+
+
+def play_localnode(row: Row) -> str:
+    """What LocalNode does otherwise than the row says, '' when nothing."""
+    sheet = io.StringIO(RICH.replace("VendorNumber=\n", "VendorNumber=0\n").replace("Dummy0005=1\n", DUMMIES))
+    sheet.name = "rig.eds"
+    network, bus = canopen.Network(), SilentBus()
+    network.bus = bus  # type: ignore[assignment]
+    node = canopen.LocalNode(NODE, sheet)  # type: ignore[arg-type]
+    network.add_node(node)
+    node.nmt.state = "PRE-OPERATIONAL"
+    bus.sent.clear()
+    try:
+        for _, what in row.hear:
+            step(network, node, what)
+    except Exception as e:  # a stranger's fault is what is looked for
+        return f"raises {type(e).__module__}.{type(e).__qualname__}"
+    finally:
+        network.bus = None
+    return difference(row, node, bus.sent)
+
+
+def step(network: canopen.Network, node: canopen.LocalNode, what: str) -> None:
+    if not what.startswith("!"):
+        frame = parse_frame(what)
+        if not frame.remote and not frame.extended:  # its Network never hands out a remote frame
+            network.notify(frame.can_id, bytearray(frame.data), 0.0)
+        return
+    name, *words = what[1:].split()
+    calls: dict[str, Callable[[], None]] = {
+        "error": lambda: node.emcy.send(int(words[0], 16), int(words[1], 16) if len(words) > 1 else 1),
+        "clear": lambda: node.emcy.reset(),
+        "set": lambda: node.set_data(*key_of(words[0]), bytes.fromhex(words[1])),
+    }
+    calls[name]()
+
+
+def difference(row: Row, node: canopen.LocalNode, sent: list[str]) -> str:
+    wanted = [str(parse_frame(text)) for _, text in row.say]
+    for number, frame in enumerate(wanted):
+        if number >= len(sent):
+            return f"silent instead of {frame}"
+        if sent[number] != frame:
+            return f"{sent[number]} instead of {frame}"
+    if len(sent) > len(wanted):
+        return f"sends {sent[len(wanted)]} besides"
+    if node.nmt.state != row.state:
+        return f"is {node.nmt.state} instead of {row.state}"
+    for key, value in row.values.items():
+        held = node.get_data(*key_of(key)).hex()
+        if held != value:
+            return f"holds {held or 'nothing'} in {key} instead of {value or 'nothing'}"
+    return ""

@@ -89,7 +89,22 @@ class Runner:
             scan = Scan(self._image, mine, config.heartbeat_limit_ms, self.outputs, outputs_first=config.outputs_first)
             timing = TaskConfig(_EVENT_MS if spec.single else spec.interval_ms, config.late_ms, config.stop_after)
             self.entries.append(Entry(spec, scan, CyclicTask(scan, timing, self._now_ns, self._guard)))
-        for p in config.programs:
+
+    def _check(self, specs: tuple[TaskSpec, ...]) -> None:
+        names = [s.name for s in specs]
+        tags = {tag.name for region in self._image.layout.regions for tag in region.tags}
+        for n, spec in enumerate(specs):
+            if spec.name in names[:n]:
+                raise FileInvalid(f"task {spec.name} is there twice")
+            if bool(spec.single) == (spec.interval_ms > 0):
+                raise FileInvalid(f"task {spec.name}", expected="an interval above 0, or a trigger (single)")
+            if spec.single and spec.single not in tags:
+                raise FileInvalid(f"the trigger of task {spec.name} does not exist", got=spec.single)
+        if all(s.single for s in specs):
+            raise FileInvalid(
+                "only SINGLE tasks", expected="at least one with an interval, which looks at their triggers"
+            )
+        for p in self.config.programs:
             if p.task and p.task not in names:
                 raise FileInvalid(
                     f"program {p.name} is in task {p.task}", expected=f"one of {', '.join(sorted(names))}"

@@ -1,0 +1,67 @@
+"""Three nodes of different device profiles on one paced bus, in a prototype run; and nodes emulated one by one, as a user does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from procs import run_to_end
+
+SYSTEM = """\
+fieldtwin: 1
+system: nodes
+buses:
+  can0: {url: "can:socketcan/can0", bitrate: 250000}
+devices:
+  io:
+    {profile: io-cia401, bus: can0, node: 6, expect: {serial: "17"}, heartbeat: {producer_ms: 200, consumer_ms: 1500},
+     tpdo1: {map: [inputs_1, inputs_2], event_ms: 100}, start: true}
+  drive:
+    {profile: drive-cia402, bus: can0, node: 7, heartbeat: {producer_ms: 200, consumer_ms: 1500},
+     tpdo1: {map: [statusword, position], event_ms: 100}, start: true}
+  winch:
+    {profile: encoder-cia406, bus: can0, node: 9, heartbeat: {producer_ms: 200, consumer_ms: 1500},
+     tpdo1: {map: [position, speed], event_ms: 50}, start: true}
+plc:
+  cycle_ms: 20
+  programs:
+    watch: {source: watch.st, inputs: {position: {tag: winch.position}, switches: {tag: io.inputs_1}}}
+"""
+PROTOTYPE = """\
+prototype_of: nodes.yaml
+buses:
+  can0: {listen: "can:fieldtwin/127.0.0.1:0", pace: true}
+devices:
+  io:    {recording: io-cia401.jsonl, at_end: loop, identity: {serial: "17"}}
+  drive: {recording: drive-cia402.jsonl, at_end: loop}
+  winch: {recording: encoder-cia406.jsonl, at_end: loop}
+"""
+PROGRAM = """\
+PROGRAM Watch
+VAR_INPUT position : UDINT; switches : USINT; END_VAR
+VAR turns : REAL; END_VAR
+  turns := UDINT_TO_REAL(position) / 8192.0;
+END_PROGRAM
+"""
+
+
+def test_three_nodes_on_one_bus(tmp_path: Path) -> None:
+    for name, text in (("nodes.yaml", SYSTEM), ("nodes.prototype.yaml", PROTOTYPE), ("watch.st", PROGRAM)):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    wanted = ("run", str(tmp_path / "nodes.yaml"), "--prototype", "--for", "3s", "--instance", "cn", "--json")
+    ended = run_to_end(tmp_path, *wanted, name="nodes")
+    assert ended.process.returncode == 0, ended.err
+    summary = json.loads(ended.out)
+    assert {name: device["state"] for name, device in summary["devices"].items()} == {
+        "io": "good", "drive": "good", "winch": "good",
+    }  # fmt: skip
+    on_can = summary["exchanges"]["can0"]
+    assert {what: on_can["gateway"][what] for what in ("requests", "replies")} == on_can["emulators"]
+    assert on_can["gateway"]["pdos"] > 50
+    assert summary["published"]["checked"] > 100
+    assert summary["published"]["wrong"] == 0
+    tags = summary["tags"]
+    assert tags["io.serial"]["value"] == 17
+    assert tags["drive.statusword"]["value"] == 0x0250
+    assert 8_000_000 < tags["winch.position"]["value"] < 9_000_000
+    assert tags["winch.speed"]["value"] > 0

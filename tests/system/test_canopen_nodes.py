@@ -1,4 +1,4 @@
-"""Three nodes of different device profiles on one paced bus, in a prototype run; and nodes emulated one by one, as a user does."""
+"""Three nodes of different device profiles on one paced bus, in a prototype run."""
 
 from __future__ import annotations
 

@@ -23,7 +23,8 @@ _ST_SUFFIXES = (".st", ".xml")
 
 @dataclass(frozen=True, slots=True)
 class InputBinding:
-    """Where an input comes from, and what a program sees while that is BAD.
+    """Where an input comes from, and what a program sees while that is BAD: a tag of the plant, or another program's
+    ``program.variable``.
 
     `if_bad` is ``"pass"`` (the value as it is, BAD), ``"hold"`` (the last one that was not, UNCERTAIN), a number to put in
     its place (SUBSTITUTED), or ``"trip"``: a bad one, once it was good, stops the task with its outputs safe.
@@ -106,14 +107,24 @@ def image_for(
 ) -> ImageLayout:
     """The process image that `programs` need of a plant whose tags are `plant`. Raises `FileInvalid`.
 
-    INPUTS holds every tag that an input is bound to, then the `watched` ones; OUTPUTS every output and local.
+    INPUTS holds every tag that an input is bound to, then the `watched` ones; OUTPUTS every output and local. An input
+    may be bound to another program's variable, too: ``<program>.<variable>``.
     """
     inputs: dict[str, TagSpec] = {}
     outputs: dict[str, TagSpec] = {}
     writers: dict[str, str] = {}
+    own = {
+        tag: TagSpec(tag, v.kind, v.unit)
+        for bound in programs
+        for v, tag in bound.published()
+        if tag not in plant and v.kind is not TagKind.MESSAGE
+    }
     for bound in programs:
         _check_names(bound)
         for variable in bound.variables(Role.INPUT):
+            if bound.inputs[variable.name].tag in own:
+                _plant_tag(bound, variable, bound.inputs[variable.name].tag, own)
+                continue
             spec = _plant_tag(bound, variable, bound.inputs[variable.name].tag, plant)
             substitute(spec, bound.inputs[variable.name].if_bad)
             inputs[spec.name] = spec
@@ -126,6 +137,8 @@ def image_for(
             else:
                 outputs[tag] = TagSpec(tag, variable.kind, variable.unit, variable.max_bytes, variable.depth)
     for tag in watched:
+        if tag in own:
+            continue
         inputs.setdefault(tag, plant[tag])
     return process_image(list(inputs.values()), list(outputs.values()))
 

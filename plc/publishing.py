@@ -97,6 +97,7 @@ class OutputImage:
         self._bind(programs, image.reader(INPUTS).shape)
         layout = self.writer.shape.layout
         self._reals = [o.index for o in self.outputs if layout.tags[o.index].kind is TagKind.REAL]
+        self._by_tag = {o.tag: o for o in self.outputs}
         self._plain = [o for o in self.outputs if o.outbox is None]
         self._resumed = self._before(image)
         self._values: list[Scalar | None] = [None] * (len(self.outputs) + len(self.consumed))
@@ -208,6 +209,12 @@ class OutputImage:
     def stop(self, now_ns: int) -> None:
         """Publish that nothing may be acted upon any more: flagged stopped, every tag BAD, values as last."""
         self.writer.publish_columns(self._values, Quality.BAD, Reason.NOT_OPERATIONAL, now_ns, None, RegionFlag.STOPPED)
+
+    def current(self, tag: str) -> Scalar | None:
+        """What a program's variable is now: its initial value before the first scan."""
+        output = self._by_tag[tag]
+        value: Scalar | None = output.namespace[output.name]
+        return value
 
     def release(self) -> None:
         self.writer.release()

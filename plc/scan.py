@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import FieldtwinError, FileInvalid
@@ -91,6 +92,7 @@ class Scan:
         self._reader = image.reader(INPUTS)
         self._plain: list[_Input] = []
         self._messages: list[_Input] = []
+        self._between: list[tuple[dict[str, Any], Variable, str]] = []
         self._seen: dict[str, Callable[[], dict[str, Scalar | None]]] = {}
         for bound in programs:
             self._bind_inputs(bound)
@@ -104,13 +106,26 @@ class Scan:
             binding = bound.inputs.get(variable.name)
             if binding is None:
                 raise FileInvalid(f"input {variable.name!r} of program {bound.name} is bound to no tag")
+            if binding.tag not in shape.index and binding.tag in self.output_image.writer.shape.index:
+                self._between.append((bound.program.__dict__, variable, binding.tag))
+                continue
             spec, index = find(shape, binding.tag)
             item = _Input(bound.name, bound.program, variable, spec, index, binding)
             (self._messages if item.message else self._plain).append(item)
             own[variable.name] = item
         plain = [item for item in own.values() if not item.message]
         self._seen[bound.name] = lambda: {item.name: item.namespace[item.name] for item in plain}
-        bound.program._lookup = lambda name: own[name].apply(self._looked_up(own[name]))
+        others = {v.name: tag for namespace, v, tag in self._between if namespace is bound.program.__dict__}
+
+        def lookup(name: str) -> TagValue:
+            if name in others:
+                value = self.output_image.current(others[name])
+                forced = others[name] in self.output_image.forces.outputs
+                quality = Quality.SIMULATED if forced else Quality.BAD if value is None else Quality.GOOD
+                return TagValue(value, quality)
+            return own[name].apply(self._looked_up(own[name]))
+
+        bound.program._lookup = lookup
 
     # -- the cycle ----------------------------------------------------------------------------------------------
 
@@ -172,9 +187,16 @@ class Scan:
                 if item.tag in forced:
                     value = forced[item.tag].value
                     item.namespace[item.name] = float(value) if item.widen else value
+        if self._between:
+            self._read_other_programs()
         for item in self._messages:
             item.namespace[item.name] = snapshot.messages.get(item.tag, ())
         self.output_image.room(values)
+
+    def _read_other_programs(self) -> None:
+        for namespace, variable, tag in self._between:
+            value = self.output_image.current(tag)
+            namespace[variable.name] = float(value) if variable.kind is TagKind.REAL and value is not None else value
 
     def _bad(self, item: _Input) -> Scalar | None:
         seen = self._seen_at(item.index)

@@ -24,7 +24,7 @@ from gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
 from gateway.runtime.tags import TagTable
 from gateway.store.exchange_log import ExchangeLog
 from plc.binding import BoundProgram, InputBinding, image_for
-from plc.config import PlcConfig, ProgramConfig
+from plc.config import PlcConfig, ProgramConfig, TaskSpec
 from plc.program import Role
 from twin.system import System
 
@@ -33,6 +33,13 @@ PLC_LOST_CYCLES = 50
 """The PLC's outputs count no more when it has not published for so many cycles, and for `PLC_LOST_MS` at least."""
 PLC_LOST_MS = 500
 GATEWAY_LOST_MS = 1000
+MIN_STUCK_MS = 200
+
+
+def fastest_ms(system: System) -> int:
+    """The interval of the PLC's fastest cyclic task: how often it publishes."""
+    intervals = [task.interval_ms for task in system.plc.tasks.values() if task.interval_ms]
+    return min(intervals, default=system.plc.cycle_ms)
 
 
 def _kind(tag: Tag) -> TagKind:
@@ -69,6 +76,7 @@ def programs_of(system: System) -> tuple[ProgramConfig, ...]:
             form.source,
             {v: InputBinding(i.tag, i.if_bad) for v, i in form.inputs.items()},
             dict(form.outputs),
+            form.task or "",
         )
         for name, form in system.plc.programs.items()
     )
@@ -92,8 +100,9 @@ def image_layout(system: System) -> ImageLayout:
         for t in d.profile.tags.values()
         if t.readable and not t.is_text
     ]
+    watched += [form.single for form in system.plc.tasks.values() if form.single]
     try:
-        return image_for(bound, plant, watched)
+        return image_for(bound, plant, dict.fromkeys(watched))
     except FileInvalid as e:
         raise system.file.error(("plc", "programs"), e.message, expected=e.expected, got=e.got) from e
 
@@ -118,8 +127,8 @@ def gateway_config(system: System, *, allow_writes: bool, free_ports: bool = Fal
     return GatewayConfig(
         buses=system.buses,
         devices=system.devices,
-        cycle_ms=system.plc.cycle_ms,
-        plc_lost_ms=max(PLC_LOST_MS, PLC_LOST_CYCLES * system.plc.cycle_ms),
+        cycle_ms=fastest_ms(system),
+        plc_lost_ms=max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system)),
         outputs=frozenset(outputs),
         log_tags=frozenset(f"{name}.log" for name in system.plc.programs),
         allow_writes=allow_writes,
@@ -129,18 +138,29 @@ def gateway_config(system: System, *, allow_writes: bool, free_ports: bool = Fal
     )
 
 
-def plc_config(system: System, run_dir: Path) -> PlcConfig:
-    """What the PLC process is told."""
+def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfig:
+    """What the PLC process is told. With `cold` its retained variables begin with their initial values."""
+    watchdog = system.plc.watchdog
     return PlcConfig(
         image_path=str(run_dir / "image"),
         layout=image_layout(system).describe(),
         control_path=str(run_dir / "plc.sock"),
         programs=programs_of(system),
-        cycle_ms=float(system.plc.cycle_ms),
-        late_ms=float(system.plc.watchdog.late_ms),
-        stop_after=system.plc.watchdog.stop_after,
-        heartbeat_limit_ms=float(max(GATEWAY_LOST_MS, 10 * system.plc.cycle_ms)),
+        cycle_ms=float(fastest_ms(system)),
+        late_ms=float(watchdog.late_ms),
+        stop_after=watchdog.stop_after,
+        heartbeat_limit_ms=float(max(GATEWAY_LOST_MS, 10 * fastest_ms(system))),
         python_path=(str(system.path.parent),),
+        tasks=tuple(
+            TaskSpec(name, float(form.interval_ms or 0), form.priority, form.single or "")
+            for name, form in system.plc.tasks.items()
+        ),
+        stuck_ms=float(watchdog.stuck_ms or max(MIN_STUCK_MS, 20 * fastest_ms(system))),
+        restart_after_ms=float(watchdog.restart_after_ms),
+        max_restarts=watchdog.restarts,
+        retain_path=str(run_dir / "retain"),
+        cold=cold,
+        outputs_first=system.plc.outputs_at == "start",
     )
 
 

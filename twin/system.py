@@ -191,6 +191,8 @@ def _check_programs(system: System) -> None:
     for name, program in system.plc.programs.items():
         loc: tuple[Key, ...] = ("plc", "programs", name)
         for variable, form in program.inputs.items():
+            if form.tag.partition(".")[0] in system.plc.programs:
+                continue  # another program's variable: checked where the programs are put together
             device, local = _split(system, (*loc, "inputs", variable, "tag"), form.tag)
             names = [t.name for t in device.profile.tags.values() if t.readable and not t.is_text]
             names += [*device.profile.messages, *(["inbox"] if device.profile.inbox else [])]

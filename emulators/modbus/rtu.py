@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 from emulators.modbus.line import Exchange, LineCounters, LineSlave
 from emulators.modbus.rtu_receiver import FRAME_GAP_NS, RtuReceiver, with_crc
+from emulators.modbus.rtu_shapes import Declared
 from emulators.modbus.rtu_strict import StrictReceiver
 from emulators.modbus.unit import ModbusUnit
 from gateway.core.endpoint import SerialSettings
@@ -25,8 +26,13 @@ class RtuSlave(LineSlave):
     def __init__(
         self, units: Mapping[int, ModbusUnit], gap_ns: int = FRAME_GAP_NS, strict: SerialSettings | None = None
     ) -> None:
-        receiver = StrictReceiver(strict) if strict is not None else RtuReceiver(frozenset(units), gap_ns)
+        receiver = StrictReceiver(strict) if strict is not None else _receiver(units, gap_ns)
         super().__init__(units, receiver)
 
     def encode(self, frame: bytes) -> bytes:
         return with_crc(frame)
+
+
+def _receiver(units: Mapping[int, ModbusUnit], gap_ns: int) -> RtuReceiver:
+    lengths = {unit_id: unit.request_lengths for unit_id, unit in units.items()}
+    return RtuReceiver(frozenset(units), gap_ns, Declared(lengths))

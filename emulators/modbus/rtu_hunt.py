@@ -16,8 +16,8 @@ from emulators.modbus.rtu_shapes import (
     LAST_UNIT,
     MAX_FRAME,
     MIN_FRAME,
+    Declared,
     crc16,
-    request_shape,
     response_shape,
 )
 
@@ -32,10 +32,12 @@ _REQUEST, _RESPONSE = 0, 1
 
 
 class Hunt:
-    """One search, from the byte that proved to begin no frame on. `own`: the unit ids served here."""
+    """One search, from the byte that proved to begin no frame on. `own`: the unit ids served here, `declared` what they
+    say of their requests."""
 
-    def __init__(self, own: frozenset[int]) -> None:
+    def __init__(self, own: frozenset[int], declared: Declared) -> None:
         self._own = own
+        self._declared = declared
         self._ours = _pattern(own)
         self._base = 0  # bytes that the owner dropped: places are counted from the hunt's first byte
         self._next = 0  # the first place that is not under trial
@@ -89,7 +91,7 @@ class Hunt:
         kinds = (_REQUEST,) if ours or head[0] == 0 else (_REQUEST, _RESPONSE)
         unknown = False
         for kind in kinds:
-            shape = request_shape(head) if kind == _REQUEST else response_shape(head)
+            shape = self._declared.request_shape(head) if kind == _REQUEST else response_shape(head)
             if shape is None:
                 unknown = True
             elif MIN_FRAME <= shape.length <= MAX_FRAME:
@@ -101,7 +103,7 @@ class Hunt:
 
     def _is_whole(self, buffer: bytearray, start: int, end: int, kind: int) -> bool:
         frame = buffer[start - self._base : end - self._base]
-        shape = request_shape(frame) if kind == _REQUEST else response_shape(frame)
+        shape = self._declared.request_shape(frame) if kind == _REQUEST else response_shape(frame)
         if shape is None or shape.length > MAX_FRAME or shape.length < MIN_FRAME:
             return False
         if shape.length > len(frame):

@@ -17,9 +17,9 @@ from emulators.modbus.rtu_shapes import (
     LAST_UNIT,
     MAX_FRAME,
     MIN_FRAME,
+    Declared,
     Shape,
     crc16,
-    request_shape,
     response_shape,
     with_crc,
 )
@@ -35,18 +35,20 @@ _NOISE, _WAIT = 0, -1
 
 
 class RtuReceiver:
-    """Cuts frames out of a line. `own`: the unit ids served here, which never *send* anything that is heard here.
+    """Cuts frames out of a line. `own`: the unit ids served here, which never *send* anything that is heard here;
+    `declared`: what they say of the length of their own functions' requests.
 
     `crc_errors` counts runs of at least `MIN_FRAME` bytes that belong to no frame, `noise_bytes` every such byte. They
     are known once the next frame is found or the line has paused for `gap_ns`; feed ``b""`` to tell of a pause.
     """
 
-    def __init__(self, own: frozenset[int], gap_ns: int = FRAME_GAP_NS) -> None:
+    def __init__(self, own: frozenset[int], gap_ns: int = FRAME_GAP_NS, declared: Declared | None = None) -> None:
         self.gap_ns = gap_ns
         self.frames = 0
         self.crc_errors = 0
         self.noise_bytes = 0
         self._own = own
+        self._declared = declared or Declared()
         self._buffer = bytearray()
         self._hunt: Hunt | None = None
         self._run = 0
@@ -80,7 +82,7 @@ class RtuReceiver:
                 return self._take(length)
             if len(self._buffer) < MIN_FRAME or (length == _WAIT and wait):
                 return None
-            self._hunt = Hunt(self._own)
+            self._hunt = Hunt(self._own, self._declared)
         found = self._hunt.search(self._buffer)
         if found is not None:
             start, end = found
@@ -110,11 +112,11 @@ class RtuReceiver:
         waiting = any(s.plausible and len(head) < s.length <= MAX_FRAME for s in shapes)
         return _WAIT if waiting else _NOISE
 
-    @staticmethod
-    def _shapes(head: bytearray, ours: bool) -> list[Shape]:
+    def _shapes(self, head: bytearray, ours: bool) -> list[Shape]:
         if head[0] > LAST_UNIT:
             return []  # noise, or nothing to do with us
-        both = [request_shape(head)] if ours or head[0] == 0 else [request_shape(head), response_shape(head)]
+        request = self._declared.request_shape(head)
+        both = [request] if ours or head[0] == 0 else [request, response_shape(head)]
         return [shape for shape in both if shape is not None]
 
     def _take(self, length: int) -> bytes:

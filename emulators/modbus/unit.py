@@ -66,6 +66,8 @@ class ModbusUnit:
         self.fifos = fifos
         self.latency_s = 0.0
         self.running = True
+        self.request_lengths: dict[int, int] = {}
+        """Of functions of its own, how long a request PDU is: how a line tells where it ends. By its check sum otherwise."""
         self._server_id = server_id
         self._busy_until_ns = 0
         self._broadcasts = set(BROADCAST_FUNCTIONS)
@@ -97,16 +99,21 @@ class ModbusUnit:
             handlers[0x2B] = identification.respond
         return handlers
 
-    def register(self, function: int, handler: Handler, *, broadcast: bool = False) -> None:
+    def register(
+        self, function: int, handler: Handler, *, broadcast: bool = False, request_length: int | None = None
+    ) -> None:
         """Answer `function` (1 to 127) with `handler` from now on, a standard one too: devices have their own ways.
 
-        `broadcast`: it is also executed when it comes to unit 0 of a serial line.
+        `broadcast`: it is also executed when it comes to unit 0 of a serial line. `request_length`: bytes of its request
+        PDU, where that is always the same; of standard functions it is known.
         """
         if not 1 <= function <= 0x7F:
             raise UsageError("function code", expected="1 to 127", got=str(function))
         self._handlers[function] = handler
         if broadcast:
             self._broadcasts.add(function)
+        if request_length is not None:
+            self.request_lengths[function] = request_length
 
     def be_busy(self, until_ns: int) -> None:
         """Answer with exception 06 until `until_ns` of the emulator's time; functions 08, 0B and 0C still work."""

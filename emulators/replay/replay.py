@@ -12,13 +12,14 @@ together whatever happens (`counters`). Pure: PDUs in, PDUs out. It knows neithe
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
 from emulators.context import MAX_ENTRIES, Recorded, UsedUp, VirtualContext, WhenUsedUp
 from emulators.modbus.bank import Table
+from emulators.modbus.register_functions import STANDARD_FUNCTIONS
 from emulators.replay import requests
 from emulators.replay.counters import Counters, CounterSpan
 from emulators.replay.requests import CellRequest
@@ -66,6 +67,7 @@ class _Unit:
         self.recorded_in: dict[bytes, list[int]] = {}  # cell or shape -> situations, in recorded order
         self.alike: dict[bytes, int] = {}  # the same -> the one to use in the present situation
         self.functions: set[int] = set()
+        self.request_lengths: dict[int, set[int]] = {}  # function that no standard knows -> recorded lengths
         self.writable: set[Cell] = set()
         self.refused_writes: dict[tuple[int, int, int], Recorded] = {}
         self.most_read: dict[int, int] = {}  # function -> most cells ever answered
@@ -156,6 +158,17 @@ class ExchangeReplay:
                 if unit_id in (None, number):
                     self._write(unit, request, request.values)
 
+    def own_request_lengths(self, unit_id: int) -> dict[int, int]:
+        """Functions that no standard knows, of which every recorded request was as long as the others: bytes of the PDU."""
+        found = self._units[unit_id].request_lengths
+        return {function: max(lengths) for function, lengths in found.items() if len(lengths) == 1}
+
+    def put(self, unit_id: int, table: Table, address: int, values: Sequence[int]) -> None:
+        """The unit itself changed these cells: they read so until they are written or put again."""
+        unit = self._units[unit_id]
+        unit.situations.write(table, address, values)
+        unit.alike.clear()
+
     def _counted(self, pdu: bytes, answer: Answer) -> Answer:
         if answer.reply is None:
             self.counters.silences += 1
@@ -176,6 +189,8 @@ class ExchangeReplay:
             return
         unit = self._unit(exchange.unit)
         unit.functions.add(exchange.request[0])
+        if exchange.request[0] not in STANDARD_FUNCTIONS:
+            unit.request_lengths.setdefault(exchange.request[0], set()).add(len(exchange.request))
         reply = exchange.reply or b""
         recorded = Recorded(exchange.t_s, self._response(reply), exchange.latency_s)
         self._add(unit, _shape(exchange.unit, exchange.request), recorded)

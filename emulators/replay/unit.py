@@ -1,6 +1,7 @@
 """A recorded unit on an emulated line: what a Modbus slave asks, answered by a replay.
 
-It takes the place of a unit that computes its answers: same counters, same calls. `latency_s` is what the last answer had taken
+It takes the place of a unit that computes its answers: same counters, same calls; what is registered on it, and exception
+06 while it is to be busy, go before what was recorded. `latency_s` is what the last answer had taken
 in the recording; whoever sends the reply may wait as long.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from emulators.modbus.bank import IllegalAddress, RegisterBank, Table
-from emulators.modbus.unit import ModbusUnit
+from emulators.modbus.unit import Handler, ModbusUnit
 from emulators.replay.replay import ExchangeReplay
 from gateway.core.errors import UsageError
 
@@ -35,9 +36,20 @@ class ReplayUnit(ModbusUnit):
         self.replay = replay
         self.unit_id = unit_id
         self.latency_s = 0.0
+        self._registered: set[int] = set()
+        self.request_lengths.update(replay.own_request_lengths(unit_id))
+
+    def register(
+        self, function: int, handler: Handler, *, broadcast: bool = False, request_length: int | None = None
+    ) -> None:
+        super().register(function, handler, broadcast=broadcast, request_length=request_length)
+        self._registered.add(function)
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
-        """The recorded answer, None for silence. `now_ns` is not used: exchanges are keyed by order, not by time."""
+        """The recorded answer, None for silence. Exchanges are keyed by order, not by time."""
+        if pdu and (pdu[0] in self._registered or now_ns < self._busy_until_ns):
+            self.latency_s = 0.0
+            return super().respond(pdu, now_ns)
         self.counters.requests += 1
         answer = self.replay.respond(self.unit_id, pdu)
         self.latency_s = answer.latency_s

@@ -26,6 +26,7 @@ from emulators.modbus.unit import ModbusUnit
 from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.sampled_sensor import SampledSensor
+from emulators.replay.own_functions import add_own_functions
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.unit import ReplayUnit
 from emulators.signals import SignalPlayer, SignalTrack
@@ -100,7 +101,9 @@ class DeviceHost:
     def _recorded(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
         """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name."""
         replay = ExchangeReplay.load(find_recording(str(recording or f"{Path(profile.path).stem}.jsonl")))
-        return ReplayUnit(replay, next(iter(replay.units)), profile.name)
+        unit = ReplayUnit(replay, next(iter(replay.units)), profile.name)
+        add_own_functions(unit, profile)
+        return unit
 
     def replayed(self, path: Path, unit_id: int | None) -> dict[int, ModbusUnit]:
         """The units of a recording of exchanges, or the one that is asked for."""

@@ -144,6 +144,18 @@ class Box:
     ack: RegisterRange
 
 
+@dataclass(frozen=True, slots=True)
+class OwnFunction:
+    """A function that no standard knows: `request` and `reply` are its data, without the function code. `sets`: what tags
+    hold afterwards, in engineering units."""
+
+    name: str
+    code: int
+    request: bytes
+    reply: bytes
+    sets: tuple[tuple[Tag, float], ...] = ()
+
+
 @dataclass(frozen=True)
 class DeviceProfile:
     """A profile, resolved. Dictionaries keep the file's order."""
@@ -195,6 +207,20 @@ class DeviceProfile:
         if self.protocol == "canopen":
             commands |= {"nmt_start", "nmt_stop", "nmt_preoperational", "nmt_reset_node", "nmt_reset_communication"}
         return frozenset(commands)
+
+    @property
+    def own_functions(self) -> dict[str, OwnFunction]:
+        """The functions of the device's own, by name."""
+        return {
+            name: OwnFunction(
+                name,
+                f.code,
+                bytes.fromhex(f.request),
+                bytes.fromhex(f.request if f.reply is None else f.reply),
+                tuple((self.tags[tag], float(value)) for tag, value in f.sets.items()),
+            )
+            for name, f in self.form.functions.items()
+        }
 
     def command_for(self, tag: str) -> str:
         """The command that writes `tag`."""
@@ -395,6 +421,7 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
     wanted += [(("messages", m.name, "when"), m.when) for m in p.messages.values()]
     wanted += [(("identify", i, "tag"), e.tag) for i, e in enumerate(p.form.identify)]
     wanted += [(("tags", t.name, "scale_by"), t.scale_by) for t in p.tags.values() if t.scale_by is not None]
+    wanted += [(("functions", n, "sets", t), t) for n, f in p.form.functions.items() for t in f.sets]
     if p.form.trigger is not None:
         wanted.append((("trigger", "tag"), p.form.trigger.tag))
     if p.sampled:
@@ -414,5 +441,14 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
                     f"no command {command!r}",
                     expected=", ".join(p.form.commands) or "none",
                 )
+    for name, function in p.form.functions.items():
+        allowed = p.form.limits.functions
+        if allowed is not None and function.code not in allowed:
+            raise file.error(("functions", name, "code"), f"{function.code:02X}h is not in `limits: functions`")
+        if max(len(t) for t in (function.request, function.reply or "")) > 3 * 252:
+            raise file.error(("functions", name), "more data than a PDU holds", expected="at most 252 bytes")
+        for tag in function.sets:
+            if tag in p.tags and (p.tags[tag].bits is not None or p.tags[tag].is_text):
+                raise file.error(("functions", name, "sets", tag), f"{tag!r} is text, or a part of a register")
     if p.protocol == "canopen" and p.form.eds is None:
         raise FileInvalid("a CANopen profile names its EDS", path=p.path, line=1, expected="`eds: FILE.eds`")

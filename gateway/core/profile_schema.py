@@ -149,6 +149,16 @@ class TriggerForm(Strict):
     poll: str = "values"
 
 
+class FunctionForm(Strict):
+    """A function of the device's own (AP 5). Request and reply are data bytes in hex, without the function code."""
+
+    code: int = Field(ge=1, le=127)
+    request: str = Field(default="", pattern=r"^([0-9A-Fa-f]{2} ?)*$", description="what it takes; else exception 03")
+    reply: str | None = Field(default=None, pattern=r"^([0-9A-Fa-f]{2} ?)*$", description="default: as the request")
+    sets: dict[Name, int | float] = Field(default={}, description="tag -> what it holds afterwards")
+    danger: str = ""
+
+
 class ProfileForm(Strict):
     """A device profile."""
 
@@ -168,5 +178,6 @@ class ProfileForm(Strict):
     mailbox: MailboxForm | None = None
     messages: dict[Name, MessageForm] = Field(default={}, max_length=1)
     tags: dict[Name, TagForm] = {}
+    functions: dict[Name, FunctionForm] = Field(default={}, description="functions that no standard knows")
     commands: dict[Name, str] = Field(default={}, description="command name -> the tag it writes")
     behaviours: dict[Name, dict[str, int | float]] = Field(default={}, description="behaviour -> command -> value")

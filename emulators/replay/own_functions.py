@@ -1,0 +1,32 @@
+"""The functions of a device's own that its profile declares, on the unit that replays the device.
+
+Such a function is asked for with the one request that is documented, says what is documented, and leaves in its registers what
+the profile says; any other request gets exception 03. Encodes for itself, as everything on this side of the wire.
+"""
+
+from __future__ import annotations
+
+from emulators.codec import encode
+from emulators.modbus.bank import IllegalValue
+from emulators.modbus.unit import Handler
+from emulators.replay.unit import ReplayUnit
+from gateway.core.profile import DeviceProfile, OwnFunction
+
+
+def add_own_functions(unit: ReplayUnit, profile: DeviceProfile) -> None:
+    """Let `unit` answer every function of `profile.own_functions`."""
+    for function in profile.own_functions.values():
+        unit.register(function.code, _handler(unit, function), request_length=1 + len(function.request))
+
+
+def _handler(unit: ReplayUnit, function: OwnFunction) -> Handler:
+    def respond(pdu: bytes, now_ns: int) -> bytes:
+        if pdu[1:] != function.request:
+            raise IllegalValue(f"{function.name}: {pdu[1:].hex(' ')}")
+        for tag, value in function.sets:
+            at = tag.registers
+            words = encode((value - tag.offset) / tag.scale, tag.type, tag.order, registers=at.count)
+            unit.replay.put(unit.unit_id, at.table, at.address, words)
+        return pdu[:1] + function.reply
+
+    return respond

@@ -18,6 +18,14 @@ from gateway.core.canframe import CanFrame
 from gateway.core.connection import CANConnection, CanConnection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import SdoAborted, UsageError, VerifyFailed
+from gateway.protocols.canopen.boot import (
+    Configuration,
+    ExpectedIdentity,
+    download_configuration,
+    holds_configuration,
+    identity_differences,
+)
+from gateway.protocols.canopen.concise_dcf import Setting
 from gateway.protocols.canopen.configure import (
     Identity,
     configure_tpdo,
@@ -153,6 +161,30 @@ def test_objects_come_and_go_expedited_and_segmented() -> None:
                 await p.master.sdo_upload(NODE, 0x1018, 9)
             assert caught.value.code == 0x0609_0011
             assert p.master.counters.sdo_requests == p.master.counters.sdo_replies + 2
+
+    run(main())
+
+
+def test_a_node_that_knows_no_block_transfer_is_asked_without() -> None:
+    async def main() -> None:
+        async with pair() as p:
+            assert await p.master.sdo_upload(NODE, 0x1008, 0, block=True) == b"a node with a long name"
+            await p.master.sdo_download(NODE, 0x2000, 0, b"a longer note that takes five segments", block=True)
+            assert p.node.data_store[0x2000][0] == b"a longer note that takes five segments"
+            assert p.master.counters.sdo_timeouts == 0
+
+    run(main())
+
+
+def test_its_boot_is_that_of_a_node_that_holds_no_date() -> None:
+    async def main() -> None:
+        async with pair() as p:
+            expected = ExpectedIdentity(device_type=0x2019A, vendor=1, serial=4)
+            assert await identity_differences(p.master, NODE, expected) == {}
+            assert not await holds_configuration(p.master, NODE, (15000, 1))  # it has no 1020h
+            settings = (Setting(0x2000, 0, b"set by its DCF"), Setting(0x1800, 5, b"\x64\0"))
+            assert await download_configuration(p.master, NODE, Configuration(settings))
+            assert p.node.data_store[0x2000][0] == b"set by its DCF"
 
     run(main())
 

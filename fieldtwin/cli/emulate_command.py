@@ -21,6 +21,12 @@ from twin.data_files import data_root, find
 @click.option(
     "--unit", type=click.IntRange(1, 247), default=None, help="For a device: its unit id; default as the profile says."
 )
+@click.option(
+    "--node",
+    type=click.IntRange(1, 255),
+    default=None,
+    help="For a CANopen device or data sheet: its node id; 255: none yet, LSS gives it one.",
+)
 @click.option("--recording", "recordings", multiple=True, metavar="[DEVICE=]FILE", help="Play this recording.")
 @click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
 @click.option(
@@ -43,6 +49,7 @@ def command(
     what: str,
     endpoints: tuple[str, ...],
     unit: int | None,
+    node: int | None,
     recordings: tuple[str, ...],
     speed: float,
     prototype_file: str | None,
@@ -52,18 +59,20 @@ def command(
     instance: str,
     profiles: tuple[str, ...],
 ) -> int:
-    """Emulate WHAT: a system, a device profile, or a recording; the file tells, a bare name is a profile, then a system.
+    """Emulate WHAT: a system, a device profile, a recording, or an EDS or DCF file; a bare name is a profile, then a system.
 
     \b
     fieldtwin emulate observatory                                    the whole field side, for run --field localhost
     fieldtwin emulate ctd-reference --on pty:/tmp/ctd                one sensor on a virtual serial port
     fieldtwin emulate ctd-reference --on tcp://127.0.0.1:1502        the same on Modbus TCP
+    fieldtwin emulate drive.eds --node 5 --on can:fieldtwin/127.0.0.1:0   a CANopen node from its data sheet
     """
     kind, path = _kind(what, tuple(Path(p) for p in profiles))
     if kind == "system":
-        if endpoints or unit is not None:
+        if endpoints or unit is not None or node is not None:
             raise UsageError(
-                "--on and --unit are for a single device", hint="a system's prototype file says where it listens"
+                "--on, --unit and --node are for a single device",
+                hint="a system's prototype file says where it listens",
             )
         from fieldtwin.running.field_here import FieldOptions, run_field
 
@@ -89,12 +98,25 @@ def command(
         raise UsageError("where shall it listen?", expected="--on pty:PATH or --on tcp://HOST:PORT")
     if len(recordings) > 1:
         raise UsageError("one device plays one recording")
+    if kind == "data sheet":
+        if recordings or unit is not None:
+            raise UsageError(
+                "a data sheet alone has neither a recording nor a unit id", hint="--node, or a device profile for it"
+            )
+        from fieldtwin.running.data_sheet_here import run_data_sheet
+
+        return run_loop(run_data_sheet(path, endpoints, node))
+    if unit is not None and node is not None:
+        raise UsageError("a device has a unit id or a node id, not both")
+    unit = node if unit is None else unit
     return run_loop(run_device(kind, path, endpoints, unit, Path(recordings[0]) if recordings else None, speed or 1.0))
 
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
-    """What `what` names: ("system" | "device" | "recording", file)."""
+    """What `what` names: ("system" | "device" | "recording" | "data sheet", file)."""
     direct = Path(what)
+    if direct.suffix.lower() in (".eds", ".dcf"):
+        return "data sheet", direct
     if direct.suffix == ".jsonl":
         shipped = data_root() / "recordings" / what
         return "recording", direct if direct.is_file() else shipped

@@ -20,6 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from emulators.canopen.aborts import Abort
+from emulators.canopen.acceptance import Acceptance
 from emulators.canopen.behaviour import Behaviour, DeviceModel
 from emulators.canopen.bus_faults import BusFaults, BusState
 from emulators.canopen.client_view import ClientView
@@ -96,6 +97,8 @@ class CanopenNode:
         self._behaviour = None if model is None else Behaviour(model, source, data)
         self._core = core = Core(data, node_id, self._behaviour or source, context.journal_size)
         core.held = context.held
+        self.accepts = Acceptance(core)
+        """The acceptance filter: whether a frame can mean anything to this node. Feeding others does no harm."""
         self._powered = False
         self._emergency = Emergency(core)
         react = ErrorReaction(core, self._enter)

@@ -43,6 +43,8 @@ class NodeData:
         self.rebase(node_id)
         self._stored: dict[Key, bytes] = {}
         self._live: dict[Key, bytes] = dict(self._factory)
+        self.version = 0
+        """Counts what happened to communication objects, so that others can keep what they made of them."""
 
     def rebase(self, node_id: int) -> None:
         """Factory values of a node with this id; live values stay until a reset."""
@@ -82,6 +84,7 @@ class NodeData:
         self._sized(key, raw)
         changed = self._live[key] != raw
         self._live[key] = bytes(raw)
+        self.version += changed and index < 0x2000
         return changed
 
     def put_number(self, index: int, subindex: int, value: int) -> None:
@@ -111,6 +114,7 @@ class NodeData:
 
     def reset(self, *, communication_only: bool) -> None:
         """Power-on values: what was stored, else the factory's (CiA 301, 7.3.2.2.1)."""
+        self.version += 1
         for key, raw in self._factory.items():
             if not communication_only or key[0] in COMMUNICATION:
                 self._live[key] = self._stored.get(key, raw)

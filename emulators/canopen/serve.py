@@ -25,6 +25,7 @@ async def serve_node(
     Raises `ConnectionLost` when the bus goes away, and what the node raises. The connection stays open: it is the
     caller's.
     """
+    connection.accept = node.accepts
     receiving: asyncio.Task[CanFrame] = asyncio.create_task(connection.recv())
     poked: asyncio.Task[Poke] | None = asyncio.create_task(pokes.get()) if pokes else None
     sleeping: asyncio.Task[None] | None = None

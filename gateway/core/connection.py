@@ -183,8 +183,12 @@ class CanConnection(_End[CanFrame], ABC):
         super().__init__(inbound, endpoint, max_pending)
         self.overruns = 0
         """Frames dropped here because the reader was too slow. A bus waits for nobody."""
+        self.accept: Callable[[CanFrame], bool] | None = None
+        """The reader's acceptance filter, where it has one: what it refuses never comes in, and was no overrun."""
 
     def feed(self, item: CanFrame) -> bool:
+        if self.accept is not None and not self.accept(item):
+            return True
         if len(self.inbound.data_stream) >= self.max_pending:
             self.overruns += 1
             return False

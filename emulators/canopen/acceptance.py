@@ -1,0 +1,46 @@
+"""Which frames a node's CAN controller lets in: the acceptance filter that every real one has in hardware.
+
+On a bus with a hundred nodes almost every frame is somebody else's. It must never say no to what the node would act on: all
+identifiers that stand in the communication objects pass, those that the node sends on as well (another sender there is an
+error), and so does what is no plain identifier.
+"""
+
+from __future__ import annotations
+
+from emulators.canopen.service import Core
+from gateway.core.canframe import CanFrame
+
+NMT, LSS = 0x000, 0x7E5
+SDO_RESPONSE, SDO_REQUEST, ERROR_CONTROL = 0x580, 0x600, 0x700
+_SINGLE = (0x1005, 0x1012, 0x1014)
+_SDO_SERVERS, _PDOS = range(0x1200, 0x1280), (range(0x1400, 0x1600), range(0x1800, 0x1A00))
+_CONSUMER_HEARTBEAT = 0x1016
+
+
+class Acceptance:
+    """Called with a frame: whether to let it in. Follows every change of the communication objects and of the node id."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._version = -1
+        self._ids: frozenset[int] = frozenset()
+
+    def __call__(self, frame: CanFrame) -> bool:
+        if self._version != self._core.data.version:
+            self._version = self._core.data.version
+            self._ids = self._identifiers()
+        return frame.can_id in self._ids or frame.extended or frame.error
+
+    def _identifiers(self) -> frozenset[int]:
+        data, node_id = self._core.data, self._core.node_id
+        ids = {NMT, LSS, *(base + node_id for base in (SDO_RESPONSE, SDO_REQUEST, ERROR_CONTROL))}
+        for index, found in data.dictionary.objects.items():
+            if index in _SINGLE:
+                ids.add(data.number(index) & 0x7FF)
+            elif index in _SDO_SERVERS:
+                ids |= {data.number(index, sub) & 0x7FF for sub in (1, 2)}
+            elif any(index in pdos for pdos in _PDOS):
+                ids.add(data.number(index, 1) & 0x7FF)
+            elif index == _CONSUMER_HEARTBEAT:
+                ids |= {ERROR_CONTROL + (data.number(index, sub) >> 16 & 0x7F) for sub in found.entries if sub}
+        return frozenset(ids)

@@ -22,10 +22,10 @@ from gateway.devices.config import BusConfig
 from gateway.protocols.canopen.cob_id import LSS_REPLY
 from gateway.protocols.canopen.emcy import parse_emcy
 from gateway.protocols.canopen.emcy_log import EmcyLog
-from gateway.protocols.canopen.lss import LssAddress
+from gateway.protocols.canopen.lss import UNCONFIGURED, LssAddress
 from gateway.protocols.canopen.lss_master import LssMaster
 from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NodeEvent
+from gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
 from gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.backoff import Backoff
@@ -190,10 +190,12 @@ class CanopenBus:
         if address is None or self._lss is None or not self._allow_writes:
             return error
         try:
-            if not await self._lss.any_unconfigured():
-                return error
             self._note_lss(driver, address)
-            await self._lss.assign(address, driver.node)
+            had = await self._lss.assign(address, driver.node)
+            if had not in (UNCONFIGURED, driver.node):
+                await driver.master.nmt(NmtCommand.RESET_COMMUNICATION, had)  # it takes the new id when it boots
+        except ReplyTimeout:
+            return error  # it is not there at all
         except ConnectionLost:
             raise
         except FieldtwinError as e:

@@ -163,8 +163,7 @@ class Play:
         return "done"
 
     async def do_lss_assign(self, vendor: int, product: int, revision: int, serial: int, node: int) -> str:
-        await self.lss.assign(LssAddress(vendor, product, revision, serial), node)
-        return "done"
+        return str(await self.lss.assign(LssAddress(vendor, product, revision, serial), node))
 
     # -- what comes of it ---------------------------------------------------------------------------------------------
 

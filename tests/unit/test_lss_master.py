@@ -180,6 +180,19 @@ def test_the_one_with_that_address_is_configured_and_asked() -> None:
     run_virtually(main())
 
 
+def test_two_that_are_named_at_once_get_each_its_own_node_id() -> None:
+    async def main() -> None:
+        slaves = [Slave((1, 2, 3, 4), delay_s=0.003), Slave((1, 2, 3, 5), node=100)]
+        async with master_of(slaves) as lss:
+            had = await asyncio.gather(
+                lss.assign(LssAddress(1, 2, 3, 4), 8), lss.assign(LssAddress(1, 2, 3, 5), 9, store=False)
+            )
+            assert had == [0xFF, 100]
+            await eventually(lambda: [(s.node, s.stored) for s in slaves] == [(8, 8), (9, None)])
+
+    run_virtually(main())
+
+
 def test_nobody_there_is_told_and_wrong_use_refused() -> None:
     async def main() -> None:
         async with master_of([Slave((1, 2, 3, 4))]) as lss:

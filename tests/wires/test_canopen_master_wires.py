@@ -136,7 +136,7 @@ class WirePlay:
         elif name == "lss-store":
             await self.lss.store()
         else:
-            await self.lss.assign(LssAddress(*rest[:4]), rest[4])
+            return str(await self.lss.assign(LssAddress(*rest[:4]), rest[4]))
         return "done"
 
 

@@ -37,6 +37,7 @@ class LssMaster:
         self._clock = clock
         self._reply_s = reply_s
         self._turn = asyncio.Lock()
+        self._procedure = asyncio.Lock()
         self._inbox: deque[bytes] = deque(maxlen=MAX_INBOX)
         self._arrived = asyncio.Event()
         self._waiting = False
@@ -146,17 +147,24 @@ class LssMaster:
             raise Desync(f"nobody stands to part {part} of the address that fastscan found", got=f"{number:08X}h")
         return number
 
-    async def assign(self, address: LssAddress, node: int, *, store: bool = True) -> None:
-        """Give the slave with `address` the node id `node` and switch it to waiting: it boots under it."""
+    async def assign(self, address: LssAddress, node: int, *, store: bool = True) -> int:
+        """Give the slave with `address` the node id `node` and switch it to waiting; the node id that it had.
+
+        One that had none (255) boots under the new one at once, another when its communication is reset. Nobody else's
+        `assign` comes in between: a slave that another call selected would get the node id too.
+        """
         lss.check_node_id(node)
-        await self.switch_all(configuration=False)
-        await self.select(address)
-        try:
-            await self.configure_node_id(node)
-            if store:
-                await self.store()
-        finally:
+        async with self._procedure:
             await self.switch_all(configuration=False)
+            await self.select(address)
+            try:
+                had = await self.inquire_node_id()
+                await self.configure_node_id(node)
+                if store:
+                    await self.store()
+            finally:
+                await self.switch_all(configuration=False)
+        return had
 
     # -- asking -----------------------------------------------------------------------------------------------------
 

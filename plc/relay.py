@@ -14,6 +14,7 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import ClassVar
 
 from gateway.core.errors import Bug, Desync
 from gateway.core.events import Consumer, Producer
@@ -21,6 +22,7 @@ from gateway.core.image import Message, TagKind
 from gateway.core.statemachine import STATE_CODES, EventStateMachine
 from gateway.core.values import COMMAND, DATA, RESPONSE
 from plc.program import Outbox, Program, ScanInfo, message_input, message_output, var_local, var_output
+from plc.states import ANY, StateTable, Transition
 
 QUEUE_CAPACITY = 256
 LOG_CAPACITY = 1024
@@ -132,6 +134,15 @@ class Relay(Program):
     wait: responses queue, bounded, the oldest dropped and counted.
     """
 
+    queue_capacity: ClassVar[int] = QUEUE_CAPACITY
+    """Responses that wait for the transmitter."""
+    table = StateTable(
+        Transition(ANY, "ACTIVE", when="command > 0"),
+        Transition(ANY, "STANDBY", when="command = 0"),
+        Transition(ANY, "OFF", when="command < 0"),
+        states=tuple(STATE_CODES),
+    )
+    """The machine as it is drawn; gateway.core.statemachine is what runs it."""
     command: tuple[Message, ...] = message_input()
     sample: tuple[Message, ...] = message_input()
     period_s: int = var_output(TagKind.INT, initial=0, unit="s")
@@ -148,7 +159,7 @@ class Relay(Program):
 
     def __init__(self) -> None:
         self.logic = ControlLogic()
-        self._outgoing: Consumer[RESPONSE] = Consumer("response", QUEUE_CAPACITY)
+        self._outgoing: Consumer[RESPONSE] = Consumer("response", self.queue_capacity)
         self.logic.response.subscribe(self._outgoing)
         self._log_sent = 0
         self._log_lost = 0

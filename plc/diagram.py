@@ -1,0 +1,138 @@
+"""A state table as a drawing: SVG, without a network, a font or a layout program.
+
+States stand on an ellipse in the order of their codes, the initial one on top with a dot before it; each transition is an
+arrow with its guard. Transitions from any state are drawn from each. Pure: text in, text out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from math import atan2, cos, hypot, pi, sin
+
+from plc.states import StateTable
+
+_CHAR = 7.2
+"""Width of a character of the 12 px monospace face, in px."""
+_BOX_H = 40.0
+_LABEL_H = 18.0
+_MARGIN = 60.0
+_LABEL_AT = 0.36
+"""How far along its arrow a label stands: nearer to the source, since arrows meet in the middle."""
+_STYLE = """
+  svg { font: 12px ui-monospace, Menlo, Consolas, monospace; fill: none }
+  .ground { fill: #fff }
+  .box { fill: #eef3fb; stroke: #2b5597; stroke-width: 1.5 } .now { fill: #ffe9b8 }
+  .name { fill: #14284a; text-anchor: middle; font-weight: 600 }
+  .arrow { fill: none; stroke: #5b6b85; stroke-width: 1.3 } .tip { fill: #5b6b85 }
+  .label { fill: #333; text-anchor: middle } .paper { fill: #fff; opacity: .88 } .dot { fill: #14284a }
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Box:
+    x: float
+    y: float
+    width: float
+
+    def edge(self, angle: float) -> tuple[float, float]:
+        """Where a ray from the middle at `angle` leaves the box."""
+        dx, dy = cos(angle), sin(angle)
+        across = self.width / 2 / abs(dx) if dx else float("inf")
+        up = _BOX_H / 2 / abs(dy) if dy else float("inf")
+        length = min(across, up) + 2
+        return self.x + dx * length, self.y + dy * length
+
+
+def svg(table: StateTable, title: str = "", current: str = "") -> str:
+    """The drawing; `current` is highlighted."""
+    arrows = _arrows(table)
+    longest = max((len(label) for *_, label in arrows), default=0)
+    boxes = _places(table, longest)
+    width = max(b.x + b.width / 2 for b in boxes.values()) + _MARGIN + longest * _CHAR / 2
+    height = max(b.y for b in boxes.values()) + _BOX_H + _MARGIN
+    middle = (sum(b.x for b in boxes.values()) / len(boxes), sum(b.y for b in boxes.values()) / len(boxes))
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" width="{width:.0f}" '
+        f'height="{height:.0f}" role="img"><title>{escape(title or "state machine")}</title><style>{_STYLE}</style>'
+        '<rect class="ground" width="100%" height="100%"/>'
+    ]
+    labels: list[str] = []
+    for source, target, text in arrows:
+        both = any(s == target and t == source for s, t, _ in arrows)
+        parts.append(_arrow(boxes[source], boxes[target], source == target, both, middle, text, labels))
+    for name, box in boxes.items():
+        style = "box now" if name == current else "box"
+        left, top = box.x - box.width / 2, box.y - _BOX_H / 2
+        parts.append(
+            f'<rect class="{style}" x="{left:.1f}" y="{top:.1f}" width="{box.width:.1f}" height="{_BOX_H}" rx="9"/>'
+            f'<text class="name" x="{box.x:.1f}" y="{box.y + 4:.1f}">{escape(name)}</text>'
+        )
+    first = boxes[table.initial]
+    top = first.y - _BOX_H / 2
+    parts.append(f'<circle class="dot" cx="{first.x:.1f}" cy="{top - 26:.1f}" r="5"/>')
+    parts.append(
+        f'<path class="arrow" d="M{first.x:.1f},{top - 21:.1f} V{top - 6:.1f}"/>{_tip(first.x, top - 1, pi / 2)}'
+    )
+    return "\n".join([*parts, *labels, "</svg>", ""])
+
+
+def _arrows(table: StateTable) -> list[tuple[str, str, str]]:
+    """(source, target, label): several transitions between the same two states share an arrow."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for state in table.states:
+        for transition in table.leaving(state):
+            found.setdefault((state, transition.target), []).append(transition.label)
+    return [(s, t, " | ".join(dict.fromkeys(label for label in labels if label))) for (s, t), labels in found.items()]
+
+
+def _places(table: StateTable, longest: int) -> dict[str, _Box]:
+    names = [table.initial, *(s for s in table.states if s != table.initial)]
+    widths = {n: max(70.0, len(n) * _CHAR + 24) for n in names}
+    around = max(longest * _CHAR + 60, max(widths.values()) + 40) * len(names) / (2 * pi) * 1.3
+    rx, ry = max(170.0, around), max(150.0, around * 0.66)
+    if len(names) == 1:
+        rx = ry = 0.0
+    cx = rx + max(widths.values()) / 2 + _MARGIN + longest * _CHAR / 2
+    cy = ry + _BOX_H + _MARGIN
+    return {
+        name: _Box(cx + rx * sin(2 * pi * n / len(names)), cy - ry * cos(2 * pi * n / len(names)), widths[name])
+        for n, name in enumerate(names)
+    }
+
+
+def _arrow(a: _Box, b: _Box, loop: bool, both: bool, middle: tuple[float, float], text: str, labels: list[str]) -> str:
+    if loop:
+        outward = atan2(a.y - middle[1], a.x - middle[0]) if (a.x, a.y) != middle else 0.0
+        x1, y1 = a.edge(outward - 0.5)
+        x2, y2 = a.edge(outward + 0.5)
+        px, py = a.x + cos(outward) * 110, a.y + sin(outward) * 90
+        bend = f"C{px:.1f},{py:.1f} {px:.1f},{py:.1f} {x2:.1f},{y2:.1f}"
+        labels.append(_label(a.x + cos(outward) * 92, a.y + sin(outward) * 78, text))
+        return f'<path class="arrow" d="M{x1:.1f},{y1:.1f} {bend}"/>{_tip(x2, y2, atan2(y2 - py, x2 - px))}'
+    dx, dy = b.x - a.x, b.y - a.y
+    length = hypot(dx, dy)
+    sway = 34.0 if both else 0.0  # there and back are two arrows: each bends to its right
+    px, py = (a.x + b.x) / 2 - dy / length * sway * 2, (a.y + b.y) / 2 + dx / length * sway * 2
+    x1, y1 = a.edge(atan2(py - a.y, px - a.x))
+    x2, y2 = b.edge(atan2(py - b.y, px - b.x))
+    near, far = (1 - _LABEL_AT) ** 2, _LABEL_AT**2
+    bent = 2 * _LABEL_AT * (1 - _LABEL_AT)
+    labels.append(_label(near * x1 + bent * px + far * x2, near * y1 + bent * py + far * y2, text))
+    tip = _tip(x2, y2, atan2(y2 - py, x2 - px))
+    return f'<path class="arrow" d="M{x1:.1f},{y1:.1f} Q{px:.1f},{py:.1f} {x2:.1f},{y2:.1f}"/>{tip}'
+
+
+def _label(x: float, y: float, text: str) -> str:
+    if not text:
+        return ""
+    width = len(text) * _CHAR + 8
+    return (
+        f'<rect class="paper" x="{x - width / 2:.1f}" y="{y - _LABEL_H / 2:.1f}" width="{width:.1f}" height="{_LABEL_H}" rx="3"/>'
+        f'<text class="label" x="{x:.1f}" y="{y + 4:.1f}">{escape(text)}</text>'
+    )
+
+
+def _tip(x: float, y: float, angle: float) -> str:
+    points = [(x, y)] + [(x - 9 * cos(angle + s * 0.4), y - 9 * sin(angle + s * 0.4)) for s in (-1, 1)]
+    return f'<path class="tip" d="M{" L".join(f"{px:.1f},{py:.1f}" for px, py in points)} Z"/>'

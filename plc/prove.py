@@ -1,0 +1,172 @@
+"""Proving a program: every state that any inputs can bring it into, breadth first, against what must always hold.
+
+A `Proof` says what may come in (a finite domain a scan: values, qualities, how much time passes), which part of the program's
+state matters, and the invariants. The program itself runs, scan by scan; nothing is modelled twice. Breadth first, so the way
+to the first violation is a shortest one. Bounded: what was not looked at is said, and is no proof.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+from gateway.core.clock import NS_PER_MS
+from gateway.core.image import Message, TagKind
+from gateway.core.values import Quality, Reason, TagValue
+from plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
+from plc.states import StateMachine
+
+MAX_STATES = 200_000
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What one scan is given: inputs by variable (None: BAD, never a value), ms since the scan before, and whether the taker
+    of each message output has emptied its mailbox since."""
+
+    inputs: tuple[tuple[str, Any], ...]
+    ms: float
+    taken: bool = True
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able: for a counterexample."""
+        shown = {
+            name: value.hex() if isinstance(value, bytes) else value for name, value in self.inputs if value is not None
+        }
+        return {"after_ms": self.ms, "inputs": shown, "taken": self.taken}
+
+
+Invariant = Callable[[Any], bool]
+"""Told the program after a scan: whether all is well."""
+
+
+@dataclass(frozen=True)
+class Proof:
+    """What is to be proved of a program.
+
+    `make` makes it; `domain` has for each input the values that a scan may bring (a message input's are payloads, None for
+    no message; None for any other is BAD); `steps_ms` the times between scans; `key` what of the program matters, as
+    something hashable: two states with one key are the same. `clogs`: mailboxes may also be full.
+    """
+
+    make: Callable[[], Program]
+    domain: Mapping[str, Sequence[Any]]
+    invariants: Mapping[str, Invariant]
+    key: Callable[[Any], Hashable]
+    steps_ms: tuple[float, ...] = (10.0,)
+    clogs: bool = False
+    requirement: Mapping[str, str] = field(default_factory=dict)
+    """Where each invariant comes from."""
+
+    def choices(self) -> list[Given]:
+        """All that one scan can be given, the plainest first."""
+        names = list(self.domain)
+        rows = product(*(self.domain[name] for name in names))
+        return [
+            Given(tuple(zip(names, row, strict=True)), ms, taken)
+            for row, ms, taken in product(list(rows), self.steps_ms, (True, False) if self.clogs else (True,))
+        ]
+
+
+def machine_key(program: StateMachine) -> Hashable:
+    """Of a state machine: its state, the phase of its timers, its outputs and locals."""
+    phase = min(program.in_state_ms, program.table.longest_ms)
+    own = [v.name for v in program.variables.values() if v.role is not Role.INPUT and v.kind is not TagKind.MESSAGE]
+    return phase, *(program.__dict__[name] for name in own)
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """`broken`: the invariant that does not hold (or the error that a scan raised), and `way` to it, scan by scan."""
+
+    states: int
+    transitions: int
+    depth: int
+    complete: bool
+    broken: str = ""
+    way: tuple[Given, ...] = ()
+
+    @property
+    def proved(self) -> bool:
+        return self.complete and not self.broken
+
+
+def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -> Result:
+    """Look at everything reachable, or until something is broken, or the bounds are reached."""
+    choices = proof.choices()
+    first = _Point(proof.make(), 0, 0, None, None)
+    seen = {proof.key(first.program)}
+    waiting = deque([first])
+    transitions, depth = 0, 0
+    while waiting:
+        point = waiting.popleft()
+        if point.number >= max_depth:
+            return Result(len(seen), transitions, point.number, complete=False)
+        depth = max(depth, point.number + 1)
+        for given in choices:
+            following = point.after(given)
+            transitions += 1
+            broken = _broken(proof, following, given)
+            if broken:
+                return Result(len(seen), transitions, following.number, False, broken, tuple(following.way()))
+            key = proof.key(following.program)
+            if key not in seen:
+                if len(seen) >= max_states:
+                    return Result(len(seen), transitions, depth, complete=False)
+                seen.add(key)
+                waiting.append(following)
+    return Result(len(seen), transitions, depth, complete=True)
+
+
+class _Point:
+    """A program in a state that was reached, and how."""
+
+    def __init__(self, program: Program, now_ns: int, number: int, before: _Point | None, given: Given | None) -> None:
+        self.program, self.now_ns, self.number = program, now_ns, number
+        self.before, self.given = before, given
+
+    def after(self, given: Given) -> _Point:
+        now_ns = self.now_ns + round(given.ms * NS_PER_MS)
+        return _Point(copy.deepcopy(self.program), now_ns, self.number + 1, self, given)
+
+    def way(self) -> Iterator[Given]:
+        if self.before is not None and self.given is not None:
+            yield from self.before.way()
+            yield self.given
+
+
+def _broken(proof: Proof, point: _Point, given: Given) -> str:
+    program = point.program
+    _hand_in(program, given, point.now_ns)
+    try:
+        program.execute(ScanInfo(point.now_ns, point.number, point.number == 1))
+    except ProgramFailed as e:
+        return f"a scan failed: {e}"
+    except Exception as e:  # the logic is the user's: whatever it raises is what was looked for
+        return f"a scan raised {type(e).__name__}: {e}"
+    for name, holds in proof.invariants.items():
+        if not holds(program):
+            return name
+    return ""
+
+
+def _hand_in(program: Program, given: Given, now_ns: int) -> None:
+    qualities = {}
+    for name, value in given.inputs:
+        variable = program.variables[name]
+        if variable.kind is TagKind.MESSAGE:
+            program.__dict__[name] = () if value is None else (Message(1, now_ns, value),)
+            continue
+        program.__dict__[name] = value
+        quality, reason = (Quality.BAD, Reason.TIMEOUT) if value is None else (Quality.GOOD, Reason.NONE)
+        qualities[name] = TagValue(value, quality, reason, now_ns)
+    program._lookup = qualities.__getitem__
+    for name in program.variables:
+        box = program.__dict__[name]
+        if isinstance(box, Outbox):
+            box.outstanding = 0 if given.taken else box.outstanding + len(box.pending)
+            box.pending = []

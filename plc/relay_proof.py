@@ -1,0 +1,71 @@
+"""What is proved of the observatory's relay: SPEC part 1, row ControlLogic, with rulings 1, 2, 5 and 6.
+
+Over every command that matters (its sign is what decides, so -1, 0, 1 and the limits of the type; and what is no command),
+responses that come or not, and mailboxes that are emptied or not. The queue is bounded at three, so that all its fillings
+are seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+
+from gateway.core.statemachine import STATE_CODES, delta, encode_period
+from plc.program import ScanInfo
+from plc.prove import Proof
+from plc.relay import Relay
+
+_DEPTH = 2
+_SHORT, _TOO_LONG = b"a", b"b" * 300
+
+
+class Watched(Relay):
+    """The relay, with what the invariants need to know of its past."""
+
+    queue_capacity = 3
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.response.depth = self.log.depth = _DEPTH
+        self.sent = 0
+        self.logged_before = 0
+
+    def execute(self, scan: ScanInfo) -> None:
+        self.logged_before = self.logged
+        super().execute(scan)
+        self.sent += len(self.response.pending)
+
+    @property
+    def unaccounted(self) -> int:
+        """Responses that were taken and neither left, nor wait, nor were counted as dropped."""
+        return self.responses - self.sent - self.waiting - self._outgoing.dropped - self._too_long
+
+    @property
+    def key(self) -> Hashable:
+        """Counters grow for ever and decide nothing; the sign, the queues' fillings and the mailboxes' do."""
+        sign = (self.period_s > 0) - (self.period_s < 0)
+        waiting = tuple(response.data for response in self._outgoing.queue)
+        unsent = min(self.logic.data_log.total - self._log_sent, 2 * _DEPTH)
+        boxes = tuple((box.outstanding, len(box.pending)) for box in (self.response, self.log))
+        return sign, self.state, waiting, unsent, boxes
+
+
+PROOF = Proof(
+    make=Watched,
+    domain={
+        "command": [None, *(encode_period(p).data for p in (-32768, -1, 0, 1, 32767)), b"", b"\1\2\3"],
+        "sample": [None, _SHORT, _TOO_LONG],
+    },
+    clogs=True,
+    key=lambda relay: relay.key,
+    invariants={
+        "the state follows from the sign of the period": lambda r: r.state == STATE_CODES[delta(r.period_s).name],
+        "what is commanded to the sensor is the period": lambda r: r.period == r.period_s == r.logic.period_s,
+        "nothing is logged while the period is 0 or below": lambda r: r.period_s > 0 or r.logged == r.logged_before,
+        "every response leaves, waits or is counted as dropped": lambda r: r.unaccounted == 0,
+        "responses leave unaltered": lambda r: all(data == _SHORT for _, data in r.response.pending),
+        "no mailbox is overrun": lambda r: all(
+            box.outstanding + len(box.pending) <= box.depth for box in (r.response, r.log)
+        ),
+        "the queue is bounded": lambda r: r.waiting <= r.queue_capacity,
+    },
+)

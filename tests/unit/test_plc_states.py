@@ -1,0 +1,189 @@
+"""State tables: what they do scan by scan, how they are drawn, and what can be proved of them."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import replace
+
+import pytest
+
+from gateway.core.errors import Bug
+from gateway.core.image import TagKind
+from gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, STATES, delta
+from plc.diagram import svg
+from plc.program import ScanInfo, var_input, var_local, var_output
+from plc.prove import Proof, machine_key, prove
+from plc.relay import Relay
+from plc.relay_proof import PROOF, Watched
+from plc.states import ANY, StateMachine, StateTable, Transition
+
+MS = 1_000_000
+
+
+class Pump(StateMachine):
+    start: bool = var_input(TagKind.BOOL)
+    level: float = var_input(TagKind.REAL)
+    stop: bool = var_input(TagKind.BOOL)
+    valve: bool = var_output(TagKind.BOOL, initial=False)
+    scans_filling: int = var_local(TagKind.INT, initial=0)
+
+    table = StateTable(
+        Transition(ANY, "IDLE", when="stop", do="close"),
+        Transition("IDLE", "FILLING", when="start and level is not None and level < 20", do="open"),
+        Transition("FILLING", "IDLE", when="level is not None and level >= 80", do="close"),
+        Transition("FILLING", "FAULT", after_ms=50, do="close"),
+        states=("IDLE", "FILLING", "FAULT"),
+    )
+
+    def open(self) -> None:
+        self.valve = True
+
+    def close(self) -> None:
+        self.valve = False
+
+    def during_FILLING(self, scan: ScanInfo) -> None:
+        self.scans_filling += 1
+
+
+def scan(pump: Pump, number: int, start: bool = False, level: float | None = 10.0, stop: bool = False) -> str:
+    pump.start, pump.level, pump.stop = start, level, stop  # type: ignore[assignment]
+    pump.execute(ScanInfo(number * 10 * MS, number, number == 1))
+    return pump.state_name
+
+
+def test_a_machine_takes_the_first_transition_that_holds_one_a_scan() -> None:
+    pump = Pump()
+    assert [scan(pump, 1), scan(pump, 2, start=True), scan(pump, 3)] == ["IDLE", "FILLING", "FILLING"]
+    assert pump.valve
+    assert scan(pump, 4, level=85.0) == "IDLE"
+    assert not pump.valve
+    assert scan(pump, 5, start=True, stop=True) == "FILLING"  # from IDLE `stop` leads nowhere
+    assert scan(pump, 6, start=True, stop=True) == "IDLE"
+    assert pump.scans_filling == 3
+
+
+def test_time_in_a_state_counts_from_the_scan_that_entered_it() -> None:
+    pump = Pump()
+    scan(pump, 1)
+    states = [scan(pump, n, start=True) for n in range(2, 10)]
+    assert states == ["FILLING"] * 5 + ["FAULT"] * 3
+    assert not pump.valve
+
+
+@pytest.mark.parametrize(
+    ("table", "told"),
+    [
+        (lambda: StateTable(), "without transitions"),
+        (lambda: StateTable(Transition("A", "B"), states=("A",)), "not declared: B"),
+        (lambda: StateTable(Transition("A", "B"), Transition("C", "A")), "cannot be reached"),
+    ],
+)
+def test_tables_that_make_no_sense_are_refused(table: object, told: str) -> None:
+    with pytest.raises(Bug, match=told):
+        table()  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("transition", "told"),
+    [
+        (Transition("A", "B", when="nothing > 1"), "names no variable"),
+        (Transition("A", "B", when="x >"), "no expression"),
+        (Transition("A", "B", when="open('f')"), "names no variable"),
+        (Transition("A", "B", do="missing"), "no method missing"),
+    ],
+)
+def test_guards_and_actions_are_checked_when_the_program_is_declared(transition: Transition, told: str) -> None:
+    with pytest.raises(Bug, match=told):
+        type("Broken", (StateMachine,), {"table": StateTable(transition), "x": var_local(TagKind.INT, initial=0)})
+
+
+def test_a_diagram_shows_every_state_and_every_way_out_of_it() -> None:
+    drawn = svg(Pump.table, "pump", current="FILLING")
+    root = ET.fromstring(drawn)
+    texts = [e.text for e in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"IDLE", "FILLING", "FAULT"} <= set(texts)
+    assert "after 50 ms / close" in texts
+    arrows = [e for e in root.iter("{http://www.w3.org/2000/svg}path") if e.get("class") == "arrow"]
+    assert len(arrows) == 1 + 4  # the initial one, IDLE-FILLING and back, FILLING-FAULT, FAULT-IDLE
+    assert "http" not in drawn.replace("http://www.w3.org/2000/svg", "")  # nothing is fetched
+
+
+def test_the_relays_diagram_says_what_its_machine_does() -> None:
+    for period_s in (PERIOD_MIN, -1, 0, 1, PERIOD_MAX):
+        for state in STATES:
+            held = [
+                t.target
+                for t in Relay.table.leaving(state)
+                if eval(t.when.replace("= 0", "== 0"), {"command": period_s})
+            ]
+            assert (held or [state]) == [delta(period_s).name]
+
+
+# -- proofs ----------------------------------------------------------------------------------------------------------------
+
+PUMP_PROOF = Proof(
+    make=Pump,
+    domain={"start": [False, True], "level": [10.0, 85.0, None], "stop": [False, True]},
+    steps_ms=(10.0, 60.0),
+    key=lambda p: (machine_key(p)[0], p.state, p.valve),
+    invariants={"the valve is open only while filling": lambda p: p.valve == (p.state_name == "FILLING")},
+)
+
+
+def test_what_holds_is_proved_over_states_inputs_quality_and_timer_phase() -> None:
+    result = prove(PUMP_PROOF)
+    assert result.proved
+    assert result.states >= 8
+    assert result.transitions == result.states * 24  # every state with everything that can come in, and the initial one
+
+
+def test_what_does_not_hold_comes_with_a_shortest_way_to_it() -> None:
+    wrong = replace(PUMP_PROOF, invariants={"never a fault": lambda p: p.state_name != "FAULT"})
+    result = prove(wrong)
+    assert (result.proved, result.broken) == (False, "never a fault")
+    assert [g.ms for g in result.way] == [10.0, 60.0]
+    assert result.way[0].describe()["inputs"] == {"start": True, "level": 10.0, "stop": False}
+
+
+def test_logic_that_raises_is_a_counterexample_too() -> None:
+    class Naive(Pump):
+        table = StateTable(Transition("IDLE", "FILLING", when="level < 20"))
+
+    result = prove(replace(PUMP_PROOF, make=Naive, invariants={}))
+    assert result.broken.startswith("a scan raised TypeError")
+    assert len(result.way) == 1
+
+
+def test_bounds_make_no_proof() -> None:
+    assert not prove(PUMP_PROOF, max_states=3).proved
+    assert not prove(PUMP_PROOF, max_depth=1).proved
+
+
+def test_the_relay_is_proved() -> None:
+    assert prove(PROOF).proved
+
+
+class LogsTooMuch(Watched):
+    def execute(self, scan: ScanInfo) -> None:
+        super().execute(scan)
+        self.logged += 1
+
+
+class Forgets(Watched):
+    def execute(self, scan: ScanInfo) -> None:
+        super().execute(scan)
+        if len(self._outgoing.queue) == 2:
+            self._outgoing.consume()
+
+
+@pytest.mark.parametrize(
+    ("broken", "invariant"),
+    [
+        (LogsTooMuch, "nothing is logged while the period is 0 or below"),
+        (Forgets, "every response leaves, waits or is"),
+    ],
+)
+def test_a_relay_that_is_wrong_is_found_out(broken: type[Watched], invariant: str) -> None:
+    result = prove(replace(PROOF, make=broken))
+    assert result.broken.startswith(invariant)
+    assert result.way

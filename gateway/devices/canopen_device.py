@@ -79,7 +79,12 @@ class CanopenDriver(DeviceDriver):
         self._master = master
         self._mappings, self._listening = {}, {}
         consumer_ms = self.config.heartbeat.consumer_ms if self.config.heartbeat else 0
-        master.add_node(self.node, heartbeat_consumer_ms=consumer_ms)
+        master.add_node(
+            self.node,
+            heartbeat_consumer_ms=consumer_ms,
+            sdo_timeout_s=self.config.timeout_s,
+            sdo_retries=self.config.retries,
+        )
 
     # -- bringing the node up (CiA 302-2, boot slave) ---------------------------------------------------------------
 

@@ -23,7 +23,7 @@ class BusConfig:
     timeout_s: float = 1.0
     retries: int = 1
     bitrate: int = 125_000
-    canopen: CanopenBusConfig = CanopenBusConfig()
+    canopen: CanopenBusConfig = field(default_factory=CanopenBusConfig)
     spacing_s: float = 0.0
     turnaround_s: float = 0.1
     connect_pause_s: float = 0.0
@@ -71,7 +71,7 @@ class DeviceConfig:
     heartbeat: Heartbeat | None = None
     tpdo1: Tpdo | None = None
     start: bool = False
-    canopen: CanopenNodeConfig = CanopenNodeConfig()
+    canopen: CanopenNodeConfig = field(default_factory=CanopenNodeConfig)
     phase: dict[str, int] = field(default_factory=dict)
     timeout_s: float | None = None
     retries: int | None = None

@@ -44,7 +44,11 @@ class NodeStatus:
     emcy_log: EmcyLog = field(default_factory=EmcyLog)
     bring_ups: int = 0
     wanted: asyncio.Event = field(default_factory=asyncio.Event)
-    backoff: Backoff = field(default_factory=lambda: Backoff(0.25, 10.0))
+    backoff: Backoff = field(init=False)
+
+    def __post_init__(self) -> None:
+        config = self.driver.config
+        self.backoff = Backoff(config.backoff_first_s, config.backoff_limit_s)
 
     @property
     def emcys(self) -> int:

@@ -62,6 +62,8 @@ class Play:
         self.driver = self.make_driver() if row.get("driver") else None
         for node, consumer_ms in row.get("watch", []):
             self.master.add_node(node, heartbeat_consumer_ms=consumer_ms)
+        for node, timeout_s, retries in row.get("patience", []):
+            self.master.add_node(node, sdo_timeout_s=timeout_s, sdo_retries=retries)
 
     @property
     def ms(self) -> str:

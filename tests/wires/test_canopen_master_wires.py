@@ -39,7 +39,8 @@ def playable(row: dict[str, Any]) -> bool:
     """Whether a row needs nothing but a wire."""
     late = max([float(line.split()[0]) for line in row.get("bus", [])] + [row.get("until_ms", 0)], default=0)
     calls = all(call[1] in CALLS for call in row.get("do", []))
-    return calls and late <= 1000 and not row.get("driver") and row["case"] not in TO_THE_MILLISECOND
+    plain = not row.get("driver") and not row.get("patience")
+    return calls and late <= 1000 and plain and row["case"] not in TO_THE_MILLISECOND
 
 
 PLAYABLE = [row for row in ROWS if playable(row)]

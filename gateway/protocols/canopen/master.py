@@ -58,6 +58,7 @@ class CanopenMaster:
         self._sdo_retries = sdo_retries
         self._short_sdo = short_sdo
         self._timeouts_s: dict[int, float] = {}
+        self._retries: dict[int, int] = {}
         self._heartbeat = HeartbeatConsumer()
         self._channels: dict[int, SdoChannel] = {}
         self._pdos: dict[int, list[PdoCallback]] = {}
@@ -69,11 +70,23 @@ class CanopenMaster:
 
     # -- what drivers ask -----------------------------------------------------------------------------------------
 
-    def add_node(self, node: int, *, heartbeat_consumer_ms: int = 0, sdo_timeout_s: float | None = None) -> None:
-        """Make `node` known; with a consumer time it is watched from its first heartbeat on."""
+    def add_node(
+        self,
+        node: int,
+        *,
+        heartbeat_consumer_ms: int = 0,
+        sdo_timeout_s: float | None = None,
+        sdo_retries: int | None = None,
+    ) -> None:
+        """Make `node` known; with a consumer time it is watched from its first heartbeat on.
+
+        `sdo_timeout_s` and `sdo_retries` None: as the master.
+        """
         self._channel(cob_id.check_node(node))
         if sdo_timeout_s is not None:
             self._timeouts_s[node] = sdo_timeout_s
+        if sdo_retries is not None:
+            self._retries[node] = sdo_retries
         self._heartbeat.monitor(node, heartbeat_consumer_ms)
         self._arm()
 
@@ -104,7 +117,7 @@ class CanopenMaster:
         Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`.
         """
         timeout_ns = self._ns(node, timeout_s)
-        again = self._sdo_retries if retries is None else retries
+        again = self._retries.get(node, self._sdo_retries) if retries is None else retries
         if block:
             try:
                 return await self._transfer(

@@ -6,6 +6,7 @@ that bus behind it. Here the paper's emulators meet the system file; what gatewa
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Mapping, Sized
 from pathlib import Path
 from typing import Any
@@ -106,6 +107,7 @@ class FieldSide:
 
     async def run(self) -> None:
         """Serve until cancelled; raises what an emulator raises."""
+        self._nursery.start(asyncio.Event().wait(), "until cancelled")  # sockets have no task of ours: it is not over
         try:
             await self._nursery.wait()
         finally:

@@ -70,8 +70,8 @@ class ImageExchange:
         return (now_ns - self._plc_heard_ns) / NS_PER_MS if self.plc_counter else float("inf")
 
     def all_consumed(self, tag: str) -> bool:
-        """True when the PLC has consumed every message of `tag` that it was given."""
-        return self._consumed.get(tag, 0) >= self._writer.last_sequence(tag)
+        """True when the PLC has consumed every message of `tag` that it was given; never where no program takes them."""
+        return tag in self._depth and self._consumed.get(tag, 0) >= self._writer.last_sequence(tag)
 
     def _publish(self, now_ns: int) -> None:
         messages: dict[str, list[tuple[int, bytes]]] = {}

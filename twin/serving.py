@@ -35,13 +35,9 @@ class Serving:
     bridges: tuple[BridgeConfig, ...] = ()
 
     def for_run(self, *, allow_writes: bool, free_ports: bool) -> Serving:
-        """As a gateway runs it. With `free_ports` (a prototype) sockets take a free port of the same host, and the plant's
-        serial lines are not listened on."""
-        bridges = [
-            replace(b, policy=replace(b.policy, allow_writes=allow_writes))
-            for b in self.bridges
-            if not (free_ports and b.listen.is_serial)
-        ]
+        """As a gateway runs it. With `free_ports` (a prototype) sockets take a free port of the same host; a serial line is
+        somewhere else there too, but that is the connector's business."""
+        bridges = [replace(b, policy=replace(b.policy, allow_writes=allow_writes)) for b in self.bridges]
         if not free_ports:
             return Serving(self.serve, tuple(bridges))
         return Serving(
@@ -51,7 +47,7 @@ class Serving:
 
 
 def _free(endpoint: Endpoint) -> Endpoint:
-    return endpoint.with_address(endpoint.host, 0)
+    return endpoint if endpoint.is_serial else endpoint.with_address(endpoint.host, 0)
 
 
 def resolve_serving(

@@ -35,6 +35,8 @@ def print_mapping(session: RunSession) -> None:
     )
     for plant, target in session.mapping.items():
         talk.print(f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's own)", soft_wrap=True)
+    for bridge, cable in session.cables.items():
+        talk.print(f"  masters of bridge {bridge}  →  {cable.master}", soft_wrap=True)
     for device, endpoint in session.far.items():
         talk.print(f"  far end of {device}  →  {endpoint}", soft_wrap=True)
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from fieldtwin.running.bridge_cable import BridgeCable
 from fieldtwin.running.children import Child
 from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
 from fieldtwin.running.options import RunOptions
@@ -61,6 +62,7 @@ class RunSession:
         self.instance = Instance(options.instance or self.system.name)
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
+        self.cables: dict[str, BridgeCable] = {}
         self.counted_before: dict[str, dict[str, int]] = {}
         self.children: dict[str, Child] = {}
         self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
@@ -95,6 +97,7 @@ class RunSession:
         plc = ecs.prepare(run_dir)
         if self.options.prototype:
             await self._start_field(run_dir)
+            await self._lay_cables(run_dir)
         config = run_dir / "plc.json"
         config.write_bytes(plc.to_json())
         await self._start_child("plc", "plc", config)
@@ -153,6 +156,16 @@ class RunSession:
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far
         self.counted_before = self._field.counted_before
+
+    async def _lay_cables(self, run_dir: Path) -> None:
+        """A line for each bridge that masters ask over a line: what the plant has there is not touched."""
+        for bridge in self.system.serving.bridges:
+            if bridge.listen.is_serial:
+                cable = await BridgeCable.open(bridge.listen, run_dir, bridge.name)
+                self._stack.push_async_callback(cable.aclose)
+                self._nursery.start(cable.run(), f"cable of bridge {bridge.name}")
+                self.cables[bridge.name] = cable
+                self.mapping[cable.plant] = cable.gateway
 
     def _start_watching(self) -> None:
         self._nursery.start(self._watch(), "states")

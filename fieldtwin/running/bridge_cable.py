@@ -1,0 +1,63 @@
+"""The line on which a prototype's bridge is asked: two virtual serial ports with a cable between them.
+
+On a plant a master stands on the line that a bridge listens on. In a prototype the gateway opens one end here, and whoever
+plays that master opens the other. It belongs to neither, and must never know what is said on it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from emulators.endpoints.pty import PtyEnd
+from gateway.core.connection import ByteConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost
+from gateway.core.nursery import Nursery
+
+
+class BridgeCable:
+    """Stands in for the line `plant`, as slow as it. `gateway` is what the gateway opens, `master` the link for a master."""
+
+    def __init__(self, plant: Endpoint, inside: PtyEnd, outside: PtyEnd) -> None:
+        """Use `open`."""
+        self.plant = plant
+        self.gateway = plant.with_path(str(inside.link))
+        self.master = outside.link
+        self.lost_bytes = 0
+        """What an end did not take because it was closed."""
+        self._inside = inside
+        self._outside = outside
+
+    @classmethod
+    async def open(cls, plant: Endpoint, run_dir: Path, name: str) -> BridgeCable:
+        """Make both ends in `run_dir`. Raises `EndpointBusy` or `Unreachable`; then nothing stays open."""
+        inside = await PtyEnd.open(run_dir / f"bridge-{name}.gateway", plant)
+        try:
+            outside = await PtyEnd.open(run_dir / f"bridge-{name}", plant, plant.serial)
+        except BaseException:
+            await inside.aclose()
+            raise
+        return cls(plant, inside, outside)
+
+    async def run(self) -> None:
+        """Carry bytes both ways until cancelled, or closed."""
+        async with Nursery() as nursery:
+            nursery.start(self._carry(self._outside, self._inside), "towards the gateway")
+            nursery.start(self._carry(self._inside, self._outside), "towards the master")
+            await nursery.wait()
+
+    async def _carry(self, source: ByteConnection, target: ByteConnection) -> None:
+        while True:
+            try:
+                data = await source.read()
+            except ConnectionLost:
+                return
+            try:
+                await target.write(data)
+            except ConnectionLost:
+                self.lost_bytes += len(data)
+                return
+
+    async def aclose(self) -> None:
+        await self._inside.aclose()
+        await self._outside.aclose()

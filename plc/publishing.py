@@ -87,7 +87,7 @@ class OutputImage:
     """The writer of OUTPUTS for all programs. Raises `FileInvalid` when the image and the programs do not match."""
 
     def __init__(self, image: Image, programs: Sequence[BoundProgram], forces: Forces | None = None) -> None:
-        self.forces = forces or Forces()
+        self.forces = Forces() if forces is None else forces
         self.writer = image.writer(OUTPUTS)
         self.outputs: list[Output] = []
         self.outboxes: list[tuple[Output, Outbox]] = []

@@ -234,7 +234,8 @@ class Runner:
 
     def force(self, tag: str, value: Scalar, by: str = "") -> None:
         """Raises `UsageError` for an unknown tag or a value that it cannot hold."""
-        for region in self._image.layout.regions:
+        # A tag of both regions is an output that is read back: the command is what is forced.
+        for region in sorted(self._image.layout.regions, key=lambda r: r.name == INPUTS):
             for spec in region.tags:
                 if spec.name == tag:
                     self.forces.force(spec, value, region.name == INPUTS, self._now_ns(), by)

@@ -248,6 +248,83 @@ def test_logic_that_raises_stops_with_outputs_safe_and_can_be_asked_why(tmp_path
     run(main())
 
 
+STUCK = """
+from gateway.core.image import TagKind
+from plc.program import Program, var_local, var_retain
+
+
+class Endless(Program):
+    count = var_local(TagKind.INT, initial=0)
+    runs = var_retain(TagKind.INT, initial=0)
+
+    def execute(self, scan):
+        self.count += 1
+        self.runs += scan.first_scan
+        while self.runs == 1 and scan.number == 3:
+            try:
+                sum(range(100))
+            except Exception:
+                pass
+"""
+
+
+def test_a_scan_that_does_not_end_is_ended_with_outputs_safe_and_the_programs_begin_again(tmp_path: Path) -> None:
+    (tmp_path / "endless_program.py").write_text(STUCK)
+
+    async def main() -> None:
+        program = ProgramConfig("e", "python: endless_program:Endless")
+        more = {"stuck_ms": 50.0, "restart_after_ms": 300.0, "retain_path": str(tmp_path / "retain")}
+        async with plc_running(config_in(tmp_path, program, **more)) as (child, gateway, client):
+            await eventually(lambda: gateway.reader.snapshot().stopped)
+            status = await got(client, lambda s: s["stop_reason"] == "stuck")
+            assert "program e" in status["error"]
+            assert "endless_program.py" in status["error"]
+            assert "the scan did not end: 50 ms" in status["error"]
+            status = await got(client, lambda s: s["restarts"] == 1 and s["scans"] > 5)
+            assert (status["state"], status["retain"]["start"]) == ("running", "warm start")
+            assert status["variables"]["e.runs"] == 2
+            assert not gateway.reader.snapshot().stopped
+            await client.call("stop")
+            assert await asyncio.wait_for(child.wait(), 1.0) == 0
+
+    run(main())
+
+
+def test_forces_pause_steps_and_reasons_over_the_control_channel(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with plc_running(config_in(tmp_path, RELAY, cycle_ms=2)) as (_, gateway, client):
+            gateway.publish(modem_inbox=encode_period(4).data)
+            await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 4)
+            [why] = (await client.call("why", tag="ctd.sample_period_s"))["changes"][:1]
+            assert (why["program"], why["before"], why["after"]) == ("relay", 0, 4)
+            await client.call("force", tag="ctd.sample_period_s", value=9, by="test")
+            await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 9)
+            assert gateway.reader.snapshot().value("ctd.sample_period_s").quality is Quality.SIMULATED
+            assert (await client.call("get"))["forces"]["ctd.sample_period_s"]["by"] == "test"
+            for args in ({"tag": "no.such", "value": 1}, {"value": 1}, {"tag": "ctd.sample_period_s", "value": "x"}):
+                with pytest.raises(RemoteError):
+                    await client.call("force", **args)
+            with pytest.raises(RemoteError, match="not forced"):
+                await client.call("unforce", tag="relay.state")
+            await client.call("unforce", all=True)
+            with pytest.raises(RemoteError, match="paused"):
+                await client.call("step", count=1)
+            await client.call("pause")
+            scans = (await got(client, lambda s: s["state"] == "paused"))["scans"]
+            await client.call("step", count=3)
+            status = await got(client, lambda s: s["scans"] == scans + 3)
+            assert status["state"] == "paused"
+            counter = gateway.reader.snapshot().counter
+            await eventually(lambda: gateway.reader.snapshot().counter > counter + 3)  # outputs are still published
+            assert (await client.call("get"))["scans"] == scans + 3
+            await client.call("go")
+            await got(client, lambda s: s["scans"] > scans + 3)
+            assert (await client.call("restart", cold=True))["start"]
+            await got(client, lambda s: s["restarts"] == 1 and s["variables"]["relay.commands"] == 0)
+
+    run(main())
+
+
 def test_the_configuration_survives_json_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
     config = config_in(tmp_path, RELAY, cycle_ms=2.5)
     assert PlcConfig.from_json(config.to_json()) == config

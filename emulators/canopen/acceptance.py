@@ -8,6 +8,7 @@ error), and so does what is no plain identifier.
 from __future__ import annotations
 
 from emulators.canopen.service import Core
+from emulators.canopen.sync import DEFAULT_COB_ID
 from gateway.core.canframe import CanFrame
 
 NMT, LSS = 0x000, 0x7E5
@@ -34,6 +35,8 @@ class Acceptance:
     def _identifiers(self) -> frozenset[int]:
         data, node_id = self._core.data, self._core.node_id
         ids = {NMT, LSS, *(base + node_id for base in (SDO_RESPONSE, SDO_REQUEST, ERROR_CONTROL))}
+        if not data.has(0x1005):
+            ids.add(DEFAULT_COB_ID)
         for index, found in data.dictionary.objects.items():
             if index in _SINGLE:
                 ids.add(data.number(index) & 0x7FF)

@@ -34,11 +34,13 @@ class Row:
     options: dict[str, Any] = field(default_factory=dict)
     values: dict[str, str] = field(default_factory=dict)
     counters: dict[str, int] = field(default_factory=dict)
+    timed: bool = False
+    """Silence in it depends on how much time passes."""
 
     @property
-    def frames_only(self) -> bool:
-        """Whether the row needs nothing of the device but its end of a wire."""
-        return not any(what.startswith("!") for _, what in self.hear)
+    def answers_only(self) -> bool:
+        """Whether all that the node says is at once, so that the row can be played without a clock."""
+        return not self.timed and {at for at, _ in self.say} <= {at for at, _ in self.hear}
 
     def make(self) -> CanopenNode:
         """The node of the row, without power yet."""

@@ -4,6 +4,9 @@ Pure arithmetic on one frame: this module knows no bus, no time and no other fra
 
 A data frame with an 11-bit identifier and n bytes takes 47 + 8n bits unstuffed and at most 55 + 10n; with a 29-bit
 identifier 67 + 8n to 80 + 10n. Both include the interframe space of 3 bits.
+
+An error costs what was sent before it, 6 to 12 bits of error flags, 8 of delimiter and the interframe space: 17 to 23 bits; an
+error-passive sender waits 8 more before it tries again, 31 in all.
 """
 
 from __future__ import annotations
@@ -20,6 +23,9 @@ END_BITS = 10
 
 INTERFRAME_BITS = 3
 """Intermission: the bus is busy for these after the end of a frame, then anybody may start."""
+
+ERROR_FLAG_BITS, ERROR_DELIMITER_BITS = 6, 8
+"""An error frame: flags of six equal bits that overlap to at most twelve, then eight recessive bits."""
 
 _STUFF_AFTER = 5
 
@@ -88,3 +94,43 @@ def arbitration_key(frame: CanFrame) -> int:
         base, extension = frame.can_id >> 18, frame.can_id & 0x3FFFF
         return base << 21 | 0b11 << 19 | extension << 1 | frame.remote
     return frame.can_id << 21 | frame.remote << 20
+
+
+def wire_bits(frame: CanFrame) -> str:
+    """All bits of an acknowledged frame as they stand on the wire, start to end of frame; stuffed up to the CRC's end."""
+    return stuff(plain_bits(frame)) + "1" + "0" + "1" + "1" * 7
+
+
+def last_errant_bit(frame: CanFrame) -> int:
+    """The last bit whose error spoils the frame for all: the last but one of end of frame (ISO 11898-1, 10.4.2.6)."""
+    return bits_to_end(frame) - 2
+
+
+def crc_objection_bit(frame: CanFrame) -> int:
+    """Where a receiver that found the CRC wrong starts its error flag: after the acknowledge delimiter."""
+    return bits_to_end(frame) - 7
+
+
+def acknowledge_bit(frame: CanFrame) -> int:
+    """The acknowledge slot's place in the frame."""
+    return bits_to_end(frame) - 9
+
+
+def error_flag_bits(frame: CanFrame, seen: str) -> int:
+    """How long dominant error flags lie on the wire when the first begins after `seen`, the bits of `frame` up to there.
+
+    The others notice when the first flag's six dominant bits break the stuffing or the fixed form, and answer with six of
+    their own: 6 bits where all notice at once (the last bit of `seen` broke the stuffing by itself), 7 to 12 otherwise.
+    """
+    stuffed = bits_to_end(frame) - END_BITS
+    tail = seen[-_STUFF_AFTER - 1 :]
+    if len(seen) <= stuffed and len(tail) == _STUFF_AFTER + 1 and tail in ("0" * 6, "1" * 6):
+        return ERROR_FLAG_BITS
+    run = len(seen) - len(seen.rstrip("0"))
+    for more in range(ERROR_FLAG_BITS):
+        at = len(seen) + more
+        stuffing_broken = at < stuffed and run + more + 1 > _STUFF_AFTER
+        form_broken = at >= stuffed and at != stuffed + 1  # the acknowledge slot may be dominant
+        if stuffing_broken or form_broken:
+            return more + 1 + ERROR_FLAG_BITS
+    return 2 * ERROR_FLAG_BITS

@@ -76,8 +76,9 @@ def unpack_record(record: bytes) -> tuple[CanFrame, bool]:
     if len(record) != RECORD_SIZE:
         raise Desync("a record of the software CAN bus", expected=f"{RECORD_SIZE} bytes", got=f"{len(record)} bytes")
     flags, dlc, can_id, t_ns, data = _RECORD.unpack(record)
-    if dlc > 8 or flags & 0xF0:
-        raise Desync("a record of the software CAN bus", expected="dlc 0 to 8, known flags", got=record.hex())
+    if dlc > 15 or flags & 0xF0:
+        raise Desync("a record of the software CAN bus", expected="dlc 0 to 15, known flags", got=record.hex())
+    dlc = min(dlc, 8)  # a classic frame's length codes 9 to 15 mean 8 bytes (ISO 11898-1, 8.4.2.4)
     remote = bool(flags & FLAG_REMOTE)
     frame = CanFrame(
         can_id,

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.wires.can_bus import CanBus, Delivery
+from emulators.wires.can_bus import CanBus
+from emulators.wires.can_events import Delivery
 from gateway.core.canframe import CanFrame
 from gateway.core.errors import Bug, EndpointBusy, UsageError
 
@@ -81,15 +82,6 @@ def test_identical_frames_overlap_and_are_one_on_the_wire() -> None:
     (only,) = bus.advance(END)
     assert (only.senders, only.receivers) == ((a, b), (c,))
     assert bus.conflicts == 0
-
-
-def test_one_identifier_with_different_data_is_counted_and_both_go_out() -> None:
-    bus = CanBus(125_000)
-    a, b = bus.join(0), bus.join(0)
-    bus.submit(b, CanFrame(0x181, b"b"), 0)
-    bus.submit(a, CanFrame(0x181, b"a"), 0)
-    assert [d.frame.data for d in bus.advance(END)] == [b"b", b"a"]
-    assert bus.conflicts == 1
 
 
 def test_late_joiner_receives_only_what_starts_after_it_came() -> None:
@@ -165,10 +157,21 @@ def test_counts_and_load() -> None:
     assert stats["load"] == pytest.approx(stats["bits"] / 125_000)
     assert bus.load(2_000_000 * US) == 0
     assert stats["overruns"] == 1
+    assert stats["load_by_id"] == {"001": 20 * 50 / 125_000, "00000001": extended_bits / 125_000}
     assert stats["nodes"][0] == {
-        "node": a, "name": "plc", "sent": 20, "received": 1, "overruns": 0, "refused": 0, "queued": 0
+        "node": a, "name": "plc", "sent": 20, "received": 1, "overruns": 0, "refused": 0, "queued": 0,
+        "load": 20 * 50 / 125_000, "errors": 0, "state": "error-active", "tec": 0, "rec": 0,
     }  # fmt: skip
     assert (stats["nodes"][1]["received"], stats["nodes"][1]["overruns"]) == (20, 1)
+
+
+def test_instant_frames_know_no_collisions_and_count_them() -> None:
+    bus = CanBus(125_000, instant=True)
+    a, b = bus.join(0), bus.join(0)
+    bus.submit(b, CanFrame(0x181, b"b"), 0)
+    bus.submit(a, CanFrame(0x181, b"a"), 0)
+    assert [d.frame.data for d in bus.advance(END)] == [b"b", b"a"]
+    assert (bus.conflicts, bus.error_frames) == (1, 0)
 
 
 def test_instant_frames_take_no_time_and_are_still_arbitrated() -> None:

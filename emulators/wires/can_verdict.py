@@ -1,0 +1,98 @@
+"""What becomes of one attempt to send, bit by bit (ISO 11898-1, 10.11 and 12.1). Pure: frames in, verdict out.
+
+Collisions: nodes won the arbitration with one identifier and different content. All send until the first bit that differs; there
+the wire is dominant, and whoever sent the recessive bit has a bit error. An error-active node's flag destroys the frame for
+everybody. An error-passive one gives way, and the others go on to the next bit that differs among them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+
+from emulators.wires.can_faults import Disturbance
+from emulators.wires.can_timing import (
+    ERROR_DELIMITER_BITS,
+    ERROR_FLAG_BITS,
+    INTERFRAME_BITS,
+    acknowledge_bit,
+    crc_objection_bit,
+    error_flag_bits,
+    last_errant_bit,
+    wire_bits,
+)
+from gateway.core.canframe import CanFrame
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Of a collision: `senders` are left, all with one frame. With `error_bit` it is destroyed, that bit being in error.
+
+    `losers` gave way, the last of them at `lost_bit`.
+    """
+
+    senders: tuple[int, ...]
+    losers: tuple[int, ...]
+    error_bit: int | None
+    lost_bit: int
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """An error frame. `kind` as in `WireFault`; the first flag begins at bit `flag_at`, all of it takes `bits` of the bus.
+
+    `first` are receivers that objected before anybody else. Their counters rise by more.
+    """
+
+    kind: str
+    flag_at: int
+    bits: int
+    first: frozenset[int] = frozenset()
+
+
+def collide(frames: Mapping[int, CanFrame], destroys: Callable[[int], bool]) -> Outcome:
+    """`frames` by node, with one arbitration field; `destroys`: whether a node's error flag is dominant."""
+    bits = {number: wire_bits(frame) for number, frame in frames.items()}
+    left = dict(bits)
+    losers: list[int] = []
+    lost_bit = -1
+    for at in range(min(len(wire) for wire in bits.values())):
+        if len({wire[at] for wire in left.values()}) == 1:
+            continue
+        in_error = [number for number, wire in left.items() if wire[at] == "1"]
+        left = {number: wire for number, wire in left.items() if wire[at] == "0"}
+        if any(destroys(number) for number in in_error):
+            return Outcome(tuple(left), tuple(losers), at, lost_bit)
+        losers += in_error
+        lost_bit = at
+        if len(set(left.values())) == 1:
+            break
+    return Outcome(tuple(left), tuple(losers), None, lost_bit)
+
+
+def collided(frame: CanFrame, error_bit: int) -> Verdict:
+    """A sender of another frame read a dominant bit at `error_bit` of `frame`, where it sent a recessive one."""
+    return _flagged("bit", frame, wire_bits(frame)[: error_bit + 1])
+
+
+def unacknowledged(frame: CanFrame) -> Verdict:
+    """Nobody acknowledged: the sender's flag follows the acknowledge slot, and meets no other."""
+    at = acknowledge_bit(frame) + 1
+    return Verdict("ack", at, at + ERROR_FLAG_BITS + ERROR_DELIMITER_BITS + INTERFRAME_BITS)
+
+
+def disturbed(what: Disturbance, frame: CanFrame, victims: Collection[int], *, at_sender: bool) -> Verdict:
+    """The frame is destroyed by `what`: at the sender (and everybody), or by the flags of `victims` among the receivers."""
+    wire = wire_bits(frame)
+    first = frozenset() if at_sender else frozenset(victims)
+    if what.at_bit is None:
+        return _flagged("crc", frame, wire[: crc_objection_bit(frame)], first)
+    at = max(0, min(what.at_bit, last_errant_bit(frame)))
+    if not at_sender:
+        return _flagged("stuff", frame, wire[: at + 1], first)
+    return _flagged("bit", frame, wire[:at] + ("0" if wire[at] == "1" else "1"), first)
+
+
+def _flagged(kind: str, frame: CanFrame, seen: str, first: frozenset[int] = frozenset()) -> Verdict:
+    flags = error_flag_bits(frame, seen)
+    return Verdict(kind, len(seen), len(seen) + flags + ERROR_DELIMITER_BITS + INTERFRAME_BITS, first)

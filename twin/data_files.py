@@ -5,6 +5,7 @@ The user's search order for profiles and systems: what a flag says, FIELDTWIN_PR
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -48,7 +49,12 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
                     if candidate.is_file():
                         return candidate
     known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if ".prototype" not in p.name})
-    raise UsageError(f"no {kind[:-1]} {name!r}", expected="a file, or one of " + ", ".join(known))
+    near = difflib.get_close_matches(direct.name, known, n=1)
+    raise UsageError(
+        f"no {kind[:-1]} {name!r}",
+        expected="a file, or one of " + ", ".join(known),
+        hint=f"did you mean {near[0]!r}?" if near else "",
+    )
 
 
 def find_recording(name: str, beside: Path | None = None) -> Path:

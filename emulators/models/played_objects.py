@@ -19,7 +19,7 @@ class PlayedObjects:
     """A node's value source: called with the time, returns raw values by (index, subindex).
 
     Signals are in engineering units under the tags' names; scale and offset of the profile and the data type of the EDS make
-    object values of them. Raises `FileInvalid` for a tag whose object the EDS does not have.
+    object values of them. Raises `FileInvalid` for a tag whose object the EDS does not have, and where no signal has a tag.
     """
 
     def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: SignalPlayer) -> None:
@@ -33,6 +33,13 @@ class PlayedObjects:
                 index, subindex = tag.object
                 raise FileInvalid(f"the EDS has no object {index:04X}h:{subindex:02X} for tag {tag.name!r}")
             self._objects.append((tag, tag.object, entry.data_type))
+        if not self._objects:
+            raise FileInvalid(
+                "the recording plays nothing of this device",
+                path=player.track.path,
+                expected="signals under names of its tags",
+                got=", ".join(player.track.names),
+            )
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
         values = self._player.values(now_ns)

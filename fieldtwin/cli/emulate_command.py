@@ -27,6 +27,12 @@ from twin.data_files import data_root, find
     default=None,
     help="For a CANopen device or data sheet: its node id; 255: none yet, LSS gives it one.",
 )
+@click.option(
+    "--bitrate",
+    type=click.IntRange(10_000, 1_000_000),
+    default=None,
+    help="For a CANopen device: bit/s of the software bus; default 125000 where none is there yet.",
+)
 @click.option("--recording", "recordings", multiple=True, metavar="[DEVICE=]FILE", help="Play this recording.")
 @click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
 @click.option(
@@ -50,6 +56,7 @@ def command(
     endpoints: tuple[str, ...],
     unit: int | None,
     node: int | None,
+    bitrate: int | None,
     recordings: tuple[str, ...],
     speed: float,
     prototype_file: str | None,
@@ -65,13 +72,14 @@ def command(
     fieldtwin emulate observatory                                    the whole field side, for run --field localhost
     fieldtwin emulate ctd-reference --on pty:/tmp/ctd                one sensor on a virtual serial port
     fieldtwin emulate ctd-reference --on tcp://127.0.0.1:1502        the same on Modbus TCP
+    fieldtwin emulate drive-cia402 --on can:fieldtwin/127.0.0.1:29536     a drive on a software CAN bus, made or joined
     fieldtwin emulate drive.eds --node 5 --on can:fieldtwin/127.0.0.1:0   a CANopen node from its data sheet
     """
     kind, path = _kind(what, tuple(Path(p) for p in profiles))
     if kind == "system":
-        if endpoints or unit is not None or node is not None:
+        if endpoints or (unit, node, bitrate) != (None, None, None):
             raise UsageError(
-                "--on, --unit and --node are for a single device",
+                "--on, --unit, --node and --bitrate are for a single device",
                 hint="a system's prototype file says where it listens",
             )
         from fieldtwin.running.field_here import FieldOptions, run_field
@@ -95,7 +103,10 @@ def command(
     from fieldtwin.running.loops import run as run_loop
 
     if not endpoints:
-        raise UsageError("where shall it listen?", expected="--on pty:PATH or --on tcp://HOST:PORT")
+        raise UsageError(
+            "where shall it listen?",
+            expected="--on pty:PATH, --on tcp://HOST:PORT or, CANopen, --on can:fieldtwin/127.0.0.1:29536",
+        )
     if len(recordings) > 1:
         raise UsageError("one device plays one recording")
     if kind == "data sheet":
@@ -105,11 +116,12 @@ def command(
             )
         from fieldtwin.running.data_sheet_here import run_data_sheet
 
-        return run_loop(run_data_sheet(path, endpoints, node))
+        return run_loop(run_data_sheet(path, endpoints, node, bitrate))
     if unit is not None and node is not None:
         raise UsageError("a device has a unit id or a node id, not both")
     unit = node if unit is None else unit
-    return run_loop(run_device(kind, path, endpoints, unit, Path(recordings[0]) if recordings else None, speed or 1.0))
+    recording = Path(recordings[0]) if recordings else None
+    return run_loop(run_device(kind, path, endpoints, unit, recording, speed or 1.0, bitrate))
 
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
@@ -133,4 +145,5 @@ def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
             raise UsageError(
                 f"no device profile, system or recording {what!r}",
                 expected=f"{no_device.expected}; or {no_system.expected}",
+                hint=no_device.hint or no_system.hint,
             ) from None

@@ -5,15 +5,12 @@ The same device may listen on several wires at once; its registers are one and t
 
 from __future__ import annotations
 
-import asyncio
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
 from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
 from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import OnClient, SocketListener
 from emulators.endpoints.udp_end import UdpEnd
@@ -26,11 +23,14 @@ from emulators.modbus.unit import ModbusUnit
 from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.sampled_sensor import SampledSensor
+from emulators.recorded_device import load_replay
 from emulators.replay.own_functions import add_own_functions
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.unit import ReplayUnit
 from emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.cli.talk import talk
+from fieldtwin.running.can_here import only_bus, stand_on_bus
+from fieldtwin.running.until_stopped import until_stopped
 from gateway.core.connection import ByteConnection, CanConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
@@ -49,15 +49,18 @@ LINE_PARAMS = ("mode", "echo")
 
 
 async def run_device(
-    kind: str, path: Path, endpoints: tuple[str, ...], unit_id: int | None, recording: Path | None, speed: float
+    kind: str,
+    path: Path,
+    endpoints: tuple[str, ...],
+    unit_id: int | None,
+    recording: Path | None,
+    speed: float,
+    bitrate: int | None = None,
 ) -> int:
-    """Serve until SIGINT or SIGTERM."""
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    """Serve until SIGINT or SIGTERM; raises what ends the serving before. `bitrate` is for a CAN bus, None for the usual one."""
     host = DeviceHost(speed)
-    async with Nursery() as nursery:
-        try:
+    try:
+        async with Nursery() as nursery:  # inside: who serves is stopped before what it serves on is closed
             wires = [Endpoint.parse(url) for url in endpoints]
             if kind == "recording":
                 units = host.replayed(path, unit_id)
@@ -65,17 +68,16 @@ async def run_device(
                 profile = load_profile(path)
                 wires = [_as_from_the_factory(wire, profile) for wire in wires]
                 if profile.protocol == "canopen":
-                    await host.serve_can(nursery, profile, wires, unit_id, recording)
+                    await host.serve_can(nursery, profile, wires, unit_id, recording, bitrate)
                     units = {}
                 else:
                     units = {unit_id or profile.form.factory.unit: host.modbus(profile, recording)}
             if units:
                 for wire in wires:
                     await host.serve(nursery, units, wire)
-            stopping = nursery.start(stop.wait(), "until stopped")
-            await asyncio.wait([stopping])
-        finally:
-            await host.aclose()
+            await until_stopped(nursery)
+    finally:
+        await host.aclose()
     return 0
 
 
@@ -100,8 +102,8 @@ class DeviceHost:
 
     def _recorded(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
         """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name."""
-        replay = ExchangeReplay.load(find_recording(str(recording or f"{Path(profile.path).stem}.jsonl")))
-        unit = ReplayUnit(replay, next(iter(replay.units)), profile.name)
+        replay, recorded = load_replay(profile, find_recording(str(recording or f"{Path(profile.path).stem}.jsonl")))
+        unit = ReplayUnit(replay, recorded, profile.name)
         add_own_functions(unit, profile)
         return unit
 
@@ -185,22 +187,18 @@ class DeviceHost:
         wires: list[Endpoint],
         node_id: int | None,
         recording: Path | None,
+        bitrate: int | None,
     ) -> None:
-        """A CANopen node on one bus: a software bus that is made here (``can:fieldtwin/HOST:PORT``), or a kernel interface."""
-        if len(wires) != 1 or not wires[0].is_can:
-            raise UsageError(
-                "a CANopen node stands on one bus", expected="--on can:fieldtwin/127.0.0.1:0 or can:socketcan/vcan0"
-            )
+        """A CANopen node on one bus: see `can_here.stand_on_bus`."""
+        wire = only_bus(wires)
         player = self._player(profile, recording) if recording or self._recording_of(profile) else None
         node = emulated_node(profile, node_id or profile.form.factory.node, player, self._clock.monotonic_ns()).node
-        if wires[0].interface == "fieldtwin":
-            bus = await SoftBusServer.open(wires[0], 125_000)
-            self._closing.append(bus)
-            connection, where = bus.attach(profile.name), bus.bound
-        else:
-            connection, where = await open_can_end(wires[0], 125_000), wires[0]
-        self._closing.append(connection)
-        nursery.start(serve_node(connection, node, self._clock), f"node on {where}")
+        opened: list[SoftBusServer | CanConnection] = []
+        try:
+            connection, where = await stand_on_bus(wire, bitrate, profile.name, opened)
+        finally:
+            self._closing += opened
+        nursery.start(serve_node(connection, node, self._clock), f"node on {wire}")
         talk.print(f"node {node.node_id} on {where}", soft_wrap=True)
 
     async def aclose(self) -> None:

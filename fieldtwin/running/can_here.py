@@ -1,0 +1,50 @@
+"""The CAN bus that an emulated node of its own stands on: one that is there, or else a software bus made for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.can_end import open_can_end
+from gateway.core.connection import CanConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import EndpointBusy, Unreachable, UsageError
+
+DEFAULT_BIT_RATE = 125_000
+
+
+def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
+    """The one bus among the endpoints; raises `UsageError` for anything else."""
+    if len(wires) != 1 or not wires[0].is_can:
+        raise UsageError(
+            "a CANopen node stands on one bus",
+            expected="--on can:fieldtwin/127.0.0.1:29536 or can:socketcan/vcan0",
+            got=" ".join(map(str, wires)),
+        )
+    return wires[0]
+
+
+async def stand_on_bus(
+    wire: Endpoint, bitrate: int | None, name: str, closing: list[SoftBusServer | CanConnection]
+) -> tuple[CanConnection, str]:
+    """Make the software bus at `wire` here, at `bitrate` bit/s; join it where it is there already, as any kernel's bus.
+
+    What is opened goes to `closing`. Returns the connection and where it is, in words. Raises `Unreachable`, `EndpointBusy`,
+    or `UsageError` where a bus runs at another bit rate than the one asked for (None: any).
+    """
+    if wire.interface != "fieldtwin":
+        connection = await open_can_end(wire, bitrate or DEFAULT_BIT_RATE)
+        closing.append(connection)
+        return connection, str(wire)
+    try:
+        made = await SoftBusServer.open(wire, bitrate or DEFAULT_BIT_RATE)
+    except (EndpointBusy, Unreachable):  # somebody listens there, or the address is another computer's
+        connection = await open_can_end(wire, bitrate or 0)
+        closing.append(connection)
+        return connection, f"{wire}, with others"
+    closing.append(made)
+    connection = made.attach(name)
+    closing.append(connection)
+    host, port = made.bound.address
+    look = f"python -m can.viewer -i fieldtwin -c {host}:{port}"
+    return connection, f"{made.bound}, a bus made here at {made.bitrate} bit/s (look at it: {look})"

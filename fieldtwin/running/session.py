@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from fieldtwin.running.bridge_cable import BridgeCable
 from fieldtwin.running.children import Child
 from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
 from fieldtwin.running.options import RunOptions
@@ -34,6 +33,7 @@ from twin.physical import PhysicalTwin
 from twin.system import System, load_system
 
 if TYPE_CHECKING:
+    from fieldtwin.running.bridge_cable import BridgeCable
     from twin.field_process import FieldConfig
 
 WATCH_S = 0.02
@@ -161,6 +161,8 @@ class RunSession:
         """A line for each bridge that masters ask over a line: what the plant has there is not touched."""
         for bridge in self.system.serving.bridges:
             if bridge.listen.is_serial:
+                from fieldtwin.running.bridge_cable import BridgeCable  # of a prototype: a plant has no emulators
+
                 cable = await BridgeCable.open(bridge.listen, run_dir, bridge.name)
                 self._stack.push_async_callback(cable.aclose)
                 self._nursery.start(cable.run(), f"cable of bridge {bridge.name}")

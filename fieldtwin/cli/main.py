@@ -17,6 +17,10 @@ from fieldtwin.__about__ import __version__
 COMMANDS = {
     "run": ("fieldtwin.cli.run_command", "Run a system: the plant, or its prototype."),
     "emulate": ("fieldtwin.cli.emulate_command", "Emulate the field side of a system, or one device."),
+    "plc": (
+        "fieldtwin.cli.plc_command",
+        "Look into a running PLC: tags, forces, steps, reasons; draw and prove programs.",
+    ),
     "shore": ("fieldtwin.cli.shore_command", "The far end of a system's transmitter: send commands, show responses."),
     "link": ("fieldtwin.cli.link_command", "The emulated connection on its own: a serial port carried over TCP."),
     "bridge": ("fieldtwin.cli.bridge_command", "Modbus TCP clients to units on a serial line, or the other way round."),

@@ -1,0 +1,256 @@
+"""`fieldtwin plc`: look into the PLC of a running instance, force, step, and ask why; draw and prove its programs."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.cli.talk import talk
+from gateway.core.errors import UsageError
+
+instance_option = click.option(
+    "--instance", default="", metavar="NAME", help="Which one; default: the only one that runs."
+)
+yes_option = click.option("--yes", is_flag=True, help="Do not ask.")
+
+
+@click.group("plc")
+def command() -> None:
+    """The soft PLC: status, tags, forces, single steps, reasons, diagrams and proofs.
+
+    Forces, pauses and restarts change what a plant does. Each asks first, showing what is and what will be; without a
+    terminal it needs --yes. Forces stay until they are taken away, and every status lists them.
+    """
+
+
+def _emit(value: Any) -> int:
+    json.dump(value, sys.stdout, indent=2)
+    sys.stdout.write("\n")
+    return 0
+
+
+def _sure(question: str, yes: bool) -> None:
+    """Raises `UsageError` where nobody can be asked, `Abort` where the answer is no."""
+    if yes:
+        return
+    if not sys.stdin.isatty():
+        raise UsageError(f"{question}: nobody to ask", hint="--yes, if that is what is meant")
+    click.confirm(question, abort=True, err=True)
+
+
+def _status(instance: str) -> dict[str, Any]:
+    from fieldtwin.running.plc_client import talk_to
+
+    found = talk_to(instance, lambda client: client.call("get"))
+    assert isinstance(found, dict)
+    return found
+
+
+def _call(instance: str, verb: str, **args: Any) -> Any:
+    from fieldtwin.running.plc_client import talk_to
+
+    return talk_to(instance, lambda client: client.call(verb, **args))
+
+
+@command.command("status")
+@instance_option
+@json_option
+def status(instance: str, as_json: bool) -> int:
+    """State, cycle statistics of each task, forces, retained variables, counters."""
+    from fieldtwin.cli.plc_views import print_status
+
+    found = _status(instance)
+    if as_json:
+        return _emit(found)
+    print_status(found)
+    return 0
+
+
+@command.command("watch")
+@click.argument("tags", nargs=-1)
+@click.option("--once", is_flag=True, help="Print once and end.")
+@instance_option
+@json_option
+def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> int:
+    """Live values of TAGS (all, if none is named; a trailing * stands for any rest): quality, age, forces. Ctrl-C ends it."""
+    import asyncio
+
+    from fieldtwin.cli.plc_views import print_tags, tag_rows, watch_live
+    from fieldtwin.running.plc_client import choose
+
+    if once or as_json or not sys.stdout.isatty():
+        rows = tag_rows(_status(instance), tags)
+        if as_json:
+            return _emit({row.tag: row.describe() for row in rows})
+        print_tags(rows)
+        return 0
+    asyncio.run(watch_live(choose(instance), tags))
+    return 0
+
+
+@command.command("force")
+@click.argument("tag")
+@click.argument("value")
+@yes_option
+@instance_option
+def force(tag: str, value: str, yes: bool, instance: str) -> int:
+    """Put VALUE (true, false, a number) in the place of TAG until it is unforced: an input, an output or a local."""
+    import getpass
+
+    from fieldtwin.running.plc_client import parse_value
+
+    wanted = parse_value(value)
+    now = _status(instance)
+    is_now = now["outputs"].get(tag, now["inputs"].get(tag, {}).get("value") if tag in now["inputs"] else "(unknown)")
+    _sure(f"force {tag}: {is_now} now, {wanted} from then on", yes)
+    _call(instance, "force", tag=tag, value=wanted, by=getpass.getuser())
+    talk.print(f"{tag} is forced to {wanted}", markup=False)
+    return 0
+
+
+@command.command("unforce")
+@click.argument("tag", required=False)
+@click.option("--all", "every", is_flag=True, help="Take all forces away.")
+@instance_option
+def unforce(tag: str | None, every: bool, instance: str) -> int:
+    """Take the force of TAG away. The safe direction: it does not ask."""
+    if bool(tag) == every:
+        raise UsageError("what is to be unforced", expected="a TAG, or --all")
+    done = _call(instance, "unforce", all=True) if every else _call(instance, "unforce", tag=tag)
+    talk.print(f"{done['removed']} taken away", markup=False)
+    return 0
+
+
+@command.command("pause")
+@yes_option
+@instance_option
+def pause(yes: bool, instance: str) -> int:
+    """Execute nothing more; outputs stay as they are, and the plant keeps them."""
+    _sure("pause the PLC: its outputs stay as they are, whatever the plant does", yes)
+    _call(instance, "pause")
+    talk.print("paused; fieldtwin plc step, fieldtwin plc go")
+    return 0
+
+
+@command.command("go")
+@instance_option
+def go(instance: str) -> int:
+    """Go on after a pause."""
+    _call(instance, "go")
+    talk.print("running")
+    return 0
+
+
+@command.command("step")
+@click.argument("count", type=click.IntRange(1, 10_000), default=1)
+@instance_option
+def step(count: int, instance: str) -> int:
+    """While paused, execute COUNT scans (1)."""
+    _call(instance, "step", count=count)
+    talk.print(f"{count} scans")
+    return 0
+
+
+@command.command("restart")
+@click.option("--cold", is_flag=True, help="Without what is retained.")
+@yes_option
+@instance_option
+def restart(cold: bool, yes: bool, instance: str) -> int:
+    """Make the programs anew: first scan, initial values, and (unless --cold) what is retained."""
+    _sure(f"restart the PLC {'cold' if cold else 'warm'}: its outputs are made safe in between", yes)
+    talk.print(_call(instance, "restart", cold=cold)["start"], markup=False)
+    return 0
+
+
+@command.command("why")
+@click.argument("tag")
+@instance_option
+@json_option
+def why(tag: str, instance: str, as_json: bool) -> int:
+    """Which program last changed TAG (an output or local), when, and what its inputs were then."""
+    from fieldtwin.cli.plc_views import print_why
+
+    changes = _call(instance, "why", tag=tag)["changes"]
+    if as_json:
+        return _emit(changes)
+    print_why(tag, changes)
+    return 0
+
+
+@command.command("diagram")
+@click.argument("system")
+@click.option(
+    "--program", default="", metavar="NAME", help="Of which program; default: the only one with a state table."
+)
+@click.option(
+    "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Write it there; default: stdout."
+)
+@profiles_option
+def diagram(system: str, program: str, output: Path | None, profiles: tuple[str, ...]) -> int:
+    """Draw the state table of a program of SYSTEM as SVG."""
+    from fieldtwin.running.plc_client import chosen, table_of
+    from plc.diagram import svg
+    from twin.system import load_system
+
+    loaded = load_system(system, [Path(p) for p in profiles])
+    name, table = chosen(loaded, program, table_of, "a state table")
+    drawn = svg(table, f"{loaded.name}: {name}")
+    if output is None:
+        sys.stdout.write(drawn)
+    else:
+        output.write_text(drawn, encoding="utf-8")
+    return 0
+
+
+@command.command("prove")
+@click.argument("system")
+@click.option("--program", default="", metavar="NAME", help="Of which program; default: the only one with a proof.")
+@click.option("--max-states", type=click.IntRange(1), default=200_000, show_default=True)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Write a counterexample there, as a scenario.",
+)
+@profiles_option
+@json_option
+def prove(
+    system: str, program: str, max_states: int, output: Path | None, profiles: tuple[str, ...], as_json: bool
+) -> int:
+    """Look at every state that a program of SYSTEM can get into, against its invariants.
+
+    Breadth first over states, inputs, qualities and timer phases, as the PROOF beside the program says (its module's name with
+    _proof behind). Exit 1 with a shortest counterexample, or when the bounds were reached before everything was seen.
+    """
+    from fieldtwin.cli.plc_views import print_proof
+    from fieldtwin.running.plc_client import chosen, proof_of, scenario
+    from plc.prove import prove as look
+    from twin.system import load_system
+
+    loaded = load_system(system, [Path(p) for p in profiles])
+    name, proof = chosen(loaded, program, proof_of, "a proof")
+    result = look(proof, max_states)
+    text = scenario(loaded, name, result) if result.broken else ""
+    if output is not None and text:
+        output.write_text(text, encoding="utf-8")
+    if as_json:
+        _emit(
+            {
+                "program": name,
+                "proved": result.proved,
+                "states": result.states,
+                "transitions": result.transitions,
+                "depth": result.depth,
+                "invariants": list(proof.invariants),
+                "broken": result.broken,
+                "way": [given.describe() for given in result.way],
+            }
+        )
+    else:
+        print_proof(name, proof, result, text)
+    return 0 if result.proved else 1

@@ -1,0 +1,152 @@
+"""Reaching the PLC of a running instance, and what is proved and drawn of a system's programs. No output of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gateway.core.control import ControlClient
+from gateway.core.errors import Unreachable, UsageError
+from gateway.core.image import TagKind
+from gateway.core.statemachine import decode_period
+from gateway.core.values import COMMAND
+from plc.binding import load_program
+from plc.program import Program
+from plc.prove import Given, Proof, Result
+from plc.states import StateTable
+from twin.instance import runtime_root
+from twin.system import System
+
+T = TypeVar("T")
+
+
+def running_instances() -> list[str]:
+    """The instances on this host whose PLC can be asked."""
+    return sorted(p.parent.name for p in runtime_root().glob("*/plc.sock"))
+
+
+def choose(instance: str) -> Path:
+    """The PLC's socket of an instance; without a name, of the only one. Raises `UsageError`, `Unreachable`."""
+    found = running_instances()
+    if not instance:
+        if len(found) > 1:
+            raise UsageError("several instances are running", expected="--instance NAME", got=", ".join(found))
+        if not found:
+            raise Unreachable("no PLC is running on this host", hint="fieldtwin run SYSTEM --prototype")
+        instance = found[0]
+    path = runtime_root() / instance / "plc.sock"
+    if not path.exists():
+        raise Unreachable(f"the instance {instance!r} has no PLC", expected=", ".join(found) or "one that is running")
+    return path
+
+
+def talk_to(instance: str, ask: Callable[[ControlClient], Awaitable[T]]) -> T:
+    """Connect, ask, and close."""
+
+    async def main() -> T:
+        client = await ControlClient.connect_unix(choose(instance))
+        try:
+            return await ask(client)
+        finally:
+            await client.aclose()
+
+    return asyncio.run(main())
+
+
+def parse_value(text: str) -> bool | int | float:
+    """``true``, ``false``, a number in decimal or 0x. Raises `UsageError`."""
+    if text.lower() in ("true", "false"):
+        return text.lower() == "true"
+    try:
+        return int(text, 0)
+    except ValueError:
+        pass
+    try:
+        return float(text)
+    except ValueError as e:
+        raise UsageError("not a value", expected="true, false or a number", got=text) from e
+
+
+# -- programs of a system ---------------------------------------------------------------------------------------------
+
+
+def programs(system: System) -> dict[str, Program]:
+    """Each program of a system by name, made but not run. Raises `FileInvalid`."""
+    folder = str(system.path.parent)
+    return {name: load_program(form.source, (folder,)) for name, form in system.plc.programs.items()}
+
+
+def chosen(system: System, name: str, has: Callable[[Program], Any], what: str) -> tuple[str, Any]:
+    """The program that is meant, and what `has` finds in it. Raises `UsageError` when there is none, or which is not clear."""
+    found = {n: thing for n, p in programs(system).items() if (thing := has(p)) is not None}
+    if name and name not in system.plc.programs:
+        raise UsageError(f"no program {name!r}", expected=", ".join(system.plc.programs))
+    if name:
+        found = {n: thing for n, thing in found.items() if n == name}
+    if len(found) != 1:
+        raise UsageError(
+            f"{'several programs have' if found else 'no program has'} {what}",
+            expected="--program NAME" if found else "",
+            got=", ".join(found),
+        )
+    return next(iter(found.items()))
+
+
+def table_of(program: Program) -> StateTable | None:
+    table = getattr(type(program), "table", None)
+    return table if isinstance(table, StateTable) else None
+
+
+def proof_of(program: Program) -> Proof | None:
+    """The `PROOF` of a module beside the program's: ``mysite.pump`` has it in ``mysite.pump_proof``."""
+    module = type(program).__module__
+    name = f"{module}_proof"
+    try:
+        found = getattr(importlib.import_module(name), "PROOF", None)
+    except ModuleNotFoundError as e:
+        if e.name != name and e.name is not None and not name.startswith(e.name):
+            raise UsageError(f"{name} cannot be imported: {e}") from e
+        found = getattr(sys.modules.get(module), "PROOF", None)
+    return found if isinstance(found, Proof) else None
+
+
+def scenario(system: System, program: str, result: Result) -> str:
+    """The way to what is broken, as a scenario file (docs/files.md)."""
+    lines = [
+        f"scenario: {result.broken}",
+        "# the shortest way that was found, scan by scan",
+        f"system: {system.path.name}",
+        "steps:",
+    ]
+    for given in result.way:
+        lines += [f"  - wait: {given.ms:g}ms", *(f"  - {step}" for step in _steps(system, program, given))]
+    lines.append(f"  - expect: {{program: {program}, holds: {result.broken!r}}}")
+    return "\n".join(lines) + "\n"
+
+
+def _steps(system: System, program: str, given: Given) -> list[str]:
+    bindings = system.plc.programs[program].inputs
+    steps = []
+    for name, value in given.inputs:
+        tag = bindings[name].tag if name in bindings else f"{program}.{name}"
+        variable = programs(system)[program].variables[name]
+        if variable.kind is TagKind.MESSAGE:
+            if value is not None:
+                steps.append(_message(tag, value))
+        elif value is None:
+            steps.append(f"fault: {{name: bad, tag: {tag}}}")
+        else:
+            steps.append(f"set: {{tag: {tag}, value: {str(value).lower() if isinstance(value, bool) else value}}}")
+    if not given.taken:
+        steps.append("fault: {name: full, of: mailboxes}")
+    return steps
+
+
+def _message(tag: str, data: bytes) -> str:
+    if tag.endswith(".inbox") and len(data) == 2:
+        return f"send: {{from: shore, period_s: {decode_period(COMMAND(data))}}}"
+    return f'send: {{to: {tag}, payload: "{data.hex()}"}}'

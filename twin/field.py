@@ -26,11 +26,12 @@ from emulators.modbus.bank import RegisterBank
 from emulators.modbus.line import LineSlave
 from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
+from emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit, UnitLimits
 from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.sampled_sensor import SampledSensor
+from emulators.recorded_device import RecordedDevice, load_replay
 from emulators.signals import SignalPlayer, SignalTrack
 from gateway.core.clock import Clock
 from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
@@ -46,7 +47,9 @@ from twin.system import System
 class FieldDevice:
     """An emulated device as the field side knows it: its counters and what it held."""
 
-    def __init__(self, emulated: EmulatedDevice, unit: EmulatedUnit | None, node: CanopenNode | None) -> None:
+    def __init__(
+        self, emulated: EmulatedDevice, unit: EmulatedUnit | RecordedDevice | None, node: CanopenNode | None
+    ) -> None:
         self.emulated = emulated
         self.unit = unit
         self.node = node
@@ -131,8 +134,11 @@ class FieldSide:
             await self._open_can(bus, listen, on_it)
             return
         units = {d.address: self._modbus_unit(d) for d in on_it}
-        latency_s = max((self.prototype.devices[d.name].form.latency_ms for d in on_it), default=0.0) / 1000
+        stated_s = max((self.prototype.devices[d.name].form.latency_ms for d in on_it), default=0.0) / 1000
         plant = self.system.buses[bus.name].endpoint
+        latency_s: float | Latency = stated_s
+        if not stated_s and any(isinstance(unit, RecordedDevice) for unit in units.values()):
+            latency_s = as_recorded(plant.serial if listen.scheme == "pty" and bus.pace else None)
         if listen.scheme == "pty":
             pace = plant.serial if bus.pace else None
             end = await PtyEnd.open(self._run_dir / listen.path, plant, pace)
@@ -157,7 +163,7 @@ class FieldSide:
                 listen, lambda c: serve_mbap(c, MbapSlave(units), self._clock, latency_s)
             )
         for device in on_it:
-            await self._open_far(device, latency_s)
+            await self._open_far(device, stated_s)
 
     async def _listen(self, endpoint: Endpoint, on_client: OnClient, max_clients: int = 32) -> Endpoint:
         listener = await SocketListener.open(endpoint, on_client, max_clients)
@@ -194,7 +200,7 @@ class FieldSide:
 
     # -- devices --------------------------------------------------------------------------------------------------------
 
-    def _modbus_unit(self, config: DeviceConfig) -> EmulatedUnit:
+    def _modbus_unit(self, config: DeviceConfig) -> EmulatedUnit | RecordedDevice:
         emulated = self.prototype.devices[config.name]
         if emulated.form.model == "mailbox":
             link = emulated.form.far_link
@@ -210,6 +216,8 @@ class FieldSide:
             modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
             modem.journal = pair.near.journal
             return unit
+        if emulated.profile.sampled is None:
+            return self._recorded_unit(config, emulated)
         player = self._player(emulated)
         bank = SampledSensor(emulated.profile, player, emulated.form.identity)
         unit = self._emulated_unit(config, bank, player.track)
@@ -217,11 +225,23 @@ class FieldSide:
         device.journal = bank.journal
         return unit
 
+    def _recorded_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> RecordedDevice:
+        """A device that is known by its exchanges."""
+        assert emulated.recording is not None
+        replay, unit_id = load_replay(emulated.profile, emulated.recording, WhenUsedUp.parse(emulated.form.at_end))
+        kind = self._kind(config)
+        unit = RecordedDevice(emulated.profile, replay, unit_id, kind, emulated.form.identity, config.name)
+        device = self.devices[config.name] = FieldDevice(emulated, unit, None)
+        device.journal = unit.journal
+        return unit
+
+    def _kind(self, config: DeviceConfig) -> type[RS232Connection] | type[TCPConnection]:
+        return RS232Connection if self.system.buses[config.bus].endpoint.is_serial else TCPConnection
+
     def _emulated_unit(self, config: DeviceConfig, bank: RegisterBank, context: Sized) -> EmulatedUnit:
         """The device on a wire of the plant's kind, whatever carries that wire now."""
         profile = self.prototype.devices[config.name].profile
-        kind = RS232Connection if self.system.buses[config.bus].endpoint.is_serial else TCPConnection
-        return EmulatedUnit(bank, profile, kind, context, unit_limits(profile), config.name)
+        return EmulatedUnit(bank, profile, self._kind(config), context, unit_limits(profile), config.name)
 
     def _canopen_node(self, config: DeviceConfig) -> CanopenNode:
         emulated = self.prototype.devices[config.name]

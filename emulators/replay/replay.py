@@ -67,6 +67,7 @@ class _Unit:
         self.recorded_in: dict[bytes, list[int]] = {}  # cell or shape -> situations, in recorded order
         self.alike: dict[bytes, int] = {}  # the same -> the one to use in the present situation
         self.functions: set[int] = set()
+        self.put: dict[Cell, int] = {}  # what the unit itself changed
         self.request_lengths: dict[int, set[int]] = {}  # function that no standard knows -> recorded lengths
         self.writable: set[Cell] = set()
         self.refused_writes: dict[tuple[int, int, int], Recorded] = {}
@@ -164,10 +165,8 @@ class ExchangeReplay:
         return {function: max(lengths) for function, lengths in found.items() if len(lengths) == 1}
 
     def put(self, unit_id: int, table: Table, address: int, values: Sequence[int]) -> None:
-        """The unit itself changed these cells: they read so until they are written or put again."""
-        unit = self._units[unit_id]
-        unit.situations.write(table, address, values)
-        unit.alike.clear()
+        """The unit itself changed these cells: they read so until they are written or put again, counters too."""
+        self._units[unit_id].put.update({(table, address + i): value for i, value in enumerate(values)})
 
     def _counted(self, pdu: bytes, answer: Answer) -> Answer:
         if answer.reply is None:
@@ -323,7 +322,8 @@ class ExchangeReplay:
 
     def _knows(self, unit_id: int, unit: _Unit, cell: Cell) -> bool:
         return (
-            _cell(unit_id, cell) in unit.recorded_in
+            cell in unit.put
+            or _cell(unit_id, cell) in unit.recorded_in
             or self._spans.knows(unit_id, cell)
             or unit.situations.written(cell) is not None
         )
@@ -333,6 +333,8 @@ class ExchangeReplay:
 
     def _value(self, unit_id: int, unit: _Unit, cell: Cell) -> int:
         """One cell: from its counter, or as recorded after the same writes, or as it was written."""
+        if cell in unit.put:
+            return unit.put[cell]
         if self._spans.knows(unit_id, cell):
             return self._spans.read(unit_id, cell)
         key, written = _cell(unit_id, cell), unit.situations.written(cell)
@@ -358,6 +360,9 @@ class ExchangeReplay:
     def _write(unit: _Unit, request: CellRequest, values: tuple[int, ...]) -> None:
         unit.situations.write(request.table, request.address, values)
         unit.alike.clear()
+        if unit.put:
+            for address in request.addresses:
+                unit.put.pop((request.table, address), None)
 
 
 def _cell(unit_id: int, cell: Cell) -> bytes:

@@ -75,7 +75,8 @@ def _exchanges(run: RunSession) -> dict[str, Any]:
         row: dict[str, Any] = {
             "gateway": {
                 "requests": counters.get(f"{prefix}requests", 0),
-                "replies": counters.get(f"{prefix}replies", 0),
+                # An exception is a reply to whoever sends it. The SDO counters have no such split.
+                "replies": counters.get(f"{prefix}replies", 0) + counters.get("sdo_aborts" if can else "exceptions", 0),
             },
             "timeouts": counters.get(f"{prefix}timeouts", 0),
             "crc_errors": counters.get("crc_errors", 0),

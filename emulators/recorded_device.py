@@ -1,0 +1,99 @@
+"""A device known by a recording of exchanges, with what its profile says besides: counters, identity, its own functions.
+
+It goes through the device's own connection, as every emulator does, and notes what it held: whatever it answered to a read.
+It never knows its driver, nor what carries its wire.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from emulators.codec import encode
+from emulators.context import WhenUsedUp
+from emulators.emulator import emulator_kind
+from emulators.journal import HeldJournal
+from emulators.replay.counters import CounterSpan
+from emulators.replay.own_functions import add_own_functions
+from emulators.replay.replay import ExchangeReplay
+from emulators.replay.requests import parse_request
+from emulators.replay.unit import ReplayUnit
+from gateway.core.connection import Connection
+from gateway.core.device import wire
+from gateway.core.errors import FileInvalid, UnknownCommand
+from gateway.core.profile import DeviceProfile, Tag
+from gateway.core.recording import RecordingReader
+
+MOST_COUNTED = 4
+"""Registers that a counter may have."""
+
+
+def load_replay(profile: DeviceProfile, path: Path, at_end: WhenUsedUp = WhenUsedUp.HOLD) -> tuple[ExchangeReplay, int]:
+    """A recording of exchanges with a device of `profile`, and its unit there: the factory's where that was recorded, else the
+    lowest. Raises `FileInvalid`."""
+    with RecordingReader(path) as reader:
+        exchanges = list(reader.exchanges())
+    recorded = sorted({e.unit for e in exchanges})
+    if not recorded:
+        raise FileInvalid("the recording holds no exchange", path=str(path))
+    unit = profile.form.factory.unit if profile.form.factory.unit in recorded else recorded[0]
+    spans = [
+        CounterSpan(unit, t.at.table, t.at.address, t.at.count)
+        for t in profile.tags.values()
+        if t.counter and t.at is not None and t.at.count <= MOST_COUNTED
+    ]
+    return ExchangeReplay(exchanges, when_used_up=at_end, counters=spans), unit
+
+
+class RecordedDevice(ReplayUnit):
+    """One unit of an emulated line. `kind` is the wire of the device that it stands for. `identity` gives tags other values
+    than the recorded ones. A request that is no command of the profile's list is answered all the same, and counted in
+    `unlisted`."""
+
+    def __init__(
+        self,
+        profile: DeviceProfile,
+        replay: ExchangeReplay,
+        unit_id: int,
+        kind: type[Connection[bytes]],
+        identity: Mapping[str, str],
+        name: str = "",
+    ) -> None:
+        super().__init__(replay, unit_id, name or profile.name)
+        end, self._line = wire(kind)
+        self.emulator = emulator_kind(end.type, profile)(end, profile, replay.context, super().respond)
+        self.journal = HeldJournal()
+        self.unlisted = 0
+        self._readable = [t for t in profile.tags.values() if t.readable and t.at is not None]
+        for tag, text in ((profile.tags[n], text) for n, text in identity.items()):
+            at, value = tag.registers, text if tag.is_text else float(text)
+            replay.put(unit_id, at.table, at.address, encode(value, tag.type, tag.order, registers=at.count))
+        add_own_functions(self, profile)
+
+    def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
+        self._line.write(pdu)
+        try:
+            self.emulator.receive(now_ns)
+            reply = self._line.read() or None
+        except UnknownCommand:
+            self.unlisted += 1
+            reply = super().respond(pdu, now_ns)
+        if reply is not None and reply[0] == pdu[0]:
+            self._note(pdu, reply, now_ns)
+        return reply
+
+    def _note(self, pdu: bytes, reply: bytes, now_ns: int) -> None:
+        request = parse_request(pdu)
+        if request is None or request.values is not None:
+            return
+        for tag in self._readable:
+            at = tag.registers
+            if at.table == request.table and request.address <= at.address and at.end <= request.addresses.stop:
+                self.journal.note(tag.name, _raw(tag, at.address - request.address, reply[2:]), now_ns)
+
+
+def _raw(tag: Tag, offset: int, data: bytes) -> bytes:
+    """A tag's own bytes in the data of a reply; a bit is one byte."""
+    if tag.registers.table in ("coil", "discrete"):
+        return bytes([data[offset // 8] >> offset % 8 & 1])
+    return data[2 * offset : 2 * (offset + tag.registers.count)]

@@ -1,0 +1,97 @@
+"""`fieldtwin plc` against a running prototype, and on files alone."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from procs import fieldtwin, wait_for
+
+from fieldtwin.cli.main import cli
+from gateway.core.errors import FieldtwinError, Unreachable, UsageError
+
+
+def plc(*args: str) -> str:
+    """What a command prints on stdout. Its errors are raised."""
+    done = CliRunner().invoke(cli, ["plc", *args], catch_exceptions=True, standalone_mode=False)
+    if isinstance(done.exception, FieldtwinError):
+        raise done.exception
+    assert done.exception is None, done.exception
+    return done.stdout
+
+
+@pytest.mark.slow
+def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
+    with pytest.raises(Unreachable, match="no PLC is running"):
+        plc("status")
+    with fieldtwin(
+        tmp_path, "run", "observatory", "--prototype", "--commands", "3", "--instance", "p", "--json"
+    ) as run:
+        run.control("p", "plc")
+        wait_for(lambda: json.loads(plc("status", "--json"))["variables"]["relay.state"] == 1, 15, "ACTIVE")
+        text = plc("status")
+        assert "PLC: running" in text
+        assert "nothing is forced" in text
+        assert "relay.state" in plc("watch", "relay.*")
+        assert "by program relay" in plc("why", "ctd.sample_period_s")
+        with pytest.raises(UsageError, match="nobody to ask"):
+            plc("force", "ctd.sample_period_s", "9")
+        plc("force", "ctd.sample_period_s", "9", "--yes")
+        gateway = run.control("p", "gateway")
+        wait_for(
+            lambda: gateway("get")["tags"]["ctd.sample_period_s"]["value"] == 9, 5, "the sensor has the forced period"
+        )
+        assert "FORCED: 1" in plc("status")
+        assert json.loads(plc("watch", "ctd.sample_period_s", "--json"))["ctd.sample_period_s"]["forced"]
+        plc("unforce", "ctd.sample_period_s")
+        with pytest.raises(FieldtwinError, match="not forced"):
+            plc("unforce", "ctd.sample_period_s")
+        wait_for(lambda: gateway("get")["tags"]["ctd.sample_period_s"]["value"] == 3, 5, "the commanded period again")
+        plc("pause", "--yes")
+        wait_for(lambda: "paused" in plc("status"), 5, "paused")
+        scans = json.loads(plc("status", "--json"))["scans"]
+        plc("step", "5")
+        wait_for(lambda: json.loads(plc("status", "--json"))["scans"] == scans + 5, 5, "five scans")
+        plc("go")
+        with pytest.raises(UsageError, match="no tag 'nothing'"):
+            plc("watch", "nothing")
+        plc("restart", "--cold", "--yes")
+        wait_for(
+            lambda: json.loads(plc("status", "--json"))["variables"]["relay.state"] == 0, 5, "STANDBY after a restart"
+        )
+
+
+def test_the_observatorys_relay_is_drawn_and_proved(tmp_path: Path) -> None:
+    root = ET.fromstring(plc("diagram", "observatory"))
+    texts = {e.text for e in root.iter("{http://www.w3.org/2000/svg}text")}
+    assert {"STANDBY", "ACTIVE", "OFF", "command > 0"} <= texts
+    plc("diagram", "observatory", "-o", str(tmp_path / "relay.svg"))
+    assert (tmp_path / "relay.svg").read_text().startswith("<svg")
+    assert "relay: proved over" in plc("prove", "observatory")
+    assert json.loads(plc("prove", "observatory", "--json"))["proved"]
+    assert "no proof" in plc("prove", "observatory", "--max-states", "5")
+    with pytest.raises(UsageError, match="no program 'pump'"):
+        plc("prove", "observatory", "--program", "pump")
+
+
+def test_a_counterexample_is_a_scenario(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "profiles/systems/observatory.yaml").read_text(encoding="utf-8")
+    (tmp_path / "site.yaml").write_text(text.replace("plc.relay:Relay", "wrong_relay:Wrong"), encoding="utf-8")
+    (tmp_path / "wrong_relay.py").write_text(
+        "from plc.relay_proof import Watched\n\n\nclass Wrong(Watched):\n    def execute(self, scan):\n"
+        "        super().execute(scan)\n        if self.period_s < 0 and self.commands == 2:\n            self.state = 1\n"
+    )
+    (tmp_path / "wrong_relay_proof.py").write_text(
+        "from dataclasses import replace\n\nfrom plc.relay_proof import PROOF as RIGHT\nfrom wrong_relay import Wrong\n\n"
+        "PROOF = replace(RIGHT, make=Wrong, key=lambda r: (r.key, min(r.commands, 2)))\n"
+    )
+    out = tmp_path / "found.scenario.yaml"
+    shown = plc("prove", str(tmp_path / "site.yaml"), "-o", str(out))
+    assert "relay: broken after 2 scans: the state follows from the sign of the period" in shown
+    scenario = out.read_text()
+    assert scenario.count("send: {from: shore, period_s: -") >= 1
+    assert "system: site.yaml" in scenario

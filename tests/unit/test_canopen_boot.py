@@ -58,6 +58,24 @@ def node(*, heartbeat_s: float = 0.1, serial: int = 0x44) -> PeerNode:
 DCF = Configuration((Setting(0x2000, 0, b"\x09"), Setting(0x2001, 3, b"\x34\x12")), date=(15000, 1234))
 
 
+class Dated:
+    """The clock of the loop, on a date. 0 is 1970."""
+
+    def __init__(self, today_ns: int) -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        self._loop, self._today_ns = loop, today_ns
+
+    def monotonic_ns(self) -> int:
+        return self._loop.monotonic_ns()
+
+    def utc_ns(self) -> int:
+        return self._today_ns + self._loop.monotonic_ns()
+
+    async def sleep_until_ns(self, deadline_ns: int) -> None:
+        await self._loop.sleep_until_ns(deadline_ns)
+
+
 class Rig:
     def __init__(self, bus: CanopenBus, peers: PeerBus, tags: TagTable, audit: Path) -> None:
         self.bus, self.peers, self.tags, self._audit = bus, peers, tags, audit
@@ -88,19 +106,19 @@ async def rig(
     *,
     allow_writes: bool = True,
     bus: CanopenBusConfig | None = None,
+    today_ns: int = 1_700_000_000_000_000_000,
 ) -> AsyncIterator[Rig]:
-    loop = asyncio.get_running_loop()
-    assert isinstance(loop, VirtualLoop)
+    clock = Dated(today_ns)
     config = DeviceConfig(
         "incl", PROFILE, "can0", NODE, heartbeat=Heartbeat(100, 350) if allow_writes else None, start=True,
         canopen=boot or CanopenNodeConfig(),
     )  # fmt: skip
-    tags = TagTable(loop)
+    tags = TagTable(clock)
     tags.declare(["incl.slope_long", "incl.slope_lateral", "incl.serial"], None)
-    audit = AuditLog(tmp_path / "audit", loop)
-    driver = CanopenDriver(config, tags, loop)
+    audit = AuditLog(tmp_path / "audit", clock)
+    driver = CanopenDriver(config, tags, clock)
     wire = BusConfig("can0", Endpoint.parse("can:fieldtwin/h:1"), 0.05, 1, canopen=bus or CanopenBusConfig())
-    canopen_bus = CanopenBus(wire, [driver], peers, loop, tags, audit, allow_writes)  # type: ignore[arg-type]
+    canopen_bus = CanopenBus(wire, [driver], peers, clock, tags, audit, allow_writes)  # type: ignore[arg-type]
     try:
         async with closing(peers), Nursery() as nursery:
             nursery.start(canopen_bus.run(), "bus")
@@ -256,7 +274,6 @@ def test_sync_and_time_are_produced_where_writing_is_allowed(tmp_path: Path) -> 
     async def main(allow_writes: bool, expected: tuple[int, int]) -> None:
         wanted = CanopenBusConfig(sync_ms=100, sync_counter=4, time_ms=500)
         async with rig(tmp_path, PeerBus([node()]), allow_writes=allow_writes, bus=wanted) as r:
-            VirtualLoop.utc_ns = lambda self: 1_700_000_000_000_000_000 + self.monotonic_ns()  # type: ignore[method-assign]
             await asyncio.sleep(1.05)
             syncs = [f.data for f in r.peers.sent if f.can_id == 0x80]
             assert syncs == [bytes([i % 4 + 1]) for i in range(expected[0])]
@@ -264,12 +281,20 @@ def test_sync_and_time_are_produced_where_writing_is_allowed(tmp_path: Path) -> 
             if not allow_writes:
                 assert r.peers.writes() == []
 
-    kept = VirtualLoop.utc_ns
-    try:
-        run_virtually(main(True, (10, 2)))
-        run_virtually(main(False, (0, 0)))
-    finally:
-        VirtualLoop.utc_ns = kept  # type: ignore[method-assign]
+    run_virtually(main(True, (10, 2)))
+    run_virtually(main(False, (0, 0)))
+
+
+def test_a_computer_that_does_not_know_the_date_tells_no_time(tmp_path: Path) -> None:
+    async def main() -> None:
+        wanted = CanopenBusConfig(time_ms=500)
+        async with rig(tmp_path, PeerBus([node()]), bus=wanted, today_ns=0) as r:
+            await asyncio.sleep(1.05)
+            assert not [f for f in r.peers.sent if f.can_id == 0x100]
+            assert r.bus.not_produced == 2
+            assert r.bus.connected
+
+    run_virtually(main())
 
 
 def test_a_node_id_is_given_over_lss_to_the_one_that_shall_have_it(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ class SyncProducer(_Periodic):
 
 
 class TimeProducer(_Periodic):
-    """TIME each `period_ms`, the time of day in UTC."""
+    """TIME each `period_ms`, the time of day in UTC. None while the host's clock is not set, which counts as missed."""
 
     name = "TIME"
 
@@ -89,7 +89,13 @@ class TimeProducer(_Periodic):
         self._can_id = can_id
 
     def due(self, now_ns: int, utc_ns: int) -> CanFrame | None:
-        return CanFrame(self._can_id, time_of_day(utc_ns)) if self._is_due(now_ns) else None
+        if not self._is_due(now_ns):
+            return None
+        try:
+            return CanFrame(self._can_id, time_of_day(utc_ns))
+        except UsageError:  # a computer that woke up in 1970: a bus must not end with that
+            self.sent, self.missed = self.sent - 1, self.missed + 1
+            return None
 
 
 def time_of_day(utc_ns: int) -> bytes:

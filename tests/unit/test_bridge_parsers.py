@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.core.errors import ModbusExceptionReply, UsageError
-from gateway.protocols.modbus.crc import with_crc
+from gateway.protocols.modbus.crc import crc16, with_crc
 from gateway.protocols.modbus.framings import make_framer
 from gateway.protocols.modbus.server import READ_FUNCTIONS, Access, examine
 from gateway.protocols.modbus.server_forward import Forwarded
@@ -137,8 +137,9 @@ def test_mb_050_a_frame_of_256_bytes_and_one_of_257() -> None:
 # -- passed on --------------------------------------------------------------------------------------------------------------
 
 
-def passed_on(pdu: str, reply: bytes, *, pieces: int = 1) -> bytes | None:
-    """The reply PDU that the master takes for the answer to a forwarded request on RTU, or None while it waits."""
+def passed_on(pdu: str, reply: bytes, *, pieces: int = 1, silence: bool = False) -> bytes | None:
+    """The reply PDU that the master takes for the answer to a forwarded request on RTU, or None while it waits; with
+    `silence`, what it takes once the line has been silent behind it."""
     data = bytes.fromhex(pdu)
     framer = make_framer("rtu", char_time_ns=86_000, echo=False, strict=False, accepts_zero_id=False)
     request = Forwarded(5, data, examine(data), on_line=True)
@@ -149,7 +150,8 @@ def passed_on(pdu: str, reply: bytes, *, pieces: int = 1) -> bytes | None:
         answer = transaction.feed(reply[at : at + size], 10**6)
         if answer is not None:
             return answer.raw
-    return None
+    answer = transaction.poll(transaction.wake_ns) if silence else None
+    return answer.raw if answer is not None else None
 
 
 @pytest.mark.parametrize("pieces", [1, 3, 100])
@@ -168,13 +170,31 @@ def passed_on(pdu: str, reply: bytes, *, pieces: int = 1) -> bytes | None:
         ("14 07 06 0004 0001 0002", "14 06 05 06 0DFE 0020"),
         ("15 09 06 0004 0007 0001 06AF", "15 09 06 0004 0007 0001 06AF"),
         ("2B 0E 01 00", "2B 0E 01 01 00 00 01 00 02 4142"),
-        ("64 01 02", "64 0A0B0C0D"),
         ("08 0000 A537", "08 0000 A537"),
     ],
 )
 def test_replies_of_every_function_end_where_they_end(pdu: str, reply: str, pieces: int) -> None:
     answer = bytes.fromhex(reply)
     assert passed_on(pdu, with_crc(b"\5" + answer), pieces=pieces) == answer
+
+
+@pytest.mark.parametrize("pieces", [1, 3, 8, 100])
+@pytest.mark.parametrize("reply", ["64 0A0B0C0D", "64", "64 5D 00 12 34"])
+def test_a_reply_that_tells_no_length_ends_with_a_silence(reply: str, pieces: int) -> None:
+    answer = bytes.fromhex(reply)
+    frame = with_crc(b"\5" + answer)
+    assert passed_on("64 01 02", frame, pieces=pieces) is None
+    assert passed_on("64 01 02", frame, pieces=pieces, silence=True) == answer
+
+
+def test_a_reply_that_looks_like_a_shorter_one_with_a_zero_behind_it_is_passed_on_whole() -> None:
+    found = next(
+        answer for n in range(0x10000) if (answer := b"\x64" + n.to_bytes(2)) and with_crc(b"\5" + answer)[-1] == 0
+    )
+    frame = with_crc(b"\5" + found)
+    assert crc16(frame[:-1]) == 0  # by its check sum it could have ended here
+    for pieces in (1, 2, len(frame)):
+        assert passed_on("64 01 02", frame, pieces=pieces, silence=True) == found
 
 
 def test_an_acknowledgement_of_something_else_is_no_answer() -> None:

@@ -63,6 +63,9 @@ class Request(ABC, Generic[R_co]):
         """Bytes of the reply PDU where the request alone tells, else `NEED_MORE`."""
         return NEED_MORE
 
+    def heard_out(self) -> None:
+        """A line has been silent since the last byte: a reply whose length nothing tells ends here (SL 2.5.1.1)."""
+
     def unanswered(self, t_ns: int) -> R_co:
         """What a broadcast of this request returns; raises `UsageError` where it asks for data (SL 2.1)."""
         raise UsageError(

@@ -91,6 +91,8 @@ class RtuFramer(Framer):
         return self._scan(settled=False)
 
     def settle(self) -> bytes | None:
+        if self._request is not None:
+            self._request.heard_out()
         return self._scan(settled=True)
 
     def drained(self, data: bytes) -> None:

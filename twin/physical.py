@@ -225,10 +225,10 @@ class EmbeddedControlSystem:
         """What the driver of each device can ask of it."""
         return {name: d.command_list for name, d in make_drivers(self.system, TagTable(clock), clock).items()}
 
-    def prepare(self, run_dir: Path) -> PlcConfig:
-        """Make the process image in `run_dir`; what the PLC's process is to be told."""
+    def prepare(self, run_dir: Path, *, cold: bool = False) -> PlcConfig:
+        """Make the process image in `run_dir`; what the PLC's process is to be told. `cold`: without what was retained."""
         make_image(self.layout, run_dir / "image")
-        return plc_config(self.system, run_dir)
+        return plc_config(self.system, run_dir, cold=cold)
 
 
 class PhysicalTwin:

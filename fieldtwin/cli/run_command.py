@@ -57,6 +57,7 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
 @click.option(
     "--capture", type=click.Path(dir_okay=False), help="Write what goes over the wires to this file (JSON lines)."
 )
+@click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
 @json_option
 def command(
@@ -75,6 +76,7 @@ def command(
     can: str,
     commands: str | None,
     capture: str | None,
+    cold: bool,
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
@@ -110,6 +112,7 @@ def command(
         can=can,
         commands=parse_periods(commands) if commands is not None else DEFAULT_SCRIPT,
         capture=Path(capture) if capture else None,
+        cold=cold,
     )
     return asyncio.run(_run(options, as_json))
 

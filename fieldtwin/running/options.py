@@ -25,3 +25,4 @@ class RunOptions:
     can: str = ""
     commands: tuple[int, ...] = ()
     capture: Path | None = None
+    cold: bool = False

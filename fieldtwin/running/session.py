@@ -94,7 +94,7 @@ class RunSession:
         self._stack.enter_context(self.instance)
         run_dir = self.instance.dir
         ecs = self.twin.ecs
-        plc = ecs.prepare(run_dir)
+        plc = ecs.prepare(run_dir, cold=self.options.cold)
         if self.options.prototype:
             await self._start_field(run_dir)
             await self._lay_cables(run_dir)

@@ -137,6 +137,10 @@ def _device(file: YamlFile, system: System, name: str, form: EmulatedForm) -> Em
         raise file.error(
             loc, f"the mailbox model for {name!r}", expected="a profile with a mailbox, and `far: ENDPOINT`"
         )
+    if form.model == "profile" and profile.protocol != "canopen":
+        raise file.error(
+            (*loc, "model"), f"no model of a device profile for {name!r}", expected="a CANopen node, or a recording"
+        )
     recording = None
     if form.recording is not None:
         try:

@@ -231,7 +231,7 @@ class EmulatedForm(Strict):
     """What stands in for a device: a recording (time-keyed signals), or a model."""
 
     recording: str | None = None
-    model: Literal["mailbox"] | None = None
+    model: Literal["mailbox", "profile"] | None = None
     profile: str | None = Field(default=None, description="the emulated device's own profile, where it differs")
     speed: float = Field(default=1.0, gt=0, le=10_000)
     at_end: Literal["hold", "loop", "error"] = "hold"

@@ -33,7 +33,7 @@ buses:
   can0: {listen: "can:fieldtwin/127.0.0.1:0", pace: true}
 devices:
   io:    {recording: io-cia401.jsonl, at_end: loop, identity: {serial: "17"}}
-  drive: {recording: drive-cia402.jsonl, at_end: loop}
+  drive: {model: profile}
   winch: {recording: encoder-cia406.jsonl, at_end: loop}
 """
 PROGRAM = """\

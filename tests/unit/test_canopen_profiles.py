@@ -35,6 +35,8 @@ from gateway.runtime.audit import AuditLog
 from gateway.runtime.canopen_bus import CanopenBus
 from gateway.runtime.tags import TagTable
 from gateway.wallclock import WallClock
+from twin.prototype_file import load_prototype
+from twin.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 DEVICES = ROOT / "profiles" / "devices"
@@ -295,3 +297,15 @@ def test_the_driver_sets_the_outputs_of_the_io_module(tmp_path: Path) -> None:
             assert int.from_bytes(rig.node.data.get(0x6411, 1), "little", signed=True) == 16384
 
     run(main())
+
+
+def test_in_a_prototype_only_a_canopen_node_is_emulated_by_its_profile_alone(tmp_path: Path) -> None:
+    system = load_system("observatory")
+    text = load_prototype(system).path.read_text(encoding="utf-8")
+    path = tmp_path / "mine.prototype.yaml"
+    path.write_text(text.replace("recording: incl.jsonl, at_end: loop", "model: profile"), encoding="utf-8")
+    assert load_prototype(system, path).devices["inclinometer"].recording is None
+    path.write_text(text.replace("recording: cast.jsonl, speed: 1, at_end: hold", "model: profile"), encoding="utf-8")
+    with pytest.raises(FileInvalid, match="for 'ctd'; expected a CANopen node") as error:
+        load_prototype(system, path)
+    assert error.value.line == next(n for n, line in enumerate(path.read_text().splitlines(), 1) if "ctd:" in line)

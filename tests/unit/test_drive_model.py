@@ -306,6 +306,19 @@ def test_a_second_set_point_waits_or_takes_over_as_bit_5_says() -> None:
     assert places[1 << 5] < 40_000
 
 
+def test_a_third_set_point_finds_no_place() -> None:
+    rig = Rig()
+    rig.write(0x6060, 1)
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        rig.command(word)
+    for place in (50_000, 60_000, 70_000):
+        rig.write(0x607A, place)
+        rig.command(ENABLE | 1 << 4)
+        rig.command(ENABLE)
+    rig.run(6_000)
+    assert rig.read(0x6064) == 60_000
+
+
 def test_halt_stops_and_goes_on() -> None:
     rig = Rig()
     rig.spin()

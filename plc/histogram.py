@@ -43,13 +43,21 @@ class Histogram:
                 return min(_upper_ns(bucket), self.max_ns)
         return 0
 
+    def share_above(self, ns: int) -> float:
+        """The share of all, 0 to 1, that took longer than `ns` (to the bucket)."""
+        if not self.count:
+            return 0.0
+        return sum(self._counts[_bucket(ns) + 1 :]) / self.count
+
     def summary_us(self) -> dict[str, Any]:
-        """JSON-able: count, and min, p50, p99, max in microseconds."""
+        """JSON-able: count, and min, p50, p99, p99.9, max in microseconds, and the share above 1 ms."""
         return {
             "count": self.count,
             "min": self.min_ns / 1e3,
             "p50": self.percentile_ns(50) / 1e3,
             "p99": self.percentile_ns(99) / 1e3,
+            "p999": self.percentile_ns(99.9) / 1e3,
+            "above_1ms": self.share_above(1_000_000),
             "max": self.max_ns / 1e3,
         }
 

@@ -1,11 +1,12 @@
-"""Three nodes of different device profiles on one paced bus, in a prototype run."""
+"""Nodes of the CiA device profiles as a user starts them: in a prototype run, and one by one on a bus that they share."""
 
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 
-from procs import run_to_end
+from procs import fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 SYSTEM = """\
 fieldtwin: 1
@@ -48,7 +49,7 @@ END_PROGRAM
 def test_three_nodes_on_one_bus(tmp_path: Path) -> None:
     for name, text in (("nodes.yaml", SYSTEM), ("nodes.prototype.yaml", PROTOTYPE), ("watch.st", PROGRAM)):
         (tmp_path / name).write_text(text, encoding="utf-8")
-    wanted = ("run", str(tmp_path / "nodes.yaml"), "--prototype", "--for", "3s", "--instance", "cn", "--json")
+    wanted = ("run", str(tmp_path / "nodes.yaml"), "--prototype", "--for", "2s", "--instance", "cn", "--json")
     ended = run_to_end(tmp_path, *wanted, name="nodes")
     assert ended.process.returncode == 0, ended.err
     summary = json.loads(ended.out)
@@ -57,11 +58,39 @@ def test_three_nodes_on_one_bus(tmp_path: Path) -> None:
     }  # fmt: skip
     on_can = summary["exchanges"]["can0"]
     assert {what: on_can["gateway"][what] for what in ("requests", "replies")} == on_can["emulators"]
-    assert on_can["gateway"]["pdos"] > 50
-    assert summary["published"]["checked"] > 100
+    assert on_can["gateway"]["pdos"] > 30
+    assert summary["published"]["checked"] > 60
     assert summary["published"]["wrong"] == 0
     tags = summary["tags"]
     assert tags["io.serial"]["value"] == 17
     assert tags["drive.statusword"]["value"] == 0x0250
     assert 8_000_000 < tags["winch.position"]["value"] < 9_000_000
     assert tags["winch.speed"]["value"] > 0
+
+
+def test_whoever_comes_first_makes_the_bus_and_whoever_is_left_without_one_says_so(tmp_path: Path) -> None:
+    where = f"can:fieldtwin/127.0.0.1:{free_port()}"
+    with fieldtwin(tmp_path, "emulate", "io-cia401", "--on", where, "--bitrate", "500000", name="io") as io:
+        wait_for(lambda: "a bus made here at 500000 bit/s" in io.err, 15, "the bus")
+        with fieldtwin(tmp_path, "emulate", "drive-cia402", "--on", where, name="drive") as drive:
+            wait_for(lambda: f"node 7 on {where}, with others" in drive.err, 15, "the second node")
+            wrong = run_to_end(
+                tmp_path, "emulate", "encoder-cia406", "--on", where, "--bitrate", "125000", name="wrong"
+            )
+            assert wrong.process.returncode == 2
+            assert "expected 125000 bit/s; got 500000 bit/s" in wrong.err
+            io.signal(signal.SIGTERM)
+            assert io.wait(10) == 0
+            assert drive.wait(10) == 4
+            assert "the software CAN bus is gone" in drive.err
+    no_tracebacks(tmp_path)
+
+
+def test_a_name_that_is_nearly_one_and_a_recording_of_something_else(tmp_path: Path) -> None:
+    on = ("--on", "can:fieldtwin/127.0.0.1:0")
+    misspelt = run_to_end(tmp_path, "emulate", "drive-cia40", *on, name="misspelt")
+    assert misspelt.process.returncode == 2
+    assert "did you mean 'drive-cia402'?" in misspelt.err
+    other = run_to_end(tmp_path, "emulate", "drive-cia402", *on, "--recording", "cast.jsonl", name="other")
+    assert other.process.returncode == 3
+    assert "plays nothing of this device" in other.err

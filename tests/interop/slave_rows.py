@@ -1,0 +1,237 @@
+"""Plays the rows of tests/vectors/modbus_slave.toml on a server of another make, over real ptys and sockets, all at once.
+
+Only what a master can see is asked: bytes, pauses, cells that can be read, and whether the wire is wedged afterwards. Counters,
+strict timing and settings of our own are not. What a peer does otherwise is told in one line that is the same each time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+import sys
+import tomllib
+import tty
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from gateway.protocols.modbus.ascii import lrc
+from gateway.protocols.modbus.crc import with_crc
+
+HERE = Path(__file__).parent
+VECTORS = HERE.parent / "vectors"
+PEERS = {"pymodbus": ("rtu", "ascii", "mbap", "udp"), "libmodbus": ("rtu", "mbap")}
+"""Which wires each has a server for."""
+REPLY_WITHIN_S = 1.5
+SILENCE_S = 0.2
+PAUSE_S = 0.8
+"""Longer than any of the peers waits for the rest of a frame."""
+APART_S = 0.1
+"""At least this between two pieces that a row has apart: how they are read must not depend on the machine's load."""
+READ_COIL = b"\x01\x00\x00\x00\x01"
+
+Row = dict[str, Any]
+
+
+def load_rows() -> list[Row]:
+    rows: list[Row] = tomllib.loads((VECTORS / "modbus_slave.toml").read_text())["vector"]
+    return rows
+
+
+def wire_of(row: Row) -> str:
+    return str(row.get("wire", "rtu"))
+
+
+def asked_of(peer: str, row: Row, not_asked: dict[str, str]) -> bool:
+    """Whether the row can be played on the peer: it has the wire, and needs no setting that is our emulator's own."""
+    own = {"even_only", "max_in_flight"} & set(row)
+    return wire_of(row) in PEERS[peer] and not own and row["id"] not in not_asked
+
+
+def to_bytes(row: Row, text: str) -> bytes:
+    return text.encode() if wire_of(row) == "ascii" else bytes.fromhex(text)
+
+
+def shown(row: Row, data: bytes | bytearray) -> str:
+    text = data.decode("latin-1") if wire_of(row) == "ascii" else data[:16].hex(" ")
+    return text.strip()[:47] + (f" and {len(data) - 16} more" if len(data) > 16 and wire_of(row) != "ascii" else "")
+
+
+def framed(row: Row, pdu: bytes) -> bytes:
+    """A request to unit 1 in the row's framing."""
+    if wire_of(row) in ("mbap", "udp"):
+        return b"\x77\x77\x00\x00" + (len(pdu) + 1).to_bytes(2, "big") + b"\x01" + pdu
+    frame = b"\x01" + pdu
+    if wire_of(row) == "rtu":
+        return with_crc(frame)
+    return b":" + (frame + bytes([lrc(frame)])).hex().upper().encode() + b"\r\n"
+
+
+class Wire:
+    """A pty's own side or a connected socket, as a file descriptor: what was heard, and whether it is closed."""
+
+    def __init__(self, fd: int) -> None:
+        self.fd = fd
+        self.heard = bytearray()
+        self.closed = False
+        self._more = asyncio.Event()
+        os.set_blocking(fd, False)
+        asyncio.get_running_loop().add_reader(fd, self._hear)
+
+    def _hear(self) -> None:
+        try:
+            data = os.read(self.fd, 4096)
+        except OSError:
+            data = b""
+        self.heard += data
+        if not data:
+            self.closed = True
+            asyncio.get_running_loop().remove_reader(self.fd)
+        self._more.set()
+
+    def send(self, data: bytes) -> None:
+        try:
+            os.write(self.fd, data)
+        except OSError:
+            self.closed = True
+
+    async def take(self, count: int) -> bytes:
+        """What was heard, once it is `count` bytes or more, the wire is closed or time is up."""
+        try:
+            async with asyncio.timeout(REPLY_WITHIN_S):
+                while len(self.heard) < count and not self.closed:
+                    self._more.clear()
+                    await self._more.wait()
+        except TimeoutError:
+            pass
+        data = bytes(self.heard)
+        self.heard.clear()
+        return data
+
+    def close(self) -> None:
+        asyncio.get_running_loop().remove_reader(self.fd)
+
+
+class Play:
+    """One row on one server."""
+
+    def __init__(self, row: Row, wire: Wire) -> None:
+        self.row, self.wire = row, wire
+
+    async def difference(self) -> str:
+        """What the server does otherwise than the row says; empty when nothing."""
+        said_ms = 0.0
+        for step in self.row["steps"]:
+            if step["at_ms"] > said_ms:
+                await asyncio.sleep(max(APART_S, (step["at_ms"] - said_ms) / 1000))
+                said_ms = step["at_ms"]
+            if self.wire.heard:
+                return f"sends {shown(self.row, self.wire.heard)} unasked"
+            await self.send(to_bytes(self.row, step["hear"]))
+            wanted = b"".join(to_bytes(self.row, text) for text in step["say"])
+            if wanted and (found := await self.wire.take(len(wanted))) != wanted:
+                return f"{self.said(found)} instead of {shown(self.row, wanted)}"
+        await asyncio.sleep(SILENCE_S)
+        if self.wire.heard:
+            return f"sends {shown(self.row, self.wire.heard)} besides"
+        return await self.afterwards() or await self.cells()
+
+    def said(self, data: bytes) -> str:
+        if data:
+            return shown(self.row, data)
+        return "closes the connection" if self.wire.closed else "silent"
+
+    async def send(self, data: bytes) -> None:
+        """In one piece; in the row that is about bytes, byte by byte."""
+        size = 1 if "byte by byte" in self.row["id"] else 1000
+        for i in range(0, len(data), size):
+            self.wire.send(data[i : i + size])
+            await asyncio.sleep(0.003 if size == 1 else 0)
+
+    async def ask(self, pdu: bytes) -> bytes:
+        request = framed(self.row, pdu)
+        self.wire.send(request)
+        return await self.wire.take(len(framed(self.row, pdu[:1] + b"\x01\x00" + b"\x00" * (pdu[0] == 3))))
+
+    async def afterwards(self) -> str:
+        """Whether a request after a pause is answered; where the row says `closed`, nothing may be."""
+        await asyncio.sleep(PAUSE_S)
+        answer = await self.ask(READ_COIL)
+        if self.row.get("closed"):
+            return f"goes on with {shown(self.row, answer)}" if answer else ""
+        head = framed(self.row, b"\x01\x01\x00")
+        if len(answer) == len(head):
+            return ""
+        return f"afterwards {self.said(answer)}"
+
+    async def cells(self) -> str:
+        """The cells that can be read as the row says they are (of unit 1)."""
+        for table, function in (("coil", 1), ("holding", 3)):
+            for address, value in self.row.get(table, []):
+                answer = await self.ask(bytes([function]) + address.to_bytes(2, "big") + b"\x00\x01")
+                data = bytes([1, value]) if function == 1 else b"\x02" + value.to_bytes(2, "big")
+                if answer != framed(self.row, bytes([function]) + data):
+                    return f"{table} {address}: {self.said(answer)} instead of {value}"
+        return ""
+
+
+class Stage:
+    """The wires of all rows, and the program that serves on the other side of them."""
+
+    def __init__(self, peer: str, rows: list[Row], stack: ExitStack) -> None:
+        self.peer, self.rows, self.stack = peer, rows, stack
+        self.lines: dict[int, int] = {}
+
+    def jobs(self) -> list[dict[str, Any]]:
+        return [
+            {"row": n, "wire": wire_of(row), "line": self.line(n, row), "units": row.get("units", [1])}
+            for n, row in enumerate(self.rows)
+        ]
+
+    def line(self, number: int, row: Row) -> str:
+        """A pty for the row, the far side of which stays open here too: nobody sees a hang-up."""
+        if wire_of(row) not in ("rtu", "ascii"):
+            return ""
+        near, far = os.openpty()
+        tty.setraw(far)
+        for fd in (near, far):
+            self.stack.callback(os.close, fd)
+        self.lines[number] = near
+        return os.ttyname(far)
+
+    def wire(self, number: int, port: int) -> Wire:
+        if number in self.lines:
+            wire = Wire(self.lines[number])
+        else:
+            kind = socket.SOCK_DGRAM if wire_of(self.rows[number]) == "udp" else socket.SOCK_STREAM
+            connected = self.stack.enter_context(socket.socket(socket.AF_INET, kind))
+            connected.connect(("127.0.0.1", port))
+            if kind == socket.SOCK_STREAM:
+                connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            wire = Wire(connected.fileno())
+        self.stack.callback(wire.close)
+        return wire
+
+
+async def play_on(peer: str, rows: list[Row]) -> dict[str, str]:
+    """What `peer` does otherwise, row by row; rows that pass have ''."""
+    with ExitStack() as stack:
+        stage = Stage(peer, rows, stack)
+        jobs = json.dumps(stage.jobs()).encode() + b"\n"
+        program = await asyncio.create_subprocess_exec(
+            sys.executable, str(HERE / "strange_slaves.py"), peer, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+        )  # fmt: skip
+        assert program.stdin is not None
+        assert program.stdout is not None
+        try:
+            program.stdin.write(jobs)
+            async with asyncio.timeout(20):
+                ready = [tuple(map(int, (await program.stdout.readline()).split())) for _ in rows]
+                plays = [Play(rows[number], stage.wire(number, port)) for number, port in ready]
+                found = await asyncio.gather(*(play.difference() for play in plays))
+        finally:
+            program.stdin.close()
+            await program.wait()
+        return {play.row["id"]: difference for play, difference in zip(plays, found, strict=True)}

@@ -1,0 +1,149 @@
+"""Servers of other makes as a program of its own: one child process a row, each with the device of the rows, fresh.
+
+Standard input: one line of JSON, a list of ``{"row": n, "wire": "rtu" | "ascii" | "mbap" | "udp", "line": path of a
+serial port or "", "units": [1]}``. Standard output: ``n port`` a row once it serves (port 0 on a line). Ends, with all
+its children, when its standard input does. A child a row, because pymodbus keeps its diagnostics once a process and
+libmodbus answers one master at a time; forked, because that takes milliseconds.
+
+It knows nothing of our code: what it serves is written down here a second time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import errno
+import json
+import logging
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from ctypes.util import find_library
+from typing import Any
+
+COILS, HOLDING, INPUTS = 48, 200, 8
+HELD = {0: 0xAA, 1: 0xBB, 4: 0x12}
+NAMES = {"VendorName": "fieldtwin", "ProductCode": "FT-1", "MajorMinorRevision": "V2.11", "VendorUrl": "u" * 200}
+BAUD_RATE = 115200
+
+
+def say(row: int, port: int) -> None:
+    os.write(1, f"{row} {port}\n".encode())
+
+
+def serve_pymodbus(job: dict[str, Any]) -> None:
+    from pymodbus import FramerType, ModbusDeviceIdentification
+    from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusUdpServer
+    from pymodbus.simulator import DataType, SimData, SimDevice
+
+    logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)
+    names = ModbusDeviceIdentification(info_name={**NAMES, "ProductName": "n" * 60})  # type: ignore[no-untyped-call]
+    held = [HELD.get(i, 0) for i in range(HOLDING)]
+    tables = (
+        [SimData(0, values=[False] * COILS, datatype=DataType.BITS)],
+        [SimData(0, values=[False] * 16, datatype=DataType.BITS)],
+        [
+            SimData(0, values=held, datatype=DataType.REGISTERS),
+            SimData(299, values=[0], datatype=DataType.REGISTERS),
+            SimData(300, values=[0], datatype=DataType.REGISTERS, readonly=True),
+        ],
+        [SimData(0, values=[0x4120] + [0] * (INPUTS - 1), datatype=DataType.REGISTERS)],
+    )
+    devices = [SimDevice(id=unit, simdata=tables, identity=names) for unit in job["units"]]
+
+    async def main() -> None:
+        server: ModbusSerialServer | ModbusTcpServer | ModbusUdpServer
+        if job["wire"] in ("rtu", "ascii"):  # on a line others' requests are silently ignored and 0 is a broadcast
+            server = ModbusSerialServer(
+                devices, framer=FramerType(job["wire"]), port=job["line"], baudrate=BAUD_RATE, identity=names,
+                ignore_missing_devices=True, broadcast_enable=True,
+            )  # fmt: skip
+        elif job["wire"] == "udp":
+            server = ModbusUdpServer(devices, address=("127.0.0.1", 0), identity=names)
+        else:
+            server = ModbusTcpServer(devices, address=("127.0.0.1", 0), identity=names)
+        await server.serve_forever(background=True)
+        transport: Any = server.transport
+        port = 0
+        if job["wire"] == "mbap":
+            port = transport.sockets[0].getsockname()[1]
+        elif job["wire"] == "udp":
+            port = transport.get_extra_info("sockname")[1]
+        say(job["row"], port)
+        await asyncio.Event().wait()
+
+    asyncio.run(main())
+
+
+class Mapping(ctypes.Structure):
+    """modbus_mapping_t of modbus.h."""
+
+    _fields_ = (
+        *((name, ctypes.c_int) for name in ("nb_bits", "start_bits", "nb_input_bits", "start_input_bits")),
+        *((name, ctypes.c_int) for name in ("nb_input_registers", "start_input_registers")),
+        *((name, ctypes.c_int) for name in ("nb_registers", "start_registers")),
+        *((name, ctypes.POINTER(ctypes.c_uint8)) for name in ("tab_bits", "tab_input_bits")),
+        *((name, ctypes.POINTER(ctypes.c_uint16)) for name in ("tab_input_registers", "tab_registers")),
+    )
+
+
+def serve_libmodbus(job: dict[str, Any]) -> None:
+    """As its own example servers do: a frame that was none is passed over on a line and ends a TCP connection."""
+    lib = ctypes.CDLL(find_library("modbus"), use_errno=True)
+    for name in ("modbus_new_tcp", "modbus_new_rtu"):
+        getattr(lib, name).restype = ctypes.c_void_p
+    lib.modbus_mapping_new.restype = ctypes.POINTER(Mapping)
+    mapping = lib.modbus_mapping_new(COILS, 16, HOLDING, INPUTS)
+    for address, value in HELD.items():
+        mapping.contents.tab_registers[address] = value
+    mapping.contents.tab_input_registers[0] = 0x4120
+    query = ctypes.create_string_buffer(260)
+    if job["wire"] == "mbap":
+        context = ctypes.c_void_p(lib.modbus_new_tcp(b"127.0.0.1", 0))
+        listening = lib.modbus_tcp_listen(context, 1)
+        with socket.socket(fileno=listening) as listener:
+            say(job["row"], listener.getsockname()[1])
+            accepted = ctypes.c_int(listening)
+            lib.modbus_tcp_accept(context, ctypes.byref(accepted))
+            while (size := lib.modbus_receive(context, query)) >= 0:
+                if size:
+                    lib.modbus_reply(context, query, size, mapping)
+            lib.modbus_close(context)
+        return
+    context = ctypes.c_void_p(lib.modbus_new_rtu(job["line"].encode(), BAUD_RATE, ord("N"), 8, 1))
+    lib.modbus_set_slave(context, job["units"][0])
+    if lib.modbus_connect(context) != 0:
+        sys.exit("cannot open the port")
+    say(job["row"], 0)
+    while True:
+        size = lib.modbus_receive(context, query)
+        if size > 0:
+            lib.modbus_reply(context, query, size, mapping)
+        elif size < 0 and ctypes.get_errno() in (errno.EIO, errno.EBADF, errno.ECONNRESET):
+            return
+
+
+def main() -> None:
+    serve: Callable[[dict[str, Any]], None] = {"pymodbus": serve_pymodbus, "libmodbus": serve_libmodbus}[sys.argv[1]]
+    if serve is serve_pymodbus:  # once for all children
+        import pymodbus.server
+        import pymodbus.simulator  # noqa: F401
+    children = []
+    for job in json.loads(sys.stdin.readline()):
+        child = os.fork()
+        if not child:
+            try:
+                serve(job)
+            finally:
+                os._exit(0)
+        children.append(child)
+    sys.stdin.read()
+    for child in children:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+
+
+if __name__ == "__main__":
+    main()

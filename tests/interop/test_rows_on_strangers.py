@@ -1,0 +1,58 @@
+"""The rows for slaves on pymodbus's and libmodbus's servers: what they do otherwise is known, row by row, and nothing else is."""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import tomllib
+from ctypes.util import find_library
+from importlib.metadata import version
+from typing import Any
+
+import pytest
+from slave_rows import PEERS, VECTORS, asked_of, load_rows, play_on
+
+pytestmark = pytest.mark.interop
+KNOWN: dict[str, Any] = tomllib.loads((VECTORS / "known_failures.toml").read_text())
+NOT_ASKED = {peer: {entry["id"]: entry["why"] for entry in KNOWN[peer].get("not_asked", [])} for peer in PEERS}
+ROWS = {peer: [row for row in load_rows() if asked_of(peer, row, NOT_ASKED[peer])] for peer in PEERS}
+_found: dict[str, dict[str, str]] = {}
+
+
+def version_of(peer: str) -> str:
+    """The peer's version here; skips where it is not installed."""
+    if peer == "pymodbus":
+        return version("pymodbus")
+    if (name := find_library("modbus")) is None:
+        pytest.skip("libmodbus is not installed")
+    lib = ctypes.CDLL(name)
+    parts = ("major", "minor", "micro")
+    return ".".join(str(ctypes.c_uint.in_dll(lib, f"libmodbus_version_{part}").value) for part in parts)
+
+
+def found_on(peer: str) -> dict[str, str]:
+    """Played once, all rows at the same time."""
+    if peer not in _found:
+        _found[peer] = asyncio.run(play_on(peer, ROWS[peer]))
+    return _found[peer]
+
+
+@pytest.mark.parametrize("peer", PEERS)
+def test_the_list_names_rows(peer: str) -> None:
+    ids = {row["id"] for row in load_rows()}
+    known = [entry["id"] for entry in KNOWN[peer]["known"]]
+    assert set(known) <= {row["id"] for row in ROWS[peer]}
+    assert len(set(known)) == len(known)
+    assert set(NOT_ASKED[peer]) <= ids
+    assert len(known) < len(ROWS[peer])
+
+
+@pytest.mark.parametrize(("peer", "row_id"), [(peer, row["id"]) for peer in PEERS for row in ROWS[peer]])
+def test_row(peer: str, row_id: str) -> None:
+    here = version_of(peer)
+    known = {entry["id"]: entry["instead"] for entry in KNOWN[peer]["known"]}
+    found = found_on(peer)[row_id]
+    if here == KNOWN[peer]["version"]:
+        assert found == known.get(row_id, "")
+    elif row_id not in known:
+        assert not found, f"a row that {KNOWN[peer]['version']} passed"

@@ -14,10 +14,9 @@ from emulators.context import WhenUsedUp
 from emulators.emulator import emulator_kind
 from emulators.journal import HeldJournal
 from emulators.replay.counters import CounterSpan
-from emulators.replay.own_functions import add_own_functions
+from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.requests import parse_request
-from emulators.replay.unit import ReplayUnit
 from gateway.core.connection import Connection
 from gateway.core.device import wire
 from gateway.core.errors import FileInvalid, UnknownCommand
@@ -45,7 +44,7 @@ def load_replay(profile: DeviceProfile, path: Path, at_end: WhenUsedUp = WhenUse
     return ExchangeReplay(exchanges, when_used_up=at_end, counters=spans), unit
 
 
-class RecordedDevice(ReplayUnit):
+class RecordedDevice(ProfiledReplay):
     """One unit of an emulated line. `kind` is the wire of the device that it stands for. `identity` gives tags other values
     than the recorded ones. A request that is no command of the profile's list is answered all the same, and counted in
     `unlisted`."""
@@ -59,7 +58,7 @@ class RecordedDevice(ReplayUnit):
         identity: Mapping[str, str],
         name: str = "",
     ) -> None:
-        super().__init__(replay, unit_id, name or profile.name)
+        super().__init__(profile, replay, unit_id, name)
         end, self._line = wire(kind)
         self.emulator = emulator_kind(end.type, profile)(end, profile, replay.context, super().respond)
         self.journal = HeldJournal()
@@ -68,7 +67,6 @@ class RecordedDevice(ReplayUnit):
         for tag, text in ((profile.tags[n], text) for n, text in identity.items()):
             at, value = tag.registers, text if tag.is_text else float(text)
             replay.put(unit_id, at.table, at.address, encode(value, tag.type, tag.order, registers=at.count))
-        add_own_functions(self, profile)
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
         self._line.write(pdu)

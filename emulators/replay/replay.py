@@ -159,6 +159,23 @@ class ExchangeReplay:
                 if unit_id in (None, number):
                     self._write(unit, request, request.values)
 
+    def was_recorded(self, unit_id: int, pdu: bytes) -> bool:
+        """Whether this very request was."""
+        unit = self._units.get(unit_id)
+        return unit is not None and _shape(unit_id, pdu) in unit.recorded_in
+
+    def refuse(self, unit_id: int, pdu: bytes, code: int) -> Answer:
+        """The answer to what the device is known not to do, though nobody recorded it."""
+        latency_s = self._units[unit_id].usual_latency_s(pdu[0])
+        return self._counted(pdu, Answer(requests.exception(pdu, code), latency_s))
+
+    def accept(self, unit_id: int, request: CellRequest, pdu: bytes) -> Answer:
+        """The answer to a write that the device is known to take, though nobody recorded it."""
+        unit = self._units[unit_id]
+        self._write(unit, request, request.values or ())
+        latency_s = unit.usual_latency_s(pdu[0]) or unit.usual_latency_s(3)
+        return self._counted(pdu, Answer(requests.written_reply(request, pdu), latency_s))
+
     def own_request_lengths(self, unit_id: int) -> dict[int, int]:
         """Functions that no standard knows, of which every recorded request was as long as the others: bytes of the PDU."""
         found = self._units[unit_id].request_lengths
@@ -268,6 +285,8 @@ class ExchangeReplay:
             return Answer(self._read(unit_id, unit, request), outcome.latency_s)
         if request is None or pdu[0] not in unit.functions:
             known = pdu[0] in unit.functions
+            if known and requests.leaves_the_table(pdu):
+                return self._never(pdu, requests.ILLEGAL_ADDRESS)
             return self._never(pdu, requests.ILLEGAL_VALUE if known else requests.ILLEGAL_FUNCTION)
         if request.values is None:
             return self._answer_new_read(unit_id, unit, request, pdu)

@@ -57,6 +57,14 @@ def parse_request(pdu: bytes) -> CellRequest | None:
     return request if request and request.addresses.stop <= 0x10000 else None
 
 
+def leaves_the_table(pdu: bytes) -> bool:
+    """Whether a request is well formed but for its last address, which is none (AP 6: 02, where a bad quantity is 03)."""
+    if len(pdu) < 5 or pdu[0] not in {*_READS, 15, 16}:
+        return False
+    address, count = struct.unpack(">HH", pdu[1:5])
+    return address + count > 0x10000 and parse_request(pdu[:1] + b"\0\0" + pdu[3:]) is not None
+
+
 def parse_values(request: CellRequest, reply: bytes) -> tuple[int, ...] | None:
     """The cells that a normal reply to a read carries; None where it is no such reply."""
     if len(reply) < 2 or reply[0] != request.function or reply[1] != len(reply) - 2:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from emulators.modbus.bank import IllegalAddress, RegisterBank, Table
 from emulators.modbus.unit import Handler, ModbusUnit
-from emulators.replay.replay import ExchangeReplay
+from emulators.replay.replay import Answer, ExchangeReplay
 from gateway.core.errors import UsageError
 
 
@@ -51,7 +51,7 @@ class ReplayUnit(ModbusUnit):
             self.latency_s = 0.0
             return super().respond(pdu, now_ns)
         self.counters.requests += 1
-        answer = self.replay.respond(self.unit_id, pdu)
+        answer = self.recall(pdu)
         self.latency_s = answer.latency_s
         if answer.reply is None:
             self.counters.unanswered += 1
@@ -59,6 +59,10 @@ class ReplayUnit(ModbusUnit):
         self.counters.replies += 1
         self.counters.exceptions += bool(answer.reply[0] & 0x80)
         return answer.reply
+
+    def recall(self, pdu: bytes) -> Answer:
+        """What the recorded unit answers."""
+        return self.replay.respond(self.unit_id, pdu)
 
     def execute_broadcast(self, pdu: bytes, now_ns: int) -> None:
         """A write to all units has its effect on this one too."""

@@ -24,7 +24,7 @@ from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.recorded_device import load_replay
-from emulators.replay.own_functions import add_own_functions
+from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.unit import ReplayUnit
 from emulators.signals import SignalPlayer, SignalTrack
@@ -103,9 +103,7 @@ class DeviceHost:
     def _recorded(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
         """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name."""
         replay, recorded = load_replay(profile, find_recording(str(recording or f"{Path(profile.path).stem}.jsonl")))
-        unit = ReplayUnit(replay, recorded, profile.name)
-        add_own_functions(unit, profile)
-        return unit
+        return ProfiledReplay(profile, replay, recorded)
 
     def replayed(self, path: Path, unit_id: int | None) -> dict[int, ModbusUnit]:
         """The units of a recording of exchanges, or the one that is asked for."""

@@ -12,7 +12,8 @@ import pytest
 from support import eventually, run
 
 from emulators.modbus.rtu import RtuSlave
-from emulators.replay.own_functions import add_own_functions
+from emulators.recorded_device import load_replay
+from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.unit import ReplayUnit
 from gateway.connections.serial_line import SerialConnection
@@ -86,9 +87,8 @@ def test_a_rover_is_reset_and_forgets_its_history(tmp_path: Path) -> None:
 
 
 def a_rover() -> ReplayUnit:
-    unit = ReplayUnit(ExchangeReplay.load(CHECKOUT / "recordings" / "renogy-rover.jsonl"), 1)
-    add_own_functions(unit, load_profile(PROFILE))
-    return unit
+    replay, unit_id = load_replay(load_profile(PROFILE), CHECKOUT / "recordings" / "renogy-rover.jsonl")
+    return ProfiledReplay(load_profile(PROFILE), replay, unit_id)
 
 
 def test_what_is_registered_goes_before_what_was_recorded_and_is_counted() -> None:

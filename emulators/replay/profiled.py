@@ -1,0 +1,71 @@
+"""A replayed unit that keeps to its device's profile where the recording has no answer.
+
+What was recorded goes first, whatever it is. Of the rest the profile tells what the device has: which functions, how many
+registers a request, no half values, what can be written and what cannot be read. A write that it allows is accepted and
+reads back. Pure; decodes for itself.
+"""
+
+from __future__ import annotations
+
+from emulators.modbus.bank import Table
+from emulators.replay import requests
+from emulators.replay.own_functions import add_own_functions
+from emulators.replay.replay import Answer, ExchangeReplay
+from emulators.replay.requests import CellRequest
+from emulators.replay.unit import ReplayUnit
+from gateway.core.profile import DeviceProfile
+
+_CELL_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10})
+
+
+class ProfiledReplay(ReplayUnit):
+    """Unit `unit_id` of a recording of a device that `profile` describes, functions of its own included."""
+
+    def __init__(self, profile: DeviceProfile, replay: ExchangeReplay, unit_id: int, name: str = "") -> None:
+        super().__init__(replay, unit_id, name or profile.name)
+        self._limits = profile.form.limits
+        self._writable: set[tuple[Table, int]] = set()
+        self._unreadable: set[tuple[Table, int]] = set()
+        readable: set[tuple[Table, int]] = set()
+        for tag in profile.tags.values():
+            cells = {(tag.registers.table, tag.registers.address + i) for i in range(tag.registers.count)}
+            self._writable |= cells if tag.writable else set()
+            readable |= cells if tag.readable else set()
+            self._unreadable |= set() if tag.readable else cells
+        self._unreadable -= readable
+        add_own_functions(self, profile)
+
+    def recall(self, pdu: bytes) -> Answer:
+        if self.replay.was_recorded(self.unit_id, pdu):
+            return super().recall(pdu)
+        request, allowed = requests.parse_request(pdu), self._limits.functions
+        code = 0
+        if allowed is not None and pdu[0] not in allowed:
+            code = requests.ILLEGAL_FUNCTION
+        elif request is not None:
+            code = self._refusal(request)
+        elif pdu[0] in _CELL_FUNCTIONS and allowed is not None:
+            code = requests.ILLEGAL_ADDRESS if requests.leaves_the_table(pdu) else requests.ILLEGAL_VALUE
+        if code:
+            return self.replay.refuse(self.unit_id, pdu, code)
+        if request is not None and request.values is not None and self._may_write(request):
+            return self.replay.accept(self.unit_id, request, pdu)
+        return super().recall(pdu)
+
+    def _refusal(self, request: CellRequest) -> int:
+        """0, or the exception that the profile has for it: quantities before addresses."""
+        registers = request.table in ("holding", "input")
+        pairs = registers and self._limits.even_only and request.function != 0x06
+        most = self._limits.read_registers if request.values is None and registers else request.count
+        if request.count > most or (pairs and request.count % 2):
+            return requests.ILLEGAL_VALUE
+        if pairs and request.address % 2:
+            return requests.ILLEGAL_ADDRESS
+        if request.values is None and any((request.table, a) in self._unreadable for a in request.addresses):
+            return requests.ILLEGAL_ADDRESS
+        if request.values is not None and not self._may_write(request):
+            return requests.ILLEGAL_ADDRESS
+        return 0
+
+    def _may_write(self, request: CellRequest) -> bool:
+        return all((request.table, address) in self._writable for address in request.addresses)

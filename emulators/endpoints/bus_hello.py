@@ -6,7 +6,8 @@ frame's record has, so a reader of fixed-size records needs no second framing. N
     0  u8   80h
     1  u8   protocol version, 1
     2  u8   status (answer): 0 welcome, 1 wrong bit rate, 2 unknown version, 3 bus full
-    3  u8   options (request): bit 0, confirm each frame of mine when it was on the wire
+    3  u8   options (request): bit 0, confirm each frame of mine when it was on the wire; bit 1, error frames when my
+            controller's state changes or frames for me were lost; bit 2, one for each error on the wire that I took part in
     4  u32  bit rate: wanted (0: whatever the bus has), in the answer the bus's own
     8  u64  monotonic clock of the bus in ns (answer)
     16 4s   "ftcb"
@@ -26,6 +27,8 @@ from gateway.core.canframe import RECORD_SIZE
 
 VERSION = 1
 WANTS_CONFIRMATIONS = 0x01
+WANTS_ERRORS = 0x02
+WANTS_VIOLATIONS = 0x04
 
 _HELLO = struct.Struct("!BBBBIQ4sHH")
 _MARK = 0x80

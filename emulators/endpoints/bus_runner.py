@@ -7,12 +7,18 @@ connection of the same process another.
 from __future__ import annotations
 
 import asyncio
-from typing import Any, Protocol
+import heapq
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol
 
+from emulators.endpoints.overrun import TellsOverrun
 from emulators.wires.can_bus import CanBus
+from emulators.wires.can_faults import Rule
+from gateway.core.can_error import CanErrorState, state_frame, violation_frame
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CANConnection, CanConnection, closed_here
+from gateway.core.connection import CANConnection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, FieldtwinError
 
@@ -28,6 +34,11 @@ class BusPort(Protocol):
         """A frame of this node was on the wire; its place in the transmit queue is free."""
         ...
 
+    def on_error(self, frame: CanFrame, *, violation: bool) -> None:
+        """An error frame of this node's controller (gateway/core/can_error.py): its state changed, or (`violation`) it took part
+        in an attempt that came to an error."""
+        ...
+
     def on_settled(self) -> None:
         """No more frames for this instant."""
         ...
@@ -37,15 +48,35 @@ class BusPort(Protocol):
         ...
 
 
+class _Told(NamedTuple):
+    """What a controller tells its node."""
+
+    t_ns: int
+    order: int
+    node: int
+    frame: CanFrame
+    violation: bool
+
+
 class BusRunner:
     """Runs a `CanBus` on the running loop. `paced`: frames take the time they take; otherwise none.
 
     A late wake-up delays deliveries and never shifts the bus: frames keep their exact times (`frame.t_ns`).
     """
 
-    def __init__(self, bitrate: int, *, paced: bool = True, queue_frames: int = 64, max_nodes: int = 128) -> None:
+    def __init__(
+        self,
+        bitrate: int,
+        *,
+        paced: bool = True,
+        queue_frames: int = 64,
+        max_nodes: int = 128,
+        monitored: bool = True,
+    ) -> None:
         self._loop = asyncio.get_running_loop()
-        self._bus = CanBus(bitrate, instant=not paced, queue_frames=queue_frames, max_nodes=max_nodes)
+        self._bus = CanBus(
+            bitrate, instant=not paced, queue_frames=queue_frames, max_nodes=max_nodes, monitored=monitored
+        )
         self._ports: dict[int, BusPort] = {}
         self._timer: asyncio.TimerHandle | asyncio.Handle | None = None
         self._due_ns = 0
@@ -63,12 +94,13 @@ class BusRunner:
         """The loop's clock in ns."""
         return int(self._loop.time() * NS_PER_S)
 
-    def join(self, port: BusPort, name: str = "") -> int:
+    def join(self, port: BusPort, name: str = "", *, listen_only: bool = False) -> int:
         """The port's node number. Raises `EndpointBusy` when the bus is full, or why the bus closed."""
         if self._closed is not None:
             raise self._closed
-        node = self._bus.join(self.now_ns(), name)
+        node = self._bus.join(self.now_ns(), name, listen_only=listen_only)
         self._ports[node] = port
+        self._schedule()  # it acknowledges from now on
         return node
 
     def leave(self, node: int) -> None:
@@ -82,6 +114,14 @@ class BusRunner:
         taken = self._bus.submit(node, frame, self.now_ns())
         self._schedule()
         return taken
+
+    def disturb(self, rule: Rule) -> None:
+        """Spoil attempts to send as `rule` says (`can_faults.spoil` makes one)."""
+        self._bus.disturb(rule)
+
+    def undisturb(self, rule: Rule) -> None:
+        """Take a rule away."""
+        self._bus.undisturb(rule)
 
     def attach(self, endpoint: Endpoint, name: str = "", max_pending: int = 4096) -> AttachedConnection:
         """A connection for a node of this process, on the very same bus."""
@@ -102,7 +142,7 @@ class BusRunner:
             port.on_bus_closed(error)
 
     def _schedule(self) -> None:
-        due_ns = self._bus.next_event_ns()
+        due_ns = self.now_ns() if self._bus.has_news else self._bus.next_event_ns()
         if due_ns is None or self._closed is not None:
             return
         if self._timer is not None:
@@ -120,8 +160,11 @@ class BusRunner:
         self._timer = None
         # The loop may fire a timer one clock resolution early; the frame's end is reached then all the same.
         deliveries = self._bus.advance(max(self.now_ns(), self._due_ns))
+        told = self._told()
         touched: dict[int, BusPort] = {}
         for delivery in deliveries:
+            while told and told[0].t_ns < delivery.frame.t_ns:
+                self._tell(told.popleft(), touched)
             for node in delivery.receivers:
                 if (port := self._ports.get(node)) is not None:
                     touched[node] = port
@@ -131,13 +174,42 @@ class BusRunner:
                 if (port := self._ports.get(node)) is not None:
                     touched[node] = port
                     port.on_confirmed(delivery.frame)
+        while told:
+            self._tell(told.popleft(), touched)
         for port in touched.values():
             port.on_settled()
         self._schedule()
 
+    def _told(self) -> deque[_Told]:
+        """What controllers have to tell since the last time, in its order."""
+        if not self._bus.has_news:
+            return deque()
+        states = (
+            _Told(
+                n.t_ns, 1, n.node, state_frame(n.state, n.tec, n.rec, restarted=restarted, t_ns=n.t_ns), violation=False
+            )
+            for n in self._bus.take_notices()
+            for restarted in (n.before is CanErrorState.BUS_OFF,)
+        )
+        return deque(heapq.merge(self._violations(), states, key=lambda told: (told.t_ns, told.order)))
 
-class AttachedConnection(CanConnection):
-    """A node of the same process. `recv` gets what the other nodes sent, stamped with its exact end of frame."""
+    def _violations(self) -> Iterator[_Told]:
+        for fault in self._bus.take_faults():
+            for node, tec, rec in fault.counters:
+                frame = violation_frame(fault.kind, tec, rec, fault.t_ns)
+                yield _Told(fault.t_ns, 0, node, frame, violation=True)
+
+    def _tell(self, told: _Told, touched: dict[int, BusPort]) -> None:
+        if (port := self._ports.get(told.node)) is not None:
+            touched[told.node] = port
+            port.on_error(told.frame, violation=told.violation)
+
+
+class AttachedConnection(TellsOverrun):
+    """A node of the same process. `recv` gets what the other nodes sent, stamped with its exact end of frame.
+
+    Error frames tell of its controller: changes of state, and overruns.
+    """
 
     def __init__(self, runner: BusRunner, endpoint: Endpoint, name: str, max_pending: int) -> None:
         super().__init__(CANConnection(), endpoint, max_pending)
@@ -169,6 +241,10 @@ class AttachedConnection(CanConnection):
 
     def on_confirmed(self, frame: CanFrame) -> None:
         self._room.set()
+
+    def on_error(self, frame: CanFrame, *, violation: bool) -> None:
+        if not violation:
+            self.feed(frame)
 
     def on_settled(self) -> None:
         """Nothing is gathered here."""

@@ -15,8 +15,18 @@ import errno
 import socket
 from typing import Any, cast
 
-from emulators.endpoints.bus_hello import VERSION, WANTS_CONFIRMATIONS, Hello, Status, unpack_hello
+from emulators.endpoints.bus_hello import (
+    VERSION,
+    WANTS_CONFIRMATIONS,
+    WANTS_ERRORS,
+    WANTS_VIOLATIONS,
+    Hello,
+    Status,
+    unpack_hello,
+)
 from emulators.endpoints.bus_runner import BusRunner
+from emulators.wires.can_faults import Rule
+from gateway.core.can_error import overrun_frame
 from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
@@ -52,18 +62,20 @@ class SoftBusServer:
         queue_frames: int = 64,
         max_nodes: int = 128,
         max_outbound_frames: int = 4096,
+        monitored: bool = True,
     ) -> SoftBusServer:
         """Listen on a ``can:fieldtwin/HOST:PORT`` endpoint; port 0 takes a free one (see `bound`).
 
         `paced`: frames take their exact time at `bitrate` bit/s; otherwise they are delivered at once. `queue_frames`
-        bounds each node's transmit queue, `max_outbound_frames` what waits for a client that reads slowly.
+        bounds each node's transmit queue, `max_outbound_frames` what waits for a client that reads slowly. `monitored`: the
+        bus itself acknowledges every frame; otherwise a node that is alone on it tries for ever, as on a real one.
         Raises `EndpointBusy` when the port is in use, `Unreachable` when it cannot be opened, `UsageError` for another
         kind of endpoint or an impossible bit rate.
         """
         if endpoint.interface != "fieldtwin":
             raise UsageError(f"{endpoint} is no software CAN bus", expected="can:fieldtwin/HOST:PORT")
         host, port = endpoint.address
-        runner = BusRunner(bitrate, paced=paced, queue_frames=queue_frames, max_nodes=max_nodes)
+        runner = BusRunner(bitrate, paced=paced, queue_frames=queue_frames, max_nodes=max_nodes, monitored=monitored)
         bus = cls(runner, endpoint, max_outbound_frames)
         loop = asyncio.get_running_loop()
         try:
@@ -86,6 +98,19 @@ class SoftBusServer:
     @property
     def bitrate(self) -> int:
         return self._runner.bitrate
+
+    @property
+    def runner(self) -> BusRunner:
+        """What other kinds of ports hang on, an slcan port for one."""
+        return self._runner
+
+    def disturb(self, rule: Rule) -> None:
+        """Spoil attempts to send as `rule` says (`emulators.wires.can_faults.spoil` makes one)."""
+        self._runner.disturb(rule)
+
+    def undisturb(self, rule: Rule) -> None:
+        """Take a rule away."""
+        self._runner.undisturb(rule)
 
     def attach(self, name: str = "", max_pending: int = 4096) -> CanConnection:
         """A connection for a node in this process, on the same bus without TCP. `max_pending` bounds its receive queue."""
@@ -124,7 +149,8 @@ class _Client(asyncio.Protocol):
         self._inbound = bytearray()
         self._outbound = bytearray()
         self._node = 0  # 0 until welcome
-        self._confirms = False
+        self._options = 0
+        self._lost_since_ns = 0  # when frames began to be lost that this client has not been told of
         self._reading = True
         self._flooded = False  # it asked for confirmations and does not read them
 
@@ -154,6 +180,10 @@ class _Client(asyncio.Protocol):
         self._inbound += data
         self._take()
 
+    @property
+    def _confirms(self) -> bool:
+        return bool(self._options & WANTS_CONFIRMATIONS)
+
     def pause_writing(self) -> None:
         self._flooded = self._confirms
 
@@ -171,14 +201,25 @@ class _Client(asyncio.Protocol):
 
     def on_frame(self, frame: CanFrame) -> bool:
         waiting = self._transport.get_write_buffer_size() + len(self._outbound)
-        if waiting + RECORD_SIZE > self._bus._max_outbound_bytes:
+        if waiting + 2 * RECORD_SIZE > self._bus._max_outbound_bytes:
+            self._lost_since_ns = self._lost_since_ns or frame.t_ns or 1
             return False
+        if self._lost_since_ns:
+            self.on_error(overrun_frame(self._lost_since_ns), violation=False)
+            self._lost_since_ns = 0
         self._outbound += pack_record(frame)
         return True
 
     def on_confirmed(self, frame: CanFrame) -> None:
         if self._confirms:
             self._outbound += pack_record(frame, confirmed=True)
+
+    def on_error(self, frame: CanFrame, *, violation: bool) -> None:
+        waiting = self._transport.get_write_buffer_size() + len(self._outbound)
+        if self._options & (WANTS_VIOLATIONS if violation else WANTS_ERRORS) and (
+            not violation or waiting + RECORD_SIZE <= self._bus._max_outbound_bytes
+        ):
+            self._outbound += pack_record(frame)
 
     def on_settled(self) -> None:
         if self._outbound:
@@ -242,7 +283,7 @@ class _Client(asyncio.Protocol):
                 self._turn_away()
                 return
         self._deadline.cancel()
-        self._confirms = bool(hello.options & WANTS_CONFIRMATIONS)
+        self._options = hello.options
         answer = Hello(
             self._runner.bitrate, status=status, t_ns=self._runner.now_ns(), window=self._runner.queue_frames
         )

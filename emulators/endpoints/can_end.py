@@ -13,7 +13,8 @@ from pathlib import Path
 
 import can
 
-from emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, Hello, Status, unpack_hello
+from emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, WANTS_ERRORS, Hello, Status, unpack_hello
+from emulators.endpoints.overrun import TellsOverrun
 from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CANConnection, CanConnection, closed_here
@@ -61,7 +62,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
         loop = asyncio.get_running_loop()
         asked_ns = int(loop.time() * NS_PER_S)
         async with asyncio.timeout(OPEN_TIMEOUT_S):
-            writer.write(Hello(bitrate, options=WANTS_CONFIRMATIONS).pack())
+            writer.write(Hello(bitrate, options=WANTS_CONFIRMATIONS | WANTS_ERRORS).pack())
             answer = unpack_hello(await reader.readexactly(RECORD_SIZE))
         if answer is None:
             raise Unreachable("what answers there is no software CAN bus", where=str(endpoint))
@@ -95,8 +96,11 @@ def _judge(answer: Hello, bitrate: int, endpoint: Endpoint) -> None:
         )
 
 
-class SoftBusEnd(CanConnection):
-    """A node on the software bus over TCP: a task reads records, `send` keeps within the bus's transmit window."""
+class SoftBusEnd(TellsOverrun):
+    """A node on the software bus over TCP: a task reads records, `send` keeps within the bus's transmit window.
+
+    Error frames (gateway/core/can_error.py) tell of its controller: changes of state, and overruns.
+    """
 
     def __init__(
         self,
@@ -192,7 +196,7 @@ def _open_kernel_end(endpoint: Endpoint) -> KernelCanEnd:
     return KernelCanEnd(endpoint, bus)
 
 
-class KernelCanEnd(CanConnection):
+class KernelCanEnd(TellsOverrun):
     """A node on a kernel interface (vcan, as a rule). Frames are stamped when they are read."""
 
     def __init__(self, endpoint: Endpoint, bus: can.BusABC) -> None:

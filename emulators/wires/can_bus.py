@@ -89,14 +89,17 @@ class CanBus:
 
     # -- nodes ----------------------------------------------------------------------------------------------------
 
-    def join(self, now_ns: int, name: str = "") -> int:
-        """A new node's number. It receives frames that start from now on. Raises `EndpointBusy` when the bus is full."""
+    def join(self, now_ns: int, name: str = "", *, listen_only: bool = False) -> int:
+        """A new node's number. It receives frames that start from now on. Raises `EndpointBusy` when the bus is full.
+
+        With `listen_only` it never acknowledges nor objects, and may not send.
+        """
         if len(self._nodes) >= self.max_nodes:
             raise EndpointBusy("the CAN bus is full", expected=f"at most {self.max_nodes} nodes")
         self._run(now_ns)
         node = self._next_node
         self._next_node += 1
-        self._nodes[node] = Node(name or f"node {node}", now_ns)
+        self._nodes[node] = Node(name or f"node {node}", now_ns, listen_only=listen_only)
         return node
 
     def leave(self, node: int, now_ns: int) -> None:
@@ -115,6 +118,8 @@ class CanBus:
         if frame.error:
             raise UsageError("a node cannot send an error frame", got=str(frame))
         sender = self._node(node)
+        if sender.listen_only:
+            raise UsageError("a node that only listens cannot send", got=str(frame))
         if len(sender.queue) >= self.queue_frames:
             self._run(now_ns)  # what ended by now no longer takes a place
             if len(sender.queue) >= self.queue_frames:
@@ -229,7 +234,7 @@ class CanBus:
             if self._spoilt(what, frame, start, senders, receivers):
                 return
             receivers = [number for number in receivers if number not in what.seen_by]
-        if receivers or self.monitored or self.instant:
+        if self.monitored or self.instant or any(not self._nodes[number].listen_only for number in receivers):
             self._deliver(frame, start, senders, receivers)
         else:
             self._unacknowledged(frame, start, senders)
@@ -254,7 +259,7 @@ class CanBus:
             return start.winner.frame, same
         outcome = can_verdict.collide(
             {number: heads[number].frame for number in by_age},
-            lambda number: self._nodes[number].faults.flags_are_dominant,
+            lambda number: self._nodes[number].flags_are_dominant,
         )
         frame = heads[outcome.senders[0]].frame
         if outcome.error_bit is not None:
@@ -282,7 +287,7 @@ class CanBus:
         """Whether the disturbance destroyed the frame; if not, some error-passive receivers went without it."""
         victims = what.seen_by & set(receivers)
         at_sender = not what.seen_by or bool(what.seen_by & set(senders))
-        if not at_sender and not any(self._nodes[n].faults.flags_are_dominant for n in victims):
+        if not at_sender and not any(self._nodes[n].flags_are_dominant for n in victims):
             for number in victims:
                 at_ns = start.start_ns + self._duration_ns(bits_to_end(frame))
                 self._change(number, at_ns, partial(self._nodes[number].faults.receive_failed, first=False))
@@ -399,8 +404,7 @@ class CanBus:
         return (
             lone.faults.state is CanErrorState.PASSIVE
             and not lone.left
-            and not self._receivers(start, start.rivals)
-            and all(n in self._off or n == start.rivals[0] or m.left for n, m in self._nodes.items())
+            and all(n in self._off or m is lone or m.left or m.listen_only for n, m in self._nodes.items())
         )
 
     def _skip(self, start: Start, now_ns: int, recovery_ns: int | None) -> bool:

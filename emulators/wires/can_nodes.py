@@ -44,11 +44,17 @@ class Node:
     faults: Confinement = field(default_factory=Confinement)
     hold_ns: int = 0
     left: bool = False
+    listen_only: bool = False
     sent: int = 0
     received: int = 0
     overruns: int = 0
     refused: int = 0
     errors: int = 0
+
+    @property
+    def flags_are_dominant(self) -> bool:
+        """Whether this node's objection destroys a frame."""
+        return self.faults.flags_are_dominant and not self.listen_only
 
     def as_dict(self, number: int, load: float) -> dict[str, Any]:
         """For `CanBus.stats`."""

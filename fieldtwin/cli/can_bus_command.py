@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import signal
+from contextlib import AsyncExitStack
+from typing import Any
 
 import click
 
+from emulators.endpoints.bus_bridge import CanBridge
 from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.can_end import open_can_end
+from emulators.endpoints.slcan_port import SlcanPort
 from fieldtwin.cli.talk import talk
 from gateway.core.endpoint import Endpoint
 
@@ -22,25 +27,71 @@ from gateway.core.endpoint import Endpoint
 )
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), default=125_000, show_default=True, help="bit/s")
 @click.option("--unpaced", is_flag=True, help="Deliver frames at once instead of at the bit rate.")
-def command(listen: str, bitrate: int, unpaced: bool) -> int:
+@click.option("--slcan", metavar="HOST:PORT", help="A second port for programs that speak slcan (LAWICEL).")
+@click.option(
+    "--bridge", metavar="IFACE", help="A kernel interface, vcan0 for one, that is joined with the bus both ways."
+)
+@click.option(
+    "--strict-ack", is_flag=True, help="Only other nodes acknowledge: one that is alone becomes error-passive."
+)
+def command(listen: str, bitrate: int, unpaced: bool, slcan: str | None, bridge: str | None, strict_ack: bool) -> int:
     """Run a CAN bus where the kernel has none.
 
     Frames take their exact time on the modelled bus and arbitrate by identifier. Any python-can program joins with
-    interface `fieldtwin` and channel HOST:PORT, for example `python -m can.logger -i fieldtwin -c 127.0.0.1:29536`.
+    interface `fieldtwin` and channel HOST:PORT, for example `python -m can.logger -i fieldtwin -c 127.0.0.1:29536`; with
+    `--slcan HOST:PORT` others do too, for example `python -m can.logger -i slcan -c socket://HOST:PORT`.
     """
-    return asyncio.run(_run(Endpoint.parse(f"can:fieldtwin/{listen}"), bitrate, paced=not unpaced))
+    endpoint = Endpoint.parse(f"can:fieldtwin/{listen}")
+    ascii_port = Endpoint.parse(f"tcp://{slcan}") if slcan else None
+    kernel = Endpoint.parse(f"can:socketcan/{bridge}") if bridge else None
+    return asyncio.run(_run(endpoint, bitrate, ascii_port, kernel, paced=not unpaced, monitored=not strict_ack))
 
 
-async def _run(endpoint: Endpoint, bitrate: int, *, paced: bool) -> int:
+async def _run(
+    endpoint: Endpoint,
+    bitrate: int,
+    slcan: Endpoint | None,
+    kernel: Endpoint | None,
+    *,
+    paced: bool,
+    monitored: bool,
+) -> int:
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    bus = await SoftBusServer.open(endpoint, bitrate, paced=paced)
-    try:
+    async with AsyncExitStack() as closing:
+        bus = await SoftBusServer.open(endpoint, bitrate, paced=paced, monitored=monitored)
+        closing.push_async_callback(bus.aclose)
+        bridge = await _bridge(bus, kernel, bitrate) if kernel else None
+        if bridge:
+            closing.push_async_callback(bridge.aclose)
         talk.print(f"CAN bus on {bus.bound}, {bitrate} bit/s", soft_wrap=True)
-        await stop.wait()
+        if slcan:
+            port = await SlcanPort.open(bus.runner, slcan)
+            closing.push_async_callback(port.aclose)
+            talk.print("slcan on {}:{}".format(*port.bound), soft_wrap=True)
+        await _until(stop, bridge)
         stats = bus.bus_stats()
-        talk.print(f"{stats['frames']} frames, load {100 * stats['load']:.1f} %")
-    finally:
-        await bus.aclose()
+        talk.print(f"{stats['frames']} frames, load {100 * stats['load']:.1f} %, {stats['error_frames']} errors")
+        if bridge:
+            crossed = ", ".join(f"{count} from {where}" for where, count in bridge.forwarded.items())
+            talk.print(f"bridge: {crossed}; {bridge.lost} lost", soft_wrap=True)
+            if bridge.ended.done():
+                raise bridge.ended.result()
     return 0
+
+
+async def _bridge(bus: SoftBusServer, kernel: Endpoint, bitrate: int) -> CanBridge:
+    outside = await open_can_end(kernel, bitrate)
+    bridge = CanBridge(bus.attach(f"bridge to {kernel.path}"), outside)
+    bridge.start()
+    talk.print(f"joined with {kernel}", soft_wrap=True)
+    return bridge
+
+
+async def _until(stop: asyncio.Event, bridge: CanBridge | None) -> None:
+    """Until somebody stops it, or a bus of the bridge is gone."""
+    stopped = asyncio.ensure_future(stop.wait())
+    waited: list[asyncio.Future[Any]] = [stopped, bridge.ended] if bridge else [stopped]
+    await asyncio.wait(waited, return_when=asyncio.FIRST_COMPLETED)
+    stopped.cancel()

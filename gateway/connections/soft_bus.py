@@ -36,7 +36,8 @@ SEND_BUFFER_BYTES = 8 * 1024
 class SoftBusConnection(CanConnection):
     """One node on a software CAN bus. Make it with `open`.
 
-    Received frames carry the bus's exact end of frame as `t_ns`, on this host's monotonic clock.
+    Received frames carry the bus's exact end of frame as `t_ns`, on this host's monotonic clock. Error frames among them tell of
+    this node's controller (gateway/core/can_error.py).
     """
 
     def __init__(self, endpoint: Endpoint, max_pending: int = 4096) -> None:
@@ -214,6 +215,9 @@ class SoftBus(can.BusABC):
     `can.Notifier` with a loop. Here, at python-can's border, errors are python-can's: `CanInitializationError` when the
     bus cannot be joined, `CanOperationError` when it is gone, `CanTimeoutError` when it takes no more frames.
 
+    Error frames come as from the kernel's interface and in its layout, past all filters: when this node's controller becomes
+    error-passive, bus-off or active again, and when frames for it were lost; with `bus_errors` for each error on the wire too.
+
     A program that asks for its own messages and never receives is held back by the bus.
     """
 
@@ -226,6 +230,7 @@ class SoftBus(can.BusABC):
         receive_own_messages: bool = False,
         timeout: float = OPEN_TIMEOUT_S,
         fd: bool = False,
+        bus_errors: bool = False,
         single_handle: bool = True,  # what python-can's programs pass to every interface; every handle is single here
     ) -> None:
         if fd:
@@ -246,7 +251,7 @@ class SoftBus(can.BusABC):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
             asked_ns = clock.monotonic_ns()
-            self._socket.sendall(ask(bitrate, confirmations=receive_own_messages))
+            self._socket.sendall(ask(bitrate, confirmations=receive_own_messages, violations=bus_errors))
             welcome = read_answer(self._read_answer(), bitrate, f"can:fieldtwin/{channel}")
             offset_ns = welcome.clock_offset_ns(asked_ns, clock.monotonic_ns())
             self._utc_minus_bus_ns = offset_ns + clock.utc_ns() - clock.monotonic_ns()
@@ -288,7 +293,7 @@ class SoftBus(can.BusABC):
             frame, own = unpack_record(record)
         except Desync as e:
             raise can.CanOperationError(str(e)) from e
-        return self._message(frame, own), False
+        return self._message(frame, own), frame.error  # filters are for frames of the bus
 
     def _message(self, frame: CanFrame, own: bool) -> can.Message:
         return can.Message(
@@ -359,7 +364,7 @@ def _frame_of(msg: can.Message) -> CanFrame:
             b"" if msg.is_remote_frame else bytes(msg.data),
             extended=msg.is_extended_id,
             remote=msg.is_remote_frame,
-            dlc=msg.dlc if msg.is_remote_frame else -1,
+            dlc=min(msg.dlc, 8) if msg.is_remote_frame else -1,
         )
     except Desync as e:
         raise can.CanOperationError(str(e)) from e

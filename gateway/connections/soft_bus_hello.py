@@ -16,7 +16,7 @@ from gateway.core.errors import EndpointBusy, Unreachable, UsageError
 _LAYOUT = struct.Struct("!BBBBIQ4sHxx")
 _MARK = 0x80
 _VERSION = 1
-_CONFIRM = 0x01
+_CONFIRM, _ERRORS, _VIOLATIONS = 0x01, 0x02, 0x04
 _MAGIC = b"ftcb"
 
 _WELCOME, _WRONG_BITRATE, _UNKNOWN_VERSION, _FULL = range(4)
@@ -41,9 +41,14 @@ class Welcome:
         return (asked_ns + answered_ns) // 2 - self.bus_ns
 
 
-def ask(bitrate: int, *, confirmations: bool) -> bytes:
-    """The request to join a bus of `bitrate` bit/s (0: any), with or without a confirmation of each own frame."""
-    return _LAYOUT.pack(_MARK, _VERSION, 0, _CONFIRM if confirmations else 0, bitrate, 0, _MAGIC, 0)
+def ask(bitrate: int, *, confirmations: bool, errors: bool = True, violations: bool = False) -> bytes:
+    """The request to join a bus of `bitrate` bit/s (0: any), with or without a confirmation of each own frame.
+
+    `errors`: error frames when the state of this node's controller changes, or frames for it were lost (as a kernel's interface
+    tells); `violations`: one for each error on the wire too (as with ``berr-reporting``).
+    """
+    options = (_CONFIRM if confirmations else 0) | (_ERRORS if errors else 0) | (_VIOLATIONS if violations else 0)
+    return _LAYOUT.pack(_MARK, _VERSION, 0, options, bitrate, 0, _MAGIC, 0)
 
 
 def read_answer(record: bytes, wanted_bitrate: int, where: str) -> Welcome:

@@ -34,10 +34,11 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from plc.program import ScanStuck
+from plc.task import Driven
 
 GUARD_NS = 2 * NS_PER_MS
 POLL_NS = 10 * NS_PER_MS
@@ -166,22 +167,6 @@ class StuckAlarm:
     def _on_alarm(self, number: int, frame: object) -> None:
         if self._armed:
             raise ScanStuck(f"{self._s * 1000:g} ms and no end")
-
-
-class Driven(Protocol):
-    """What is driven: plc.runner.Runner, plc.task.CyclicTask."""
-
-    @property
-    def running(self) -> bool: ...
-
-    @property
-    def deadline_ns(self) -> int: ...
-
-    def start(self) -> None: ...
-
-    def run_once(self) -> None: ...
-
-    def stop(self) -> None: ...
 
 
 def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:

@@ -45,6 +45,22 @@ class Guard(Protocol):
     def disarm(self) -> None: ...
 
 
+class Driven(Protocol):
+    """What is driven: plc.runner.Runner, CyclicTask."""
+
+    @property
+    def running(self) -> bool: ...
+
+    @property
+    def deadline_ns(self) -> int: ...
+
+    def start(self) -> None: ...
+
+    def run_once(self) -> None: ...
+
+    def stop(self) -> None: ...
+
+
 class TaskState(Enum):
     READY = "ready"
     RUNNING = "running"
@@ -194,7 +210,7 @@ class CyclicTask:
         }
 
 
-async def run_on_clock(task: CyclicTask, clock: Clock) -> None:
+async def run_on_clock(task: Driven, clock: Clock) -> None:
     """Drive `task` in the running loop until it is stopped: what a virtual clock does. Cancelling it makes outputs safe."""
     task.start()
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -187,3 +188,8 @@ def test_a_relay_that_is_wrong_is_found_out(broken: type[Watched], invariant: st
     result = prove(replace(PROOF, make=broken))
     assert result.broken.startswith(invariant)
     assert result.way
+
+
+def test_the_drawing_in_the_docs_is_that_of_the_table() -> None:
+    drawn = (Path(__file__).parents[2] / "docs/relay.svg").read_text(encoding="utf-8")
+    assert drawn == svg(Relay.table, "observatory: relay"), "fieldtwin plc diagram observatory -o docs/relay.svg"

@@ -1,33 +1,21 @@
 """What a node notices of its own CAN controller: error-passive, bus-off, overrun, and another node on its identifiers.
 
 EMCY codes after CiA 301 v4.2, table 26: 8110h overrun, 8120h error-passive, 8140h recovered from bus-off, 8150h collision of
-identifiers. In bus-off a node can say nothing, so that 8140h is told afterwards. Error frames are read as Linux hands them
-out (linux/can/error.h).
+identifiers. In bus-off a node can say nothing, so that 8140h is told afterwards.
 """
 
 from __future__ import annotations
-
-from enum import Enum
 
 from emulators.canopen import emcy
 from emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
 from emulators.canopen.sdo_channels import RESPONSE
 from emulators.canopen.service import Core, Service
+from gateway.core.can_error import CanErrorState, tells_overrun, told_state
 from gateway.core.canframe import CanFrame
 
 OVERRUN, PASSIVE, RECOVERED, COLLISION = 0x8110, 0x8120, 0x8140, 0x8150
 
-_CONTROLLER, _BUS_OFF, _RESTARTED = 0x04, 0x40, 0x100
-_RX_OVERFLOW, _ANY_PASSIVE, _ACTIVE = 0x01, 0x30, 0x40
 _MUTE = "bus-off"
-
-
-class BusState(Enum):
-    """The fault confinement states of ISO 11898-1."""
-
-    ERROR_ACTIVE = "error-active"
-    ERROR_PASSIVE = "error-passive"
-    BUS_OFF = "bus-off"
 
 
 class BusFaults(Service):
@@ -37,28 +25,29 @@ class BusFaults(Service):
         self._core = core
         self._emergency = emergency
         self._react = react
-        self.state = BusState.ERROR_ACTIVE
+        self.state = CanErrorState.ACTIVE
 
     def reset(self, now_ns: int) -> None:
         """What the controller is stays what it is; an error that goes on is told anew."""
-        if self.state is BusState.ERROR_PASSIVE:
+        if self.state is CanErrorState.PASSIVE:
             self._raise(PASSIVE, now_ns)
 
-    def changed(self, state: BusState, now_ns: int) -> None:
-        """The controller's state, told when it changes; told twice it means nothing."""
+    def changed(self, state: CanErrorState, now_ns: int) -> None:
+        """The controller's state, told when it changes; told twice it means nothing, and a warning is no state of its own."""
+        state = CanErrorState.ACTIVE if state is CanErrorState.WARNING else state
         before, self.state = self.state, state
         if state is before:
             return
-        if state is BusState.BUS_OFF:
+        if state is CanErrorState.BUS_OFF:
             self._core.mutes.add(_MUTE)
             self._react(now_ns)
             return
         self._core.mutes.discard(_MUTE)
-        if state is BusState.ERROR_ACTIVE:
+        if state is CanErrorState.ACTIVE:
             self._emergency.clear_error(PASSIVE, now_ns)
-        if before is BusState.BUS_OFF:
+        if before is CanErrorState.BUS_OFF:
             self._emergency.report(RECOVERED, now_ns, register=emcy.COMMUNICATION)
-        if state is BusState.ERROR_PASSIVE:
+        if state is CanErrorState.PASSIVE:
             self._raise(PASSIVE, now_ns)
 
     def overrun(self, now_ns: int) -> None:
@@ -75,19 +64,12 @@ class BusFaults(Service):
         return True
 
     def on_error_frame(self, frame: CanFrame, now_ns: int) -> None:
-        """An error frame of the kernel's (or of a bus that speaks its language)."""
-        if frame.can_id & _BUS_OFF:
-            self.changed(BusState.BUS_OFF, now_ns)
-        if frame.can_id & _RESTARTED:
-            self.changed(BusState.ERROR_ACTIVE, now_ns)
-        if frame.can_id & _CONTROLLER and len(frame.data) > 1:
-            what = frame.data[1]
-            if what & _RX_OVERFLOW:
-                self.overrun(now_ns)
-            if what & _ANY_PASSIVE:
-                self.changed(BusState.ERROR_PASSIVE, now_ns)
-            elif what & _ACTIVE:
-                self.changed(BusState.ERROR_ACTIVE, now_ns)
+        """An error frame of the node's own controller: the kernel's, or the software bus's."""
+        if tells_overrun(frame):
+            self.overrun(now_ns)
+        state = told_state(frame)
+        if state is not None:
+            self.changed(state, now_ns)
 
     def _raise(self, code: int, now_ns: int) -> None:
         self._emergency.raise_error(code, now_ns, register=emcy.COMMUNICATION)

@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from emulators.canopen.aborts import Abort
 from emulators.canopen.acceptance import Acceptance
 from emulators.canopen.behaviour import Behaviour, DeviceModel
-from emulators.canopen.bus_faults import BusFaults, BusState
+from emulators.canopen.bus_faults import BusFaults
 from emulators.canopen.client_view import ClientView
 from emulators.canopen.dictionary import Dictionary, Key
 from emulators.canopen.emcy import GENERIC, Emergency
@@ -38,6 +38,7 @@ from emulators.canopen.storage import Storage
 from emulators.canopen.sync import Sync
 from emulators.canopen.time_of_day import TimeOfDay, TimeService
 from emulators.canopen.tpdo import Tpdos
+from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import UsageError
@@ -206,7 +207,7 @@ class CanopenNode:
             self._run_due(now_ns)
         return self._core.take_output()
 
-    def bus_state(self, state: BusState, now_ns: int) -> list[CanFrame]:
+    def bus_state(self, state: CanErrorState, now_ns: int) -> list[CanFrame]:
         """The CAN controller's state changed: error-passive is EMCY 8120h, bus-off is silence and 8140h after it."""
         if self._powered:
             self._faults.changed(state, now_ns)

@@ -10,11 +10,11 @@ from typing import Any
 from canopen_slave_rig import NODE, RICH
 
 from emulators.canopen.aborts import Abort
-from emulators.canopen.bus_faults import BusState
 from emulators.canopen.dictionary import parse_eds
 from emulators.canopen.lss import LssStore
 from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.canopen.time_of_day import TimeOfDay
+from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS
 
@@ -88,8 +88,8 @@ def parse_frame(text: str) -> CanFrame:
 def happen(node: CanopenNode, event: str, now_ns: int) -> list[CanFrame]:
     """An event of the device: ``!bus-off``, ``!error 5000``, ``!set 2002:00 3412``..."""
     name, *words = event.removeprefix("!").split()
-    if name in (state.value for state in BusState):
-        return node.bus_state(BusState(name), now_ns)
+    if name in (state.value for state in CanErrorState):
+        return node.bus_state(CanErrorState(name), now_ns)
     if name == "overrun":
         return node.overrun(now_ns)
     if name == "error":

@@ -1,0 +1,126 @@
+"""What nodes on the software CAN bus are told of their controllers, at each kind of end."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import can
+from support import eventually, run
+
+from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.can_end import open_can_end
+from emulators.wires.can_faults import Disturbance, spoil
+from gateway.connections.soft_bus import SoftBus, SoftBusConnection
+from gateway.core.can_error import CanErrorState, tells_overrun, told_state
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import CanConnection
+from gateway.core.endpoint import Endpoint
+
+ANY_PORT = Endpoint.parse("can:fieldtwin/127.0.0.1:0")
+WARNING, PASSIVE, BUS_OFF = CanErrorState.WARNING, CanErrorState.PASSIVE, CanErrorState.BUS_OFF
+ACTIVE = CanErrorState.ACTIVE
+
+
+@asynccontextmanager
+async def bus(bitrate: int = 1_000_000, **options: object) -> AsyncIterator[SoftBusServer]:
+    server = await SoftBusServer.open(ANY_PORT, bitrate, **options)  # type: ignore[arg-type]
+    try:
+        yield server
+    finally:
+        await server.aclose()
+
+
+async def ends(server: SoftBusServer) -> list[CanConnection]:
+    return [
+        await SoftBusConnection.open(server.bound, 0),
+        await open_can_end(server.bound, 0),
+        server.attach("attached"),
+    ]
+
+
+def test_every_kind_of_end_is_told_of_its_own_controller_and_of_no_other() -> None:
+    async def main() -> None:
+        async with bus() as server:
+            all_ends = await ends(server)
+            for sender in all_ends:
+                rule = spoil(Disturbance(at_bit=3), times=32)
+                server.disturb(rule)
+                await sender.send(CanFrame(0x123))
+                told = [await sender.recv() for _ in range(4)]
+                assert [told_state(f) for f in told] == [WARNING, PASSIVE, BUS_OFF, ACTIVE]
+                assert [f.can_id & 0x140 for f in told] == [0, 0, 0x40, 0x100]
+                assert [f.data[6] for f in told] == [96, 128, 255, 0]  # TEC
+                assert [f.t_ns for f in told] == sorted(f.t_ns for f in told)
+                for other in all_ends:
+                    if other is not sender:
+                        assert str(await other.recv()) == "123#"
+                server.undisturb(rule)
+            assert not any(end.inbound.data_stream for end in all_ends)
+            for end in all_ends:
+                await end.aclose()
+
+    run(main())
+
+
+def test_python_can_is_told_as_a_kernel_tells_and_of_each_error_when_it_asks() -> None:
+    def program(channel: str) -> list[tuple[int, int, int]]:
+        filters = [{"can_id": 0x7FF, "can_mask": 0x7FF}]
+        with SoftBus(channel, filters, bus_errors=True) as own:
+            own.send(can.Message(arbitration_id=0x7FF, is_extended_id=False), 5.0)
+            told = []
+            while len(told) < 34:
+                message = own.recv(5.0)
+                assert message is not None
+                assert message.is_error_frame
+                told.append((message.arbitration_id, message.data[1], message.data[2]))
+            return told
+
+    async def main() -> None:
+        async with bus() as server:
+            server.disturb(spoil(Disturbance(at_bit=3), times=32))
+            told = await asyncio.to_thread(program, str(server.bound).removeprefix("can:fieldtwin/"))
+            violation = (0x288, 0, 0x01)  # protocol violation, bus error, counters; a bit error
+            assert told.count(violation) == 32
+            # After the 12th, the 16th and the 32nd of them.
+            assert [(i, *t) for i, t in enumerate(told) if t != violation] == [
+                (12, 0x204, 0x08, 0), (17, 0x204, 0x20, 0)
+            ]  # fmt: skip
+
+    run(main())
+
+
+def test_a_node_that_is_too_slow_is_told_once_it_reads() -> None:
+    async def main() -> None:
+        async with bus(paced=False) as server:
+            sender = server.attach("sender")
+            slow = server.attach("slow", max_pending=10)
+            for i in range(15):
+                await sender.send(CanFrame(i))
+            await eventually(lambda: slow.overruns == 5)
+            got = [await slow.recv() for _ in range(11)]
+            assert [f.can_id for f in got[:10]] == list(range(10))
+            assert tells_overrun(got[10])
+            assert not slow.inbound.data_stream
+            assert server.bus_stats()["overruns"] == 5
+            for end in (sender, slow):
+                await end.aclose()
+
+    run(main())
+
+
+def test_alone_on_a_bus_that_nobody_watches() -> None:
+    async def main() -> None:
+        async with bus(monitored=False) as server:
+            alone = await open_can_end(server.bound, 0)
+            await alone.send(CanFrame(0x705, b"\0"))
+            assert [told_state(await alone.recv()) for _ in range(2)] == [WARNING, PASSIVE]
+            await eventually(lambda: server.bus_stats()["nodes"][0]["state"] == "error-passive")
+            late = await open_can_end(server.bound, 0)
+            assert str(await late.recv()) == "705#00"  # sent until somebody took it
+            assert told_state(await alone.recv()) is WARNING  # 127
+            for end in (late, alone):
+                await end.aclose()
+
+    run(main())

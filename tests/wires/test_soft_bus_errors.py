@@ -66,10 +66,9 @@ def test_every_kind_of_end_is_told_of_its_own_controller_and_of_no_other() -> No
 
 def test_python_can_is_told_as_a_kernel_tells_and_of_each_error_when_it_asks() -> None:
     def program(channel: str) -> list[tuple[int, int, int]]:
-        filters = [{"can_id": 0x7FF, "can_mask": 0x7FF}]
-        with SoftBus(channel, filters, bus_errors=True) as own:
+        with SoftBus(channel, [{"can_id": 0x7FF, "can_mask": 0x7FF}], bus_errors=True) as own:
             own.send(can.Message(arbitration_id=0x7FF, is_extended_id=False), 5.0)
-            told = []
+            told: list[tuple[int, int, int]] = []
             while len(told) < 34:
                 message = own.recv(5.0)
                 assert message is not None

@@ -125,8 +125,63 @@ def serve_libmodbus(job: dict[str, Any]) -> None:
             return
 
 
+def serve_pymodbustcp(job: dict[str, Any]) -> None:
+    from pyModbusTCP.server import DataBank, ModbusServer
+
+    bank = DataBank(coils_size=COILS, d_inputs_size=16, h_regs_size=HOLDING, i_regs_size=INPUTS)
+    bank.set_holding_registers(0, [HELD.get(i, 0) for i in range(HOLDING)])
+    bank.set_input_registers(0, [0x4120])
+    server = ModbusServer("127.0.0.1", 0, no_block=True, data_bank=bank)
+    server.start()
+    say(job["row"], server._service.socket.getsockname()[1])
+    signal.pause()
+
+
+def serve_umodbus(job: dict[str, Any]) -> None:
+    from umodbus import conf
+
+    conf.SIGNED_VALUES = False
+    tables = [dict.fromkeys(range(n), 0) for n in (COILS, 16, HOLDING, INPUTS)]
+    tables[2].update(HELD)
+    tables[3][0] = 0x4120
+    if job["wire"] == "mbap":
+        from socketserver import TCPServer
+
+        from umodbus.server.tcp import RequestHandler
+        from umodbus.server.tcp import get_server as tcp_server
+
+        server = tcp_server(TCPServer, ("127.0.0.1", 0), RequestHandler)
+        port = server.socket.getsockname()[1]
+    else:
+        import serial
+        from umodbus.server.serial import get_server as serial_server
+        from umodbus.server.serial.rtu import RTUServer
+
+        server, port = serial_server(RTUServer, serial.Serial(job["line"], BAUD_RATE)), 0
+    for reads, writes, cells in zip(([1], [2], [3], [4]), ([5, 15], [], [6, 16], []), tables, strict=True):
+
+        def read(slave_id: int, function_code: int, address: int, cells: dict[int, int] = cells) -> int:
+            return cells[address]
+
+        def write(slave_id: int, function_code: int, address: int, value: int, cells: dict[int, int] = cells) -> None:
+            cells[address] = value
+
+        server.route([1], reads, list(cells))(read)
+        server.route([1], writes, list(cells))(write)
+    say(job["row"], port)
+    server.serve_forever(poll_interval=0.05)  # also how long it waits for the rest of a frame on a line
+
+
+SERVERS: dict[str, Callable[[dict[str, Any]], None]] = {
+    "libmodbus": serve_libmodbus,
+    "pyModbusTCP": serve_pymodbustcp,
+    "pymodbus": serve_pymodbus,
+    "umodbus": serve_umodbus,
+}
+
+
 def main() -> None:
-    serve: Callable[[dict[str, Any]], None] = {"pymodbus": serve_pymodbus, "libmodbus": serve_libmodbus}[sys.argv[1]]
+    serve = SERVERS[sys.argv[1]]
     if serve is serve_pymodbus:  # once for all children
         import pymodbus.server
         import pymodbus.simulator  # noqa: F401

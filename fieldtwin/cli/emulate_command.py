@@ -33,7 +33,13 @@ from twin.data_files import data_root, find
     default=None,
     help="For a CANopen device: bit/s of the software bus; default 125000 where none is there yet.",
 )
-@click.option("--recording", "recordings", multiple=True, metavar="[DEVICE=]FILE", help="Play this recording.")
+@click.option(
+    "--recording",
+    "recordings",
+    multiple=True,
+    metavar="[DEVICE=]FILE",
+    help="Play this recording; for a data sheet: a log of candump -L.",
+)
 @click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
 @click.option(
     "--prototype-file", type=click.Path(exists=True, dir_okay=False), help="For a system: another prototype file."
@@ -110,13 +116,12 @@ def command(
     if len(recordings) > 1:
         raise UsageError("one device plays one recording")
     if kind == "data sheet":
-        if recordings or unit is not None:
-            raise UsageError(
-                "a data sheet alone has neither a recording nor a unit id", hint="--node, or a device profile for it"
-            )
+        if unit is not None:
+            raise UsageError("a data sheet has no unit id", hint="--node")
         from fieldtwin.running.data_sheet_here import run_data_sheet
 
-        return run_loop(run_data_sheet(path, endpoints, node, bitrate))
+        log = Path(recordings[0]) if recordings else None
+        return run_loop(run_data_sheet(path, endpoints, node, bitrate, log))
     if unit is not None and node is not None:
         raise UsageError("a device has a unit id or a node id, not both")
     unit = node if unit is None else unit

@@ -10,11 +10,14 @@ from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.canopen.serve import serve_node
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.models.by_profile import model_for
+from emulators.replay.can_log import read_can_log
+from emulators.replay.objects import RecordedObjects
 from fieldtwin.cli.talk import talk
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.until_stopped import until_stopped
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 
@@ -22,20 +25,20 @@ DEFAULT_NODE_ID = 1
 
 
 async def run_data_sheet(
-    path: Path, endpoints: tuple[str, ...], node_id: int | None, bitrate: int | None = None
+    path: Path, endpoints: tuple[str, ...], node_id: int | None, bitrate: int | None = None, log: Path | None = None
 ) -> int:
     """Serve until SIGINT or SIGTERM; raises what ends the serving before. What was mended in the file is said first.
 
     The node id is `node_id`, else what a DCF commissions, else 1; the bit rate of a bus that is made here `bitrate`, else that
-    of the DCF, else 125 kbit/s. Raises `FileInvalid` for a file that cannot be used, `UsageError` for endpoints that are not
-    one bus.
+    of the DCF, else 125 kbit/s. `log` is what candump -L wrote of such a node, to be held again. Raises `FileInvalid` for a
+    file that cannot be used, `UsageError` for endpoints that are not one bus and for a log that holds nothing of the node.
     """
     dictionary = load_eds(path)
     for note in dictionary.notes:
         talk.print(f"{path.name}, {note}", soft_wrap=True)
     wires = [Endpoint.parse(url) for url in endpoints]
     wire = only_bus(wires)
-    node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID)
+    node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log)
     closing: list[SoftBusServer | CanConnection] = []
     try:
         async with Nursery() as nursery:  # inside: who serves is stopped before what it serves on is closed
@@ -49,8 +52,18 @@ async def run_data_sheet(
     return 0
 
 
-def _node(dictionary: Dictionary, node_id: int) -> CanopenNode:
-    """With the model of the device profile that 1000h names, where there is one."""
+def _node(dictionary: Dictionary, node_id: int, log: Path | None) -> CanopenNode:
+    """With what was recorded of it, and the model of the device profile that 1000h names, where there are such."""
+    if log is not None:
+        try:
+            text = log.read_text(encoding="ascii", errors="replace")
+        except OSError as e:
+            raise FileInvalid("the log cannot be read", path=str(log), got=e.strerror or str(e)) from e
+        played = RecordedObjects(read_can_log(text.splitlines(), str(log)), dictionary, node_id)
+        if not played.initial:
+            raise UsageError(f"the log holds nothing of node {node_id}", where=str(log), hint="--node")
+        context = NodeContext(source=played, factory=played.initial, model=model_for(dictionary))
+        return CanopenNode(dictionary, node_id, context)
     return CanopenNode(dictionary, node_id, NodeContext(model=model_for(dictionary)))
 
 

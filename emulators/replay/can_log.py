@@ -1,0 +1,38 @@
+"""A CAN log as candump writes it with -L: ``(1436509052.249713) can0 585#4B06200034120000``. Text in, frames with times out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+
+from gateway.core.canframe import CanFrame
+from gateway.core.errors import FileInvalid
+
+_LINE = re.compile(
+    r"\((\d+\.\d+)\)\s+\S+\s+([0-9A-F]{3}|[0-9A-F]{8})#(R[0-8]?|(?:[0-9A-F]{2}){0,8})(?:\s+[RT])?", re.IGNORECASE
+)
+_ERROR = 0x20000000
+
+
+def read_can_log(lines: Iterable[str], path: str = "") -> Iterator[tuple[float, CanFrame]]:
+    """Seconds as the log has them, and the frame; error frames are left out. Raises `FileInvalid` with the line."""
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        found = _LINE.fullmatch(line.strip())
+        if found is None:
+            raise FileInvalid(
+                "not a line of a CAN log",
+                path=path,
+                line=number,
+                expected="(SECONDS) NAME ID#DATA",
+                got=line.strip()[:60],
+            )
+        identifier, body = int(found[2], 16), found[3]
+        if identifier & _ERROR:
+            continue
+        if body[:1] in "Rr" and body:
+            frame = CanFrame(identifier, extended=len(found[2]) > 3, remote=True, dlc=int(body[1:] or "0"))
+        else:
+            frame = CanFrame(identifier, bytes.fromhex(body), extended=len(found[2]) > 3)
+        yield float(found[1]), frame

@@ -114,3 +114,8 @@ def test_the_key_orders_as_the_arbitration_fields_do(a: CanFrame, b: CanFrame) -
         return plain_bits(frame)[1 : 33 if frame.extended else 14].ljust(32, "0")
 
     assert (field(a) < field(b)) == (arbitration_key(a) < arbitration_key(b))
+
+
+@given(frames())
+def test_lengths_by_tables_are_those_of_the_bits(frame: CanFrame) -> None:
+    assert bits_to_end(frame) == len(stuff(plain_bits(frame))) + 10

@@ -276,7 +276,7 @@ def test_mb_028_a_broadcast_is_answered_where_that_is_wanted_and_only_when_it_we
         async with rig(tmp_path, config) as r, r.raw() as raw:
             await raw.write(bytes.fromhex("0001 0000 0009 00 10 0005 0001 02 4321"))
             assert await take(raw, 12) == bytes.fromhex("0001 0000 0006 00 10 0005 0001")
-            assert r.units[2].bank.read("holding", 5, 1, 0) == [0x4321]
+            await eventually(lambda: r.units[2].bank.read("holding", 5, 1, 0) == [0x4321])  # it went out; it arrives
         blocked = rig(tmp_path / "again", config, blocked=lambda bus, unit: "held")
         (tmp_path / "again").mkdir()
         async with blocked as r, r.raw() as raw:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 
 from gateway.core.connection import CanConnection
-from gateway.core.errors import ConnectionLost, WireError
+from gateway.core.errors import FieldtwinError, WireError
 
 
 class CanBridge:
@@ -22,7 +22,7 @@ class CanBridge:
         self._ends = (one, other)
         self._refused = 0
         self._tasks: list[asyncio.Task[None]] = []
-        self.ended: asyncio.Future[ConnectionLost] = asyncio.get_running_loop().create_future()
+        self.ended: asyncio.Future[FieldtwinError] = asyncio.get_running_loop().create_future()
 
     def start(self) -> None:
         """Forward from now on."""
@@ -59,6 +59,6 @@ class CanBridge:
                     self._refused += 1  # a transmit queue that stays full; the next one may fit
                 else:
                     self.forwarded[where] += 1
-        except ConnectionLost as e:
+        except FieldtwinError as e:
             if not self.ended.done():
                 self.ended.set_result(e)

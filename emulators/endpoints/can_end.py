@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
+import socket
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +36,7 @@ CLOSE_TIMEOUT_S = 1.0
 TX_FULL_TIMEOUT_S = 2.0
 TX_RETRY_S = 0.005
 FRAMES_PER_TURN = 256
+RECEIVE_BUFFER_BYTES = 4 << 20
 ARPHRD_CAN = "280"  # include/uapi/linux/if_arp.h
 
 
@@ -204,6 +207,7 @@ class KernelCanEnd(TellsOverrun):
         self._bus = bus
         self._loop = asyncio.get_running_loop()
         self._order = asyncio.Lock()
+        _enlarge(bus.fileno())
         self._loop.add_reader(bus.fileno(), self._read_some)
 
     async def send(self, frame: CanFrame) -> None:
@@ -260,3 +264,9 @@ class KernelCanEnd(TellsOverrun):
             self._loop.remove_reader(self._bus.fileno())
             self._bus.shutdown()
         self.feed_lost(reason)
+
+
+def _enlarge(descriptor: int) -> None:
+    """A larger receive buffer, as far as the kernel allows: the usual one holds some hundred frames."""
+    with socket.socket(fileno=os.dup(descriptor)) as can_socket:
+        can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import socket
 
 import can
@@ -22,6 +23,8 @@ from gateway.wallclock import WallClock
 
 FRAMES_PER_TURN = 256
 """Frames taken from the kernel before the loop serves others; what is left keeps the descriptor readable."""
+
+RECEIVE_BUFFER_BYTES = 4 << 20
 
 FIRST_BACKOFF_S, LAST_BACKOFF_S = 0.001, 0.05
 SEND_TIMEOUT_S = 2.0
@@ -44,6 +47,7 @@ class SocketCanConnection(CanConnection):
         self._clock = WallClock()
         self._turn = asyncio.Lock()  # keeps the order of concurrent senders, through back-off too
         self._loop = asyncio.get_running_loop()
+        _enlarge(bus.fileno())
         self._loop.add_reader(bus.fileno(), self._on_readable)
 
     @classmethod
@@ -190,3 +194,9 @@ def _unreachable(endpoint: Endpoint, error: Exception) -> Unreachable:
 
 def _up(endpoint: Endpoint) -> str:
     return f"ip link set {endpoint.path} up"
+
+
+def _enlarge(descriptor: int) -> None:
+    """A larger receive buffer, as far as the kernel allows: the usual one holds some hundred frames."""
+    with socket.socket(fileno=os.dup(descriptor)) as can_socket:
+        can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)

@@ -54,6 +54,17 @@ def test_a_frame_on_the_wire_is_not_interrupted() -> None:
     assert done[1].start_ns == 400 * US
 
 
+def test_who_comes_before_the_start_takes_part_whoever_has_looked() -> None:
+    bus = CanBus(125_000)
+    a, b = bus.join(0), bus.join(0)
+    bus.submit(a, ONE, 0)
+    bus.submit(a, CanFrame(0x300), 0)
+    assert keys(bus.advance(380 * US)) == [0x001]
+    assert bus.next_event_ns() is not None  # 300h, from 400 us on, as things stand
+    bus.submit(b, ZERO, 400 * US)
+    assert keys(bus.advance(END)) == [0x000, 0x300]
+
+
 def test_a_frame_waits_no_longer_than_it_must() -> None:
     bus = CanBus(125_000)
     a = bus.join(0)

@@ -23,15 +23,22 @@ def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
     if not sys.platform.startswith("linux"):
         return
 
+    libc = ctypes.CDLL(None, use_errno=True)
+    if linger_s <= 0:  # no timer: the PLC's own use of it would be lost
+        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        if os.getppid() != parent:  # it died before we asked
+            os.kill(os.getpid(), signal.SIGTERM)
+        return
+
     def parent_ended(number: int, frame: object) -> None:
-        signal.setitimer(signal.ITIMER_REAL, max(linger_s, 0.001))
+        signal.setitimer(signal.ITIMER_REAL, linger_s)
 
     def linger_over(number: int, frame: object) -> None:
         os.kill(os.getpid(), signal.SIGTERM)
 
     signal.signal(signal.SIGHUP, parent_ended)
     signal.signal(signal.SIGALRM, linger_over)
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGHUP, 0, 0, 0)
+    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGHUP, 0, 0, 0)
     if os.getppid() != parent:  # it died before we asked
         os.kill(os.getpid(), signal.SIGHUP)
 

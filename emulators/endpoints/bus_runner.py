@@ -80,6 +80,7 @@ class BusRunner:
         self._ports: dict[int, BusPort] = {}
         self._timer: asyncio.TimerHandle | asyncio.Handle | None = None
         self._due_ns = 0
+        self._pumping = False
         self._closed: FieldtwinError | None = None
 
     @property
@@ -109,11 +110,23 @@ class BusRunner:
             self._bus.leave(node, self.now_ns())
             self._schedule()
 
-    def submit(self, node: int, frame: CanFrame) -> bool:
-        """Queue a frame; False while the node's transmit queue is full: try again after `on_confirmed`."""
+    def submit(self, node: int, frame: CanFrame, *, more: bool = False) -> bool:
+        """Queue a frame; False while the node's transmit queue is full: try again after `on_confirmed`.
+
+        With `more` the caller has further ones, and calls `settle` after the last.
+        """
         taken = self._bus.submit(node, frame, self.now_ns())
-        self._schedule()
+        if not more:
+            self._schedule()
         return taken
+
+    def settle(self) -> None:
+        """All that a port had at this moment is submitted. Where frames take no time they go out now."""
+        if self._bus.instant and not self._pumping and self._timer is None and self._closed is None:
+            self._due_ns = self.now_ns()
+            self._pump()
+        else:
+            self._schedule()
 
     def disturb(self, rule: Rule) -> None:
         """Spoil attempts to send as `rule` says (`can_faults.spoil` makes one)."""
@@ -158,6 +171,14 @@ class BusRunner:
 
     def _pump(self) -> None:
         self._timer = None
+        self._pumping = True
+        try:
+            self._hand_out()
+        finally:
+            self._pumping = False
+        self._schedule()
+
+    def _hand_out(self) -> None:
         # The loop may fire a timer one clock resolution early; the frame's end is reached then all the same.
         deliveries = self._bus.advance(max(self.now_ns(), self._due_ns))
         told = self._told()
@@ -178,7 +199,6 @@ class BusRunner:
             self._tell(told.popleft(), touched)
         for port in touched.values():
             port.on_settled()
-        self._schedule()
 
     def _told(self) -> deque[_Told]:
         """What controllers have to tell since the last time, in its order."""

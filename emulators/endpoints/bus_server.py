@@ -247,19 +247,22 @@ class _Client(asyncio.Protocol):
             taken += RECORD_SIZE
         del self._inbound[:taken]
         if self._transport.is_closing():
+            self._runner.settle()
             return
         if blocked and self._reading:
             self._transport.pause_reading()
         elif not blocked and not self._reading:
             self._transport.resume_reading()
         self._reading = not blocked
+        if taken:
+            self._runner.settle()
 
     def _submit(self, record: bytes) -> bool:
         try:
             frame, confirmed = unpack_record(record)
             if confirmed:
                 raise Desync("a confirmation from a node", got=str(frame))
-            return self._runner.submit(self._node, frame)
+            return self._runner.submit(self._node, frame, more=True)
         except (Desync, UsageError):  # not our protocol, or an error frame: nothing after it can be trusted
             self._turn_away()
             return True

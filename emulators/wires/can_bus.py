@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -212,7 +211,9 @@ class CanBus:
             contenders = [number for ready_ns, number in heads if ready_ns <= start_ns]
             winner = min((self._waiting[n].queue[0] for n in contenders), key=lambda p: (p.key, p.sequence))
             rivals = [n for n in contenders if self._waiting[n].queue[0].key == winner.key]
-            longest = max(bits_to_end(self._waiting[n].queue[0].frame) for n in rivals)  # of a collision, any may stay
+            longest = bits_to_end(winner.frame)
+            if len(rivals) > 1:  # of a collision, any may stay
+                longest = max(bits_to_end(self._waiting[n].queue[0].frame) for n in rivals)
             end_ns = start_ns + self._duration_ns(longest)
             self._next = Start(start_ns, end_ns, winner, rivals)
         return self._next
@@ -336,7 +337,8 @@ class CanBus:
         end_ns = start.start_ns + self._duration_ns(bits_to_end(frame))
         self._pass(start.start_ns, bits)
         self._load.count(frame, bits, end_ns, tuple(senders), whole=True)
-        self._done.append(Delivery(replace(frame, t_ns=end_ns), start.start_ns, bits, tuple(senders), tuple(receivers)))
+        ended = CanFrame(frame.can_id, frame.data, frame.extended, frame.remote, dlc=frame.dlc, t_ns=end_ns)
+        self._done.append(Delivery(ended, start.start_ns, bits, tuple(senders), tuple(receivers)))
         for number in receivers:
             node = self._nodes[number]
             node.received += 1

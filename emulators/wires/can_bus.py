@@ -241,11 +241,9 @@ class CanBus:
             self._unacknowledged(frame, start, senders)
 
     def _receivers(self, start: Start, but: Collection[int]) -> list[int]:
-        return [
-            number
-            for number, node in self._nodes.items()
-            if number not in but and not node.left and node.joined_ns <= start.start_ns and number not in self._off
-        ]
+        since_ns = start.start_ns
+        there = [n for n, node in self._nodes.items() if n not in but and not node.left and node.joined_ns <= since_ns]
+        return [number for number in there if number not in self._off] if self._off else there
 
     def _contend(self, start: Start) -> tuple[CanFrame, list[int]] | None:
         """Several nodes won the arbitration together. The frame that stays and who sends it; None: it came to an error."""

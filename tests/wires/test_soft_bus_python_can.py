@@ -128,6 +128,21 @@ def test_filters() -> None:
     run(main())
 
 
+def test_periodic_sending_until_it_is_stopped() -> None:
+    async def main() -> None:
+        async with bus() as server:
+            a, other = await join(server), server.attach("other")
+            task = a.send_periodic(can.Message(arbitration_id=0x80, is_extended_id=False), 0.01)
+            times = [(await other.recv()).t_ns for _ in range(20)]
+            task.stop()
+            assert times == sorted(times)
+            assert (times[-1] - times[0]) / 1e9 > 0.1  # 19 periods; a loaded computer stretches them, and never hurries
+            await leave(a)
+            await other.aclose()
+
+    run(main())
+
+
 def test_error_frames_and_records_cut_anywhere() -> None:
     error = CanFrame(0x4, b"\0\x20" + bytes(6), error=True, t_ns=1)
     frames = [error, CanFrame(0x12, b"x", t_ns=2)]

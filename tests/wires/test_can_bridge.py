@@ -279,3 +279,34 @@ class TestVcan:
                 await soft.aclose()
 
         run(main(), 200)
+
+    @pytest.mark.skipif(not (shutil.which("slcand") and shutil.which("socat")), reason="needs can-utils and socat")
+    def test_slcand_makes_an_interface_of_the_slcan_port(self, tmp_path: Path) -> None:
+        async def main() -> None:
+            async with command("--bitrate", "1000000", "--slcan", "127.0.0.1:0") as (_, told):
+                soft = await open_can_end(Endpoint.parse(f"can:fieldtwin/{told['CAN bus']}"), 0)
+                link = tmp_path / "tty"
+                socat = await asyncio.create_subprocess_exec(
+                    "socat", f"pty,raw,echo=0,link={link}", f"tcp:{told['slcan']},nodelay"
+                )
+                await eventually(link.exists, 20)
+                slcand = await asyncio.create_subprocess_exec(
+                    "slcand", "-F", "-o", "-c", "-s8", link.readlink(), "slcan9"
+                )
+                await eventually(lambda: Path("/sys/class/net/slcan9").exists(), 20)
+                up = await asyncio.create_subprocess_exec("ip", "link", "set", "slcan9", "up")
+                assert await up.wait() == 0
+                kernel = await SocketCanConnection.open(Endpoint.parse("can:socketcan/slcan9"), 0)
+                for sender, receiver in ((soft, kernel), (kernel, soft)):
+                    for frame in KINDS:
+                        await sender.send(frame)
+                    assert [(await receiver.recv()).key() for _ in KINDS] == [f.key() for f in KINDS]
+                    await cross(sender, receiver, 200, ahead=5)
+                for end in (soft, kernel):
+                    await end.aclose()
+                slcand.terminate()
+                await slcand.wait()
+                socat.terminate()
+                await socat.wait()
+
+        run(main(), 120)

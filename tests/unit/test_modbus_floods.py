@@ -1,0 +1,100 @@
+"""100 MB of garbage through every receiver of Modbus: what they keep is a frame or two, and a request behind it is heard.
+
+Garbage that each gets rid of fast enough for a default run; slower kinds, a MB each, stand in test_slave_flood.py and in
+test_modbus_properties.py, where the master's framers have their 100 MB.
+"""
+
+from __future__ import annotations
+
+import random
+import resource
+from collections.abc import Callable
+
+import pytest
+
+from emulators.modbus.ascii import AsciiSlave
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.rtu import RtuSlave
+from emulators.modbus.unit import ModbusUnit
+from gateway.core.clock import NS_PER_S
+from gateway.protocols.modbus.server_line import RtuRequests
+from gateway.protocols.modbus.server_mbap import MbapRequests
+
+CHUNK = 1 << 20
+CHUNKS = 100
+GROWTH_KB = 16 * 1024
+"""Of the process, at most: some chunks. 100 MB that were kept would be six times that."""
+READ_ADU = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
+READ_FRAME = bytes.fromhex("01 03 0000 0001 840A")
+FOREIGN_ADU = bytes.fromhex("0001 0001 00FE 01") + bytes(253)
+
+GARBAGE = {
+    "zeros": bytes(CHUNK),
+    "ones": b"\xff" * CHUNK,
+    "random": random.Random(70).randbytes(CHUNK),
+    "another protocol": FOREIGN_ADU * (CHUNK // len(FOREIGN_ADU)),
+}
+
+
+def units() -> dict[int, ModbusUnit]:
+    return {1: ModbusUnit(MapBank([Span("holding", 0, 4)]))}
+
+
+def flood(feed: Callable[[bytes, int], object], kept: Callable[[], int], kind: str, chunks: int = CHUNKS) -> int:
+    """Feed it; how long that took on the line, in ns."""
+    before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    now_ns = NS_PER_S
+    for _ in range(chunks):
+        feed(GARBAGE[kind], now_ns)
+        now_ns += 1_000
+        assert kept() <= 600
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < GROWTH_KB
+    return now_ns
+
+
+@pytest.mark.parametrize("kind", ["zeros", "ones"])
+def test_an_rtu_slave(kind: str) -> None:
+    slave = RtuSlave(units())
+    now_ns = flood(slave.feed, lambda: slave.pending, kind)
+    assert slave.counters.noise_bytes >= CHUNKS * CHUNK - 600
+    slave.feed(b"", now_ns + NS_PER_S)
+    assert len(slave.feed(READ_FRAME, now_ns + 2 * NS_PER_S)) == 1
+
+
+@pytest.mark.parametrize("kind", ["zeros", "random"])
+def test_an_ascii_slave(kind: str) -> None:
+    slave = AsciiSlave(units())
+    now_ns = flood(slave.feed, lambda: slave.pending, kind)
+    assert len(slave.feed(b":010300000001FB\r\n", now_ns + 2 * NS_PER_S)) == 1
+
+
+@pytest.mark.parametrize("kind", sorted(GARBAGE))
+def test_a_tcp_slave(kind: str) -> None:
+    slave = MbapSlave(units())
+    chunks = 4 if kind == "zeros" else CHUNKS  # ADUs of length 0, one in six bytes, each dropped for itself
+    flood(slave.feed, lambda: slave.pending, kind, chunks)
+    assert slave.requests == 0
+    assert (slave.desync is None) == (kind in ("zeros", "another protocol"))
+    answered = slave.feed(READ_ADU, 2 * NS_PER_S)
+    assert len(answered) == (1 if kind == "another protocol" else 0) or kind == "zeros"
+
+
+@pytest.mark.parametrize("kind", sorted(GARBAGE))
+def test_the_gateways_own_tcp_server(kind: str) -> None:
+    stream = MbapRequests()
+    flood(lambda data, now_ns: stream.feed(data), lambda: len(stream._buffer), kind)
+    assert bool(stream.desync) == (kind != "another protocol")
+    assert len(stream.feed(READ_ADU)) == (kind == "another protocol")
+
+
+@pytest.mark.parametrize("kind", ["zeros", "ones", "random"])
+def test_the_gateways_own_rtu_server(kind: str) -> None:
+    """A tenth of a MB: nine seconds of a line of 115200 bit/s."""
+    line = RtuRequests(86_000)
+    for at in range(0, 100_000, 1000):
+        line.feed(GARBAGE[kind][at : at + 1000])
+        assert len(line._buffer) <= 256
+    line.silence()
+    assert line.noise_bytes >= 100_000 - 260 * line.frames
+    assert len(line.feed(READ_FRAME)) == 1

@@ -150,7 +150,7 @@ async def command(*options: str) -> AsyncIterator[tuple[asyncio.subprocess.Proce
         assert process.stderr is not None
         told = {}
         while "CAN bus" not in told or ("--slcan" in options and "slcan" not in told):
-            line = (await asyncio.wait_for(process.stderr.readline(), 15)).decode()
+            line = (await asyncio.wait_for(process.stderr.readline(), 60)).decode()
             assert line, "it ended"
             if match := re.match(r"(CAN bus|slcan) on (?:can:fieldtwin/)?(\S+?),?(?: |$)", line.strip() + " "):
                 told[match[1]] = match[2]

@@ -68,7 +68,8 @@ class Rig:
             return [e.reply for e in self.stream.receive_datagram(data, self.now_ns) if e.reply]
         if self.kind == "mbap":
             return self.stream.feed(data, self.now_ns)
-        return self.line.feed(data, self.now_ns)
+        replies: list[bytes] = self.line.feed(data, self.now_ns)
+        return replies
 
     def exchange(
         self, request: Request[Reply], damage_out: list[bytes] | None = None, damage_back: Damage | None = None
@@ -158,11 +159,11 @@ def is_true(rig: Rig, request: Request[Reply], reply: Reply) -> bool:
         bits = reply.bits  # type: ignore[attr-defined]
         return list(bits) == [(request.address + i) % every == 0 for i in range(len(bits))]
     if isinstance(request, WriteRegister | WriteCoil):
-        table = "holding" if isinstance(request, WriteRegister) else "coil"
-        return bool(rig.unit.bank.peek(table, request.address) == int(request.value))  # type: ignore[attr-defined]
+        cells = "holding" if isinstance(request, WriteRegister) else "coil"
+        return bool(rig.unit.bank.peek(cells, request.address) == int(request.value))  # type: ignore[attr-defined]
     if isinstance(request, WriteRegisters | WriteCoils):
-        table = "holding" if isinstance(request, WriteRegisters) else "coil"
-        held = [rig.unit.bank.peek(table, 320 + i) for i in range(len(request.values))]  # type: ignore[attr-defined]
+        cells = "holding" if isinstance(request, WriteRegisters) else "coil"
+        held = [rig.unit.bank.peek(cells, 320 + i) for i in range(len(request.values))]  # type: ignore[attr-defined]
         return held == [int(v) for v in request.values]
     return False
 
@@ -206,26 +207,39 @@ def test_datagrams_of_anything_never_raise_and_the_next_is_answered(datagrams: l
     assert isinstance(rig.exchange(ReadRegisters("holding", 0, 1)), Reply)
 
 
+ADDRESSES = st.one_of(st.sampled_from([0, 0xFFF0, 0xFFFE, 0xFFFF]), st.integers(0, 0xFFFF))
+COUNTS = st.one_of(
+    st.sampled_from([0, 1, 2, 7, 8, 9, 121, 122, 123, 124, 125, 126, 1968, 1969, 2000, 2001]), st.integers(0, 0xFFFF)
+)
+OFF_BY = st.sampled_from([0, 0, 0, -1, 1])
+
+
+def words(*values: int) -> bytes:
+    return b"".join(value.to_bytes(2) for value in values)
+
+
+def write_many(function: int, address: int, count: int, off_by: int, short_by: int) -> bytes:
+    """A write of several cells whose byte count and whose data may be one too many or too few."""
+    size = (count + 7) // 8 if function == 0x0F else 2 * count
+    data = bytes(max(0, min(size, 246) - short_by))
+    return bytes([function]) + words(address, count) + bytes([max(0, size + off_by) & 0xFF]) + data
+
+
+def read_write(address: int, count: int, to: int, given: int, off_by: int) -> bytes:
+    size = max(0, min(2 * given, 242) + off_by)
+    return b"\x17" + words(address, count, to, given) + bytes([size]) + bytes(size)
+
+
 SENSIBLE = st.one_of(
     st.binary(min_size=1, max_size=253),
-    st.tuples(
-        st.sampled_from([1, 2, 3, 4, 5, 6]), st.integers(0, 0xFFFF), st.integers(0, 2100), st.binary(max_size=1)
-    ).map(lambda t: bytes([t[0]]) + t[1].to_bytes(2) + t[2].to_bytes(2) + t[3]),
-    st.tuples(
-        st.sampled_from([0x0F, 0x10]),
-        st.integers(0, 0xFFFF),
-        st.integers(0, 130),
-        st.integers(0, 255),
-        st.binary(max_size=240),
-    ).map(lambda t: bytes([t[0]]) + t[1].to_bytes(2) + t[2].to_bytes(2) + bytes([t[3]]) + t[4]),
-    st.tuples(st.integers(0, 0xFFF0), st.integers(1, 20), st.integers(0, 1)).map(
-        lambda t: b"\x10" + t[0].to_bytes(2) + t[1].to_bytes(2) + bytes([2 * t[1]]) + bytes(2 * t[1] - t[2])
+    st.builds(
+        lambda function, address, count, more: bytes([function]) + words(address, count) + more,
+        st.integers(1, 6), ADDRESSES, st.one_of(COUNTS, st.sampled_from([0xFF00, 0xFF01])), st.sampled_from([b"", b"\0"]),
     ),
-    st.tuples(*[st.integers(0, 0xFFFF)] * 3, st.integers(0, 130), st.binary(max_size=3)).map(
-        lambda t: b"\x17" + t[0].to_bytes(2) + (t[1] % 140).to_bytes(2) + t[2].to_bytes(2) + t[3].to_bytes(2) + t[4]
-    ),
-    st.tuples(*[st.integers(0, 0xFFFF)] * 3).map(lambda t: b"\x16" + b"".join(n.to_bytes(2) for n in t)),
-)
+    st.builds(write_many, st.sampled_from([0x0F, 0x10]), ADDRESSES, COUNTS, OFF_BY, OFF_BY),
+    st.builds(read_write, ADDRESSES, COUNTS, ADDRESSES, COUNTS, OFF_BY),
+    st.builds(lambda *values: b"\x16" + words(*values), ADDRESSES, ADDRESSES, ADDRESSES),
+)  # fmt: skip
 WHOLE = make_unit(0x10000)
 JUDGED = {1, 2, 3, 4, 5, 6, 0x0F, 0x10, 0x16, 0x17}
 """Functions that both sides know, and that depend on nothing but the request where every cell is there."""

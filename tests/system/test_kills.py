@@ -127,13 +127,13 @@ def test_a_field_side_that_dies_and_comes_back_and_a_parent_that_is_killed(tmp_p
             with fieldtwin(tmp_path, *emulate, name="field2") as second:
                 field = second.control("observatory-field", "field")
                 wait_for(lambda: all(d["online"] for d in gateway("get")["devices"].values()), 15, "all devices back")
-                wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1:] == ["0001"], 5, "the period again")
+                wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1:] == ["0001"], 15, "the period again")
 
                 def good_again() -> bool:
                     tags = gateway("get")["tags"]
                     return all(tags[name]["quality"] == "good" for name in watched)
 
-                wait_for(good_again, 8, "values good again")
+                wait_for(good_again, 15, "values good again")
                 command_from_far(field("get")["far"]["modem"], 1, 2)
                 wait_for(
                     lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0002", 10, "a new command gets through"

@@ -221,8 +221,17 @@ class CanBus:
     # -- attempts -------------------------------------------------------------------------------------------------
 
     def _attempt(self, start: Start) -> None:
-        """Judge an attempt whose regular end has come: a frame, or an error."""
+        """An attempt's regular end has come: it was a frame, or an error. Who is in bus-off by it counts from its end on."""
         self._next = None
+        self._judge(start)
+        for number in start.rivals:
+            node = self._nodes.get(number)
+            if node is not None and node.faults.state is CanErrorState.BUS_OFF:
+                self._go_off(number)
+            elif node is not None and node.faults.state is CanErrorState.PASSIVE:
+                node.hold_ns = self._free_ns + self._duration_ns(SUSPEND_BITS)
+
+    def _judge(self, start: Start) -> None:
         if len(start.rivals) == 1:
             frame, senders = start.winner.frame, start.rivals
         else:
@@ -266,12 +275,10 @@ class CanBus:
             self._fail(verdict, frame, start, by_age, self._receivers(start, by_age))
             return None
         at_ns = start.start_ns + self._duration_ns(outcome.lost_bit + 1)
-        resume_ns = start.start_ns + self._duration_ns(bits_on_wire(frame) + SUSPEND_BITS)
         for number in outcome.losers:  # error-passive: they give way without spoiling the frame
             node = self._nodes[number]
             self._change(number, at_ns, node.faults.send_failed)
             node.errors += 1
-            node.hold_ns = resume_ns
         return frame, list(outcome.senders)
 
     def _asked(self, frame: CanFrame, start_ns: int, senders: tuple[int, ...]) -> Disturbance | None:
@@ -313,7 +320,6 @@ class CanBus:
         for number in senders:
             faults = self._nodes[number].faults
             self._change(number, at_ns, faults.not_acknowledged if verdict.kind == "ack" else faults.send_failed)
-            self._suspend_if_passive(number)
         for number in receivers:
             first = number in verdict.first
             self._change(number, at_ns, partial(self._nodes[number].faults.receive_failed, first=first))
@@ -324,8 +330,6 @@ class CanBus:
             node = self._nodes[number]
             node.errors += 1
             counters.append((number, node.faults.tec, node.faults.rec))
-            if node.faults.state is CanErrorState.BUS_OFF:
-                self._go_off(number)
         self._faults.append(
             WireFault(at_ns, verdict.kind, frame, start.start_ns, verdict.bits, tuple(senders), tuple(counters))
         )
@@ -348,7 +352,6 @@ class CanBus:
             node.sent += 1
             if node.faults.tec:
                 self._change(number, end_ns, node.faults.sent)
-            self._suspend_if_passive(number)
             if not node.queue:
                 self._stop_waiting(number)
                 self._forget_if_done(number)
@@ -361,11 +364,6 @@ class CanBus:
         what()
         if faults.state is not before:
             self._notices.append(Notice(at_ns, number, before, faults.state, faults.tec, faults.rec))
-
-    def _suspend_if_passive(self, number: int) -> None:
-        node = self._nodes[number]
-        if node.faults.state is CanErrorState.PASSIVE:
-            node.hold_ns = self._free_ns + self._duration_ns(SUSPEND_BITS)
 
     def _pass(self, start_ns: int, bits: int) -> None:
         """An attempt took the bus: it is free again after `bits`. Nodes in bus-off count the recessive sequences."""

@@ -297,6 +297,21 @@ def test_collisions_of_three_and_the_same_frame_twice() -> None:
     assert [x.senders for x in done] == [(b, c), (d,), (a,)]
 
 
+def test_who_gives_way_again_and_again_goes_to_bus_off_too() -> None:
+    bus, (a, b, _) = make(3)
+    # 16 collisions; then a, error-passive, gives way to b, whose frame is spoilt each time: + 8 for both until they are off.
+    bus.disturb(spoil(match=lambda frame: frame.data == b"\x7f", times=16))
+    bus.submit(a, CanFrame(0x181, b"\xff"), 0)
+    bus.submit(b, CanFrame(0x181, b"\x7f"), 0)
+    assert [d.frame.data for d in bus.advance(END)] == [b"\x7f", b"\xff"]
+    notices = bus.take_notices()
+    states = [WARNING, PASSIVE, BUS_OFF, ACTIVE]
+    assert [n.state for n in notices if n.node == a][:4] == states
+    assert [n.state for n in notices if n.node == b][:4] == states
+    off, back = (next(n.t_ns for n in notices if n.node == a and n.state is state) for state in (BUS_OFF, ACTIVE))
+    assert back - off > 128 * 11 * BIT_NS
+
+
 def test_collisions_go_on_to_bus_off() -> None:
     bus, (a, b) = make(2)
     for _ in range(40):

@@ -25,7 +25,9 @@ VECTORS = HERE.parent / "vectors"
 PEERS = {"pymodbus": ("rtu", "ascii", "mbap", "udp"), "libmodbus": ("rtu", "mbap")}
 """Which wires each has a server for."""
 REPLY_WITHIN_S = 1.5
-SILENCE_S = 0.2
+SILENCE_S = 0.5
+STAGGER_S = 0.01
+"""From the beginning of one row to that of the next: what many do at once would look like a peer that thinks for long."""
 PAUSE_S = 0.8
 """Longer than any of the peers waits for the rest of a frame."""
 APART_S = 0.1
@@ -104,6 +106,7 @@ class Wire:
                 while len(self.heard) < count and not self.closed:
                     self._more.clear()
                     await self._more.wait()
+            await asyncio.sleep(APART_S)  # what is said besides comes along
         except TimeoutError:
             pass
         data = bytes(self.heard)
@@ -119,6 +122,11 @@ class Play:
 
     def __init__(self, row: Row, wire: Wire) -> None:
         self.row, self.wire = row, wire
+
+    async def after(self, delay_s: float) -> str:
+        """`difference`, begun a little later."""
+        await asyncio.sleep(delay_s)
+        return await self.difference()
 
     async def difference(self) -> str:
         """What the server does otherwise than the row says; empty when nothing."""
@@ -227,10 +235,10 @@ async def play_on(peer: str, rows: list[Row]) -> dict[str, str]:
         assert program.stdout is not None
         try:
             program.stdin.write(jobs)
-            async with asyncio.timeout(20):
+            async with asyncio.timeout(60):
                 ready = [tuple(map(int, (await program.stdout.readline()).split())) for _ in rows]
                 plays = [Play(rows[number], stage.wire(number, port)) for number, port in ready]
-                found = await asyncio.gather(*(play.difference() for play in plays))
+                found = await asyncio.gather(*(play.after(n * STAGGER_S) for n, play in enumerate(plays)))
         finally:
             program.stdin.close()
             await program.wait()

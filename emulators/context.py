@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-from gateway.core.errors import FileInvalid, UnknownCommand, UsageError
+from gateway.core.errors import Bug, FileInvalid, UnknownCommand, UsageError
 from gateway.core.values import COMMAND, RECORDING
 
 MAX_ENTRIES = 500_000
@@ -49,17 +49,37 @@ class Recorded:
     latency_s: float = 0.0
 
 
+RELEASE_AT = 512
+"""Taken recordings of a command that are still in memory before they are let go together: removing each by itself from the
+head of a list would cost as many steps as there are behind it."""
+
+
 class _Series:
-    """What was recorded for one command: what is left, what was taken, and the last one taken."""
+    """What was recorded for one command, how far it was taken, and the last one taken. The list may be another's, too."""
 
-    __slots__ = ("last", "left", "skip", "taken", "when_used_up")
+    __slots__ = ("at", "last", "recorded", "shared", "skip", "when_used_up")
 
-    def __init__(self, when_used_up: WhenUsedUp) -> None:
-        self.left: deque[Recorded] = deque()
-        self.taken: list[Recorded] = []  # kept under LOOP only
+    def __init__(self, when_used_up: WhenUsedUp, recorded: list[Recorded] | None = None) -> None:
+        self.recorded = [] if recorded is None else recorded
+        self.shared = recorded is not None
+        self.at = 0
         self.last: Recorded | None = None
         self.skip = 0  # taken since, and still in the context's order of arrival
         self.when_used_up = when_used_up
+
+    @property
+    def left(self) -> int:
+        return len(self.recorded) - self.at
+
+    def take(self) -> Recorded:
+        """The oldest that is left, removed."""
+        recorded = self.last = self.recorded[self.at]
+        self.at += 1
+        wanted_again = self.shared or self.when_used_up is WhenUsedUp.LOOP
+        if self.at >= RELEASE_AT and 2 * self.at >= len(self.recorded) and not wanted_again:
+            del self.recorded[: self.at]
+            self.at = 0
+        return recorded
 
 
 class VirtualContext:
@@ -67,6 +87,8 @@ class VirtualContext:
 
     With `commands`, that list is fixed and its items are what `take` accepts, with or without recordings. Without, it is
     derived from what is added (ruling 12). A full context drops its oldest entry.
+
+    `copy` gives another one that begins where this one began; many devices of one recording have one each.
     """
 
     def __init__(
@@ -85,8 +107,21 @@ class VirtualContext:
         self._fixed = commands is not None
         self._series: dict[bytes, _Series] = {command.data: _Series(when_used_up) for command in commands or ()}
         self._order: deque[_Series] = deque()  # one entry for each added and not yet known to be gone
+        self._origin: Mapping[bytes, _Series] | None = None
         for command, recorded in recordings:
             self.add(command, recorded)
+
+    def copy(self) -> VirtualContext:
+        """A context with the same recordings, which nothing can be added to any more, here or there. This one must not
+        have been taken from. The recordings are in memory once, and a command costs some when it is first asked for."""
+        if self.taken:
+            raise Bug("a context was copied after something was taken from it")
+        other = VirtualContext(when_used_up=self.when_used_up, max_entries=self.max_entries)
+        other.dropped, other._left = self.dropped, self._left
+        other._origin = self._series if self._origin is None else self._origin
+        for series in self._series.values():
+            series.shared = True
+        return other
 
     def __len__(self) -> int:
         """How many recordings are left."""
@@ -95,15 +130,23 @@ class VirtualContext:
     @property
     def command_list(self) -> tuple[COMMAND, ...]:
         """The commands that `take` accepts, in the order in which they came."""
-        return tuple(COMMAND(data) for data in self._series)
+        return tuple(COMMAND(data) for data in (self._series if self._origin is None else self._origin))
 
     def left(self, command: COMMAND) -> int:
         """How many recordings are left for `command`."""
+        series = self._find(command)
+        return series.left if series else 0
+
+    def _find(self, command: COMMAND) -> _Series | None:
         series = self._series.get(command.data)
-        return len(series.left) if series else 0
+        if series is None and self._origin is not None and (there := self._origin.get(command.data)) is not None:
+            series = self._series[command.data] = _Series(there.when_used_up, there.recorded)
+        return series
 
     def add(self, command: COMMAND, recorded: Recorded) -> None:
         """Append to what was recorded for `command`; raises `UnknownCommand` where the list is fixed."""
+        if self._origin is not None:
+            raise Bug("something was added to a copied context")
         series = self._series.get(command.data)
         if series is None:
             if self._fixed:
@@ -113,7 +156,9 @@ class VirtualContext:
             series = self._series[command.data] = _Series(self.when_used_up)
         if self._left >= self.max_entries:
             self._drop_oldest()
-        series.left.append(recorded)
+        if series.shared:
+            raise Bug("something was added to a context that was copied")
+        series.recorded.append(recorded)
         self._order.append(series)
         self._left += 1
 
@@ -134,14 +179,14 @@ class VirtualContext:
 
     def take_recorded(self, command: COMMAND) -> Recorded:
         """As `take`, with time and latency."""
-        series = self._series.get(command.data)
+        series = self._find(command)
         if series is None:
             raise self._unknown(command)
-        if not series.left and series.taken and series.when_used_up is WhenUsedUp.LOOP:
-            self._left += len(series.taken)
-            self._order.extend([series] * len(series.taken))
-            series.left.extend(series.taken)
-            series.taken.clear()
+        if not series.left and series.at and series.when_used_up is WhenUsedUp.LOOP:
+            self._left += series.at
+            if self._origin is None:
+                self._order.extend([series] * series.at)
+            series.at = 0
         if series.left:
             return self._remove(series)
         if series.last is not None and series.when_used_up is WhenUsedUp.HOLD:
@@ -149,12 +194,12 @@ class VirtualContext:
         raise UsedUp(f"nothing is left of what was recorded for command {command.data.hex(' ')}")
 
     def _remove(self, series: _Series) -> Recorded:
-        recorded = series.last = series.left.popleft()
-        if series.when_used_up is WhenUsedUp.LOOP:
-            series.taken.append(recorded)
-        series.skip += 1
+        recorded = series.take()
         self._left -= 1
         self.taken += 1
+        if self._origin is not None:
+            return recorded  # nothing is added, so nobody asks for the order
+        series.skip += 1
         while self._order and self._order[0].skip:  # forget the order of those that are gone
             self._order.popleft().skip -= 1
         return recorded
@@ -165,7 +210,7 @@ class VirtualContext:
             if series.skip:
                 series.skip -= 1
                 continue
-            series.left.popleft()
+            del series.recorded[series.at]
             self._left -= 1
             self.dropped += 1
             return

@@ -54,6 +54,16 @@ class Counters:
             for i in range(span.count):
                 self._by_cell[span.unit, (span.table, span.address + i)] = (counter, i)
 
+    def copy(self, context: VirtualContext) -> Counters:
+        """The same counters over a copy of the context, before anything was read."""
+        other = Counters((), context)
+        other.torn = self.torn
+        made: dict[int, _Counter] = {}
+        for place, (counter, i) in self._by_cell.items():
+            mine = made.setdefault(id(counter), _Counter(counter.span))
+            other._by_cell[place] = (mine, i)
+        return other
+
     def learn(self, unit: int, cell: Cell, value: int, t_s: float) -> bool:
         """A register was recorded. Returns whether it is one of a counter."""
         found = self._by_cell.get((unit, cell))

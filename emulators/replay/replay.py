@@ -11,9 +11,10 @@ together whatever happens (`counters`). Pure: PDUs in, PDUs out. It knows neithe
 
 from __future__ import annotations
 
+import copy
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
@@ -75,6 +76,12 @@ class _Unit:
         self.least_refused: dict[int, int] = {}  # function -> fewest cells ever refused with 03
         self.latency: dict[int, tuple[int, float]] = {}  # function -> how many, sum
 
+    def copy(self) -> _Unit:
+        """What was learned, shared, with nothing asked or written yet."""
+        other = copy.copy(self)
+        other.situations, other.alike, other.put = self.situations.copy(), {}, {}
+        return other
+
     def usual_latency_s(self, function: int) -> float:
         count, total = self.latency.get(function, (0, 0.0))
         return total / count if count else 0.0
@@ -131,6 +138,17 @@ class ExchangeReplay:
             )
             replay.truncated = reader.truncated
             return replay
+
+    def copy(self) -> ExchangeReplay:
+        """Another device of the same recording, from its beginning: what was learned is in memory once. This one must not
+        have answered anything."""
+        other = copy.copy(self)
+        other.context = self.context.copy()
+        other.counters = replace(self.counters)
+        other._spans = self._spans.copy(other.context)
+        other._units = {unit_id: unit.copy() for unit_id, unit in self._units.items()}
+        other._last_answers = {}
+        return other
 
     @property
     def units(self) -> tuple[int, ...]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from emulators.modbus.bank import Table
+from gateway.core.errors import Bug
 
 Cell = tuple[Table, int]
 Written = tuple[Cell, int]
@@ -35,6 +36,15 @@ class Situations:
         self._known: list[frozenset[Written]] = [frozenset()]
         self._values: list[dict[Cell, int]] = [{}]
         self._numbers: dict[frozenset[Written], int] = {frozenset(): 0}
+
+    def copy(self) -> Situations:
+        """Another unit of the same recording, of which nothing more is learned: it begins at the beginning."""
+        if self._learning:
+            raise Bug("situations were copied while they are being learned")
+        other = Situations(self.max_situations)
+        other.folded, other._learning = self.folded, False
+        other._known, other._values, other._numbers = self._known, self._values, self._numbers
+        return other
 
     @property
     def learned(self) -> int:

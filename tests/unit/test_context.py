@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
-from gateway.core.errors import FileInvalid, UnknownCommand
+from emulators.context import RELEASE_AT, Recorded, UsedUp, VirtualContext, WhenUsedUp
+from gateway.core.errors import Bug, FileInvalid, UnknownCommand
 from gateway.core.values import COMMAND, RECORDING, RESPONSE
 
 A, B = COMMAND(b"a"), COMMAND(b"b")
@@ -118,3 +119,38 @@ def test_endlessly_many_different_commands_are_refused() -> None:
         subject.add(COMMAND(bytes([number])), recorded(number))
     with pytest.raises(FileInvalid, match="too many"):
         subject.add(COMMAND(b"\x02"), recorded(2))
+
+
+@pytest.mark.parametrize("policy", WhenUsedUp)
+def test_copies_begin_where_the_first_began_and_know_nothing_of_each_other(policy: WhenUsedUp) -> None:
+    first = VirtualContext([A, B], [(A, recorded(1)), (B, recorded(9)), (A, recorded(2))], when_used_up=policy)
+    second, third = first.copy(), first.copy().copy()
+    assert taken(second, A, 2) == [1, 2]
+    assert (len(first), len(second), len(third)) == (3, 1, 3)
+    assert second.command_list == third.command_list == (A, B)
+    for subject in (first, third):
+        assert (taken(subject, A, 2), taken(subject, B, 1), len(subject)) == ([1, 2], [9], 0)
+    assert second.left(B) == 1
+    if policy is not WhenUsedUp.ERROR:
+        assert taken(second, A, 2) == ([2, 2] if policy is WhenUsedUp.HOLD else [1, 2])
+    with pytest.raises(UnknownCommand):
+        second.take(COMMAND(b"c"))
+
+
+def test_what_is_shared_is_not_added_to() -> None:
+    first = context([1])
+    second = first.copy()
+    for subject in (first, second):
+        with pytest.raises(Bug, match="cop"):
+            subject.add(A, recorded(2))
+    second.take(A)
+    with pytest.raises(Bug, match="after something was taken"):
+        second.copy()
+
+
+def test_what_was_taken_of_a_long_recording_is_let_go() -> None:
+    subject = context([n % 256 for n in range(3 * RELEASE_AT)])
+    before = sys.getsizeof(subject._series[A.data].recorded)
+    assert taken(subject, A, 3 * RELEASE_AT - 1) == [n % 256 for n in range(3 * RELEASE_AT - 1)]
+    assert subject.left(A) == 1
+    assert sys.getsizeof(subject._series[A.data].recorded) < before / 2

@@ -380,3 +380,30 @@ def test_a_recorded_unit_stands_in_for_a_computed_one(tmp_path: Path) -> None:
     assert unit.latency_s == 0.05
     with pytest.raises(UsageError, match="expected 1; got 2"):
         ReplayUnit(replay, 2)
+
+
+def test_copies_answer_like_the_first_whatever_another_was_asked() -> None:
+    """Devices of one recording: each begins at its beginning, with its own writes and its own counters."""
+    recorded = [
+        ok(read(0), reply(1)),
+        ok(read(0), reply(2)),
+        ok(bytes.fromhex("0600010007"), bytes.fromhex("0600010007")),
+        ok(read(0), reply(3)),
+    ]
+    first = ExchangeReplay(recorded)
+    asked, other = first.copy(), first.copy()
+    assert replies(asked, read(0), 2) == [reply(1), reply(2)]
+    asked.respond(1, bytes.fromhex("0600010007"))
+    assert replies(asked, read(0), 1) == [reply(3)]
+    asked.put(1, "input", 0, [99])
+    for replay in (other, first):
+        assert replies(replay, read(0), 2) == [reply(1), reply(2)]
+        assert replay.counters.answered == 2
+    assert replies(asked, read(0), 1) == [reply(99)]
+
+
+def test_copies_have_their_own_counters() -> None:
+    first = ExchangeReplay([ok(read(0, 2), reply(0, n)) for n in (1, 2, 3)], counters=[ENERGY])
+    copies = [first.copy() for _ in range(2)]
+    assert [words(copies[0], 0, 2) for _ in range(3)] == [(0, 1), (0, 2), (0, 3)]
+    assert words(copies[1], 0, 2) == (0, 1)

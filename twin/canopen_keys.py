@@ -13,7 +13,7 @@ from gateway.core.yaml_file import Key, YamlFile
 from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
 from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
 from gateway.protocols.canopen.concise_dcf import configuration_date, settings_of
-from gateway.protocols.canopen.configure import TpdoConfig, tpdos_of
+from gateway.protocols.canopen.configure import PdoConfig, tpdos_of
 from gateway.protocols.canopen.dictionary import load_dictionary
 from gateway.protocols.canopen.lss import LssAddress
 from twin.data_files import find
@@ -58,7 +58,7 @@ def canopen_node(
 
 def _configuration(
     file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, path: Path, profiles: Iterable[Path]
-) -> tuple[Configuration | None, tuple[TpdoConfig, ...] | None]:
+) -> tuple[Configuration | None, tuple[PdoConfig, ...] | None]:
     if form.dcf is None:
         for key in ("store", "tpdos"):
             if getattr(form, key) in (True, "dcf"):

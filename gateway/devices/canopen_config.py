@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
-from gateway.protocols.canopen.configure import TpdoConfig
+from gateway.protocols.canopen.configure import PdoConfig
 from gateway.protocols.canopen.lss import LssAddress
 
 
@@ -34,5 +34,5 @@ class CanopenNodeConfig:
     dcf: str = ""
     configuration: Configuration | None = None
     lss: LssAddress | None = None
-    tpdos: tuple[TpdoConfig, ...] | None = None
+    tpdos: tuple[PdoConfig, ...] | None = None
     adopt_tpdos: bool = False

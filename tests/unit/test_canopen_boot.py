@@ -27,7 +27,7 @@ from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat
 from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
 from gateway.protocols.canopen.concise_dcf import Setting
-from gateway.protocols.canopen.configure import TpdoConfig
+from gateway.protocols.canopen.configure import PdoConfig
 from gateway.protocols.canopen.lss import LssAddress
 from gateway.protocols.canopen.pdo import PdoMapping
 from gateway.runtime.audit import AuditLog
@@ -265,7 +265,7 @@ def test_tpdos_come_from_the_node_or_from_its_dcf(tmp_path: Path) -> None:
             assert r.tags.current("incl.slope_lateral", 0).value == -5.0
             assert r.peers.writes() == []
 
-    from_dcf = (TpdoConfig(1, 0x185, True, 254, 100, PdoMapping.of(SLOPES)),)
+    from_dcf = (PdoConfig(1, 0x185, True, 254, 100, PdoMapping.of(SLOPES)),)
     run_virtually(main(CanopenNodeConfig(adopt_tpdos=True), True))
     run_virtually(main(CanopenNodeConfig(tpdos=from_dcf), False))
 

@@ -13,6 +13,7 @@ from gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted, UsageE
 from gateway.protocols.canopen.emcy import parse_emcy
 from gateway.protocols.canopen.master import CanopenMaster
 from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from gateway.protocols.canopen.sdo_channel import NodeRestarted
 
 
 class Bench:
@@ -337,6 +338,30 @@ def test_a_lost_bus_fails_what_waits_at_once_and_what_comes_later() -> None:
             with pytest.raises(ConnectionLost):
                 await bench.master.sdo_upload(6, 0x1000, 0)
         assert LoopClock().monotonic_ns() < 60e9
+
+    run_virtual(main())
+
+
+def test_a_boot_up_ends_the_transfer_under_way_and_it_is_asked_again_at_once() -> None:
+    """The node will never answer what it forgot: nobody waits for it, and no late reply is expected."""
+
+    async def main() -> None:
+        bench = Bench()
+        async with running(bench.master):
+            first = asyncio.ensure_future(bench.master.sdo_upload(5, 0x1018, 4, 10.0))
+            assert (await bench.node.recv()).can_id == 0x605
+            start = asyncio.get_running_loop().time()
+            await bench.send("705#00")
+            with pytest.raises(NodeRestarted, match="the node restarted"):
+                await first
+            retried = asyncio.ensure_future(bench.master.sdo_upload(5, 0x1018, 4, 10.0, retries=1))
+            await bench.node.recv()
+            await bench.send("705#00")
+            assert (await bench.node.recv()).data[:4] == bytes.fromhex("40181004")  # again, without a probe
+            await bench.send("585#4318100478563412")
+            assert await retried == bytes.fromhex("78563412")
+            assert asyncio.get_running_loop().time() - start < 0.1
+            assert (bench.master.counters.sdo_probes, bench.master.counters.sdo_timeouts) == (0, 0)
 
     run_virtual(main())
 

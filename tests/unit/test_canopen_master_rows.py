@@ -23,7 +23,7 @@ from gateway.devices.canopen_config import CanopenNodeConfig
 from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.config import DeviceConfig
 from gateway.protocols.canopen.cob_id import LSS_REPLY
-from gateway.protocols.canopen.configure import TpdoConfig
+from gateway.protocols.canopen.configure import PdoConfig
 from gateway.protocols.canopen.emcy import parse_emcy
 from gateway.protocols.canopen.emcy_log import EmcyLog
 from gateway.protocols.canopen.lss import LssAddress, LssRefused
@@ -178,7 +178,7 @@ class Play:
 
     def make_driver(self) -> CanopenDriver:
         mapping = PdoMapping.of([(0x6010, 0, 16), (0x6020, 0, 16)])
-        boot = CanopenNodeConfig(tpdos=(TpdoConfig(1, 0x180 + NODE, True, 254, 100, mapping),))
+        boot = CanopenNodeConfig(tpdos=(PdoConfig(1, 0x180 + NODE, True, 254, 100, mapping),))
         driver = CanopenDriver(DeviceConfig("incl", PROFILE, "can0", NODE, canopen=boot), self, self.loop)
         driver.attach_master(self.ours, self.master)
         return driver

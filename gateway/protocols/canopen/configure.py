@@ -5,8 +5,9 @@ Procedures over a master; they know object numbers of CiA 301 and nothing of any
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from gateway.core.errors import Desync, FileInvalid, SdoAborted, UsageError, VerifyFailed
 from gateway.protocols.canopen import cob_id as cob_ids
@@ -21,11 +22,27 @@ IDENTITY = 0x1018
 TPDO_COMMUNICATION = 0x1800
 TPDO_MAPPING = 0x1A00
 TPDO_MAX = 512
+RPDO_COMMUNICATION = 0x1400
+RPDO_MAPPING = 0x1600
 
 PDO_INVALID = 1 << 31
 """Bit 31 of a PDO's COB-ID: the PDO does not exist (7.5.2.37)."""
 NO_RTR = 1 << 30
 """Bit 30 of a TPDO's COB-ID: no remote frames for it."""
+SYNCHRONOUS_MAX = 240
+"""The highest transmission type of a synchronous PDO (7.5.2.35, 7.5.2.37)."""
+
+
+class Records(NamedTuple):
+    """A PDO's name and the indices of its communication and mapping record."""
+
+    name: str
+    communication: int
+    mapping: int
+
+
+PARAMETERS = {2: DataType.UNSIGNED8, 3: DataType.UNSIGNED16, 5: DataType.UNSIGNED16}
+"""Sub-indices of a communication record: transmission type, inhibit time (100 us), event timer (ms)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,8 +57,9 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class TpdoConfig:
-    """A TPDO as the node holds it. `cob_id` is the CAN-ID alone; `event_ms` is 0 when off, None when not supported."""
+class PdoConfig:
+    """A PDO as the node holds it. `cob_id` is the CAN-ID alone; `event_ms` is 0 when off, None when not supported: a TPDO's
+    event timer, an RPDO's deadline."""
 
     number: int
     cob_id: int
@@ -49,6 +67,16 @@ class TpdoConfig:
     transmission_type: int
     event_ms: int | None
     mapping: PdoMapping
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether it goes by SYNC (types 0 to 240); an RPDO's values then count from the next SYNC on."""
+        return self.transmission_type <= SYNCHRONOUS_MAX
+
+    @property
+    def cyclic(self) -> bool:
+        """Whether a TPDO comes again and again although nothing changed: each nth SYNC, or by its event timer."""
+        return 1 <= self.transmission_type <= SYNCHRONOUS_MAX or bool(not self.synchronous and self.event_ms)
 
 
 async def read_number(master: CanopenMaster, node: int, index: int, subindex: int, data_type: DataType) -> int:
@@ -91,34 +119,59 @@ async def read_identity(master: CanopenMaster, node: int) -> Identity:
     return Identity(device_type, *parts)
 
 
-async def read_tpdo(master: CanopenMaster, node: int, number: int) -> TpdoConfig:
+async def read_tpdo(master: CanopenMaster, node: int, number: int) -> PdoConfig:
     """Read TPDO `number` (from 1) with its mapping, for a driver that takes the node as it is."""
-    communication, mapping = _records(number)
-    word = await read_number(master, node, communication, 1, DataType.UNSIGNED32)
-    highest = await read_number(master, node, communication, 0, DataType.UNSIGNED8)
-    kind = await read_number(master, node, communication, 2, DataType.UNSIGNED8)
-    event = await read_number(master, node, communication, 5, DataType.UNSIGNED16) if highest >= 5 else None
-    return TpdoConfig(
-        number, word & 0x7FF, not word & PDO_INVALID, kind, event, await _read_mapping(master, node, mapping)
-    )
+    return await _read_pdo(master, node, number, _tpdo(number))
 
 
-async def read_tpdos(master: CanopenMaster, node: int, up_to: int = TPDO_MAX) -> tuple[TpdoConfig, ...]:
+async def read_tpdos(master: CanopenMaster, node: int, up_to: int = TPDO_MAX) -> tuple[PdoConfig, ...]:
     """Read TPDO 1, 2 and so on with their mappings, as far as the node has them without a gap."""
-    found: list[TpdoConfig] = []
+    return await _read_pdos(master, node, up_to, _tpdo)
+
+
+async def read_rpdos(master: CanopenMaster, node: int, up_to: int = TPDO_MAX) -> tuple[PdoConfig, ...]:
+    """Read RPDO 1, 2 and so on with their mappings, as far as the node has them without a gap."""
+    return await _read_pdos(master, node, up_to, _rpdo)
+
+
+async def _read_pdos(
+    master: CanopenMaster, node: int, up_to: int, records: Callable[[int], Records]
+) -> tuple[PdoConfig, ...]:
+    found: list[PdoConfig] = []
     while len(found) < up_to:
+        number = len(found) + 1
         try:
-            found.append(await read_tpdo(master, node, len(found) + 1))
+            found.append(await _read_pdo(master, node, number, records(number)))
         except SdoAborted:
             break
     return tuple(found)
 
 
-def tpdos_of(dictionary: ObjectDictionary) -> tuple[TpdoConfig, ...]:
+async def _read_pdo(master: CanopenMaster, node: int, number: int, records: Records) -> PdoConfig:
+    communication = records.communication
+    word = await read_number(master, node, communication, 1, DataType.UNSIGNED32)
+    highest = await read_number(master, node, communication, 0, DataType.UNSIGNED8)
+    kind = await read_number(master, node, communication, 2, DataType.UNSIGNED8)
+    event = await read_number(master, node, communication, 5, DataType.UNSIGNED16) if highest >= 5 else None
+    return PdoConfig(
+        number, word & 0x7FF, not word & PDO_INVALID, kind, event, await _read_mapping(master, node, records.mapping)
+    )
+
+
+def tpdos_of(dictionary: ObjectDictionary) -> tuple[PdoConfig, ...]:
     """The TPDOs as an EDS or DCF has them. Raises `FileInvalid` for a mapping that is none."""
+    return _pdos_of(dictionary, _tpdo)
+
+
+def rpdos_of(dictionary: ObjectDictionary) -> tuple[PdoConfig, ...]:
+    """The RPDOs as an EDS or DCF has them. Raises `FileInvalid` for a mapping that is none."""
+    return _pdos_of(dictionary, _rpdo)
+
+
+def _pdos_of(dictionary: ObjectDictionary, records: Callable[[int], Records]) -> tuple[PdoConfig, ...]:
     found = []
     for number in range(1, TPDO_MAX + 1):
-        communication, mapping = _records(number)
+        name, communication, mapping = records(number)
         word = _number_in(dictionary, communication, 1)
         if word is None:
             continue
@@ -127,12 +180,12 @@ def tpdos_of(dictionary: ObjectDictionary) -> tuple[TpdoConfig, ...]:
         try:
             mapped = PdoMapping.from_words(words)
         except Desync as e:
-            where = f"[{mapping:04X}]: the mapping of TPDO {number}"
+            where = f"[{mapping:04X}]: the mapping of {name}"
             raise FileInvalid(where, path=dictionary.path, expected=e.expected, got=e.got) from e
         kind = _number_in(dictionary, communication, 2)
         event = _number_in(dictionary, communication, 5)
         enabled = not word & PDO_INVALID
-        found.append(TpdoConfig(number, word & 0x7FF, enabled, 255 if kind is None else kind, event, mapped))
+        found.append(PdoConfig(number, word & 0x7FF, enabled, 255 if kind is None else kind, event, mapped))
     return tuple(found)
 
 
@@ -159,14 +212,41 @@ async def configure_tpdo(
     `SdoAborted` where the node refuses a step (the TPDO is then left disabled), `VerifyFailed` where it holds something
     else in the end.
     """
-    communication, mapped = _records(number)
+    parameters = ((2, transmission_type), (3, inhibit_100us), (5, event_ms))
+    return await _configure_pdo(master, node, _tpdo(number), mapping, cob_id, parameters)
+
+
+async def configure_rpdo(
+    master: CanopenMaster,
+    node: int,
+    number: int,
+    mapping: Iterable[tuple[int, int, int]],
+    cob_id: int,
+    transmission_type: int = 255,
+) -> PdoMapping:
+    """Configure RPDO `number` (from 1) by the procedure of 7.5.2.36, verify it, and return its mapping.
+
+    As `configure_tpdo`. With `transmission_type` 0 to 240 the node takes the values at the SYNC that follows.
+    """
+    return await _configure_pdo(master, node, _rpdo(number), mapping, cob_id, ((2, transmission_type),))
+
+
+async def _configure_pdo(
+    master: CanopenMaster,
+    node: int,
+    records: Records,
+    mapping: Iterable[tuple[int, int, int]],
+    cob_id: int,
+    optional: Iterable[tuple[int, int | None]],
+) -> PdoMapping:
+    """`optional` are sub-indices of the communication record, and what they shall hold; None is left alone."""
+    name, communication, mapped = records
     wanted = PdoMapping.of(mapping)
     cob_ids.check_pdo_cob_id(cob_id)
     if not wanted.entries:
-        raise UsageError(f"TPDO {number} of node {node} maps nothing", expected="at least one object")
-    u8, u16, u32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
-    optional = ((2, u8, transmission_type), (3, u16, inhibit_100us), (5, u16, event_ms))
-    parameters = [(sub, data_type, value) for sub, data_type, value in optional if value is not None]
+        raise UsageError(f"{name} of node {node} maps nothing", expected="at least one object")
+    u8, u32 = DataType.UNSIGNED8, DataType.UNSIGNED32
+    parameters = [(sub, PARAMETERS[sub], value) for sub, value in optional if value is not None]
     for _, data_type, value in parameters:
         encode(data_type, value)  # a value that does not fit is refused before anything is sent
 
@@ -187,7 +267,7 @@ async def configure_tpdo(
         await verify_number(master, node, communication, sub, data_type, value)
     found = await _read_mapping(master, node, mapped)
     if found != wanted:
-        raise VerifyFailed(f"the mapping of TPDO {number}", expected=str(wanted), got=str(found)).at(f"node {node}")
+        raise VerifyFailed(f"the mapping of {name}", expected=str(wanted), got=str(found)).at(f"node {node}")
     return wanted
 
 
@@ -202,8 +282,15 @@ async def _read_mapping(master: CanopenMaster, node: int, index: int) -> PdoMapp
     )
 
 
-def _records(number: int) -> tuple[int, int]:
-    """Indices of a TPDO's communication and mapping record."""
+def _tpdo(number: int) -> Records:
+    return _records(f"TPDO {number}", number, TPDO_COMMUNICATION, TPDO_MAPPING)
+
+
+def _rpdo(number: int) -> Records:
+    return _records(f"RPDO {number}", number, RPDO_COMMUNICATION, RPDO_MAPPING)
+
+
+def _records(name: str, number: int, communication: int, mapping: int) -> Records:
     if not 1 <= number <= TPDO_MAX:
-        raise UsageError("no such TPDO", expected=f"1 to {TPDO_MAX}", got=str(number))
-    return TPDO_COMMUNICATION + number - 1, TPDO_MAPPING + number - 1
+        raise UsageError(f"no such {name[:4]}", expected=f"1 to {TPDO_MAX}", got=str(number))
+    return Records(name, communication + number - 1, mapping + number - 1)

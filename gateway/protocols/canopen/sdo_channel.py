@@ -23,6 +23,10 @@ MAX_INBOX = 128
 """Frames that wait for the transfer's task; a flood beyond that is dropped and counted."""
 
 
+class NodeRestarted(ReplyTimeout):
+    """The node booted during a transfer: its reply will never come. What is to be done again can be done at once."""
+
+
 @dataclass(slots=True)
 class Counters:
     """What a master has seen and done since it was made.
@@ -80,6 +84,7 @@ class SdoChannel:
         self._lost: ConnectionLost | None = None
         self._last_answer: Multiplexor | None = None
         self._owed: CanFrame | None = None
+        self._rebooted = False
 
     def deliver(self, frame: CanFrame) -> bool:
         """A frame came from the node. True when it answers what was answered before (CO-042).
@@ -101,9 +106,12 @@ class SdoChannel:
         self._arrived.set()
 
     def on_boot_up(self) -> None:
-        """The node booted: what it owed, it will never send."""
+        """The node booted: what it owed, it will never send, and a transfer under way ends now."""
         self._late.settle()
         self._last_answer = self._owed = None
+        if self._active is not None:
+            self._rebooted = True
+            self._arrived.set()
 
     async def run(self, transfer: SdoTransfer) -> bytes:
         """Do `transfer` when its turn comes. Raises `SdoAborted`, `ReplyTimeout`, `Desync` or `ConnectionLost`."""
@@ -120,8 +128,8 @@ class SdoChannel:
         index, subindex = self._late.probe()
         try:
             await self._run(SdoUpload(self._node, index, subindex, transfer.timeout_ns))
-        except SdoAborted:
-            pass  # an answer, which is all that was wanted
+        except (SdoAborted, NodeRestarted):
+            pass  # an answer, which is all that was wanted, or nothing to wait for any more
         except ReplyTimeout as e:
             hint = (
                 f"an earlier request for {transfer.name} is unanswered, so {index:04X}h:{subindex:02X} was asked first"
@@ -135,7 +143,7 @@ class SdoChannel:
         if self._lost is not None:
             raise self._again(self._lost)
         request, complete = (transfer.index, transfer.subindex), False
-        self._active, self._last_answer = transfer, None
+        self._active, self._last_answer, self._rebooted = transfer, None, False
         try:
             await self._tell_owed(transfer)
             data = await self._drive(transfer)
@@ -149,11 +157,12 @@ class SdoChannel:
             self._active = None
             self._counters.ignored += len(self._inbox)
             self._inbox.clear()
-            if transfer.answered:
-                self._late.answered(request)
-            if not complete:
-                self._late.unanswered(request)
-            self._owe(transfer)
+            if not self._rebooted:  # else nothing can be on its way, and there is nothing to abort
+                if transfer.answered:
+                    self._late.answered(request)
+                if not complete:
+                    self._late.unanswered(request)
+                self._owe(transfer)
 
     def _owe(self, transfer: SdoTransfer) -> None:
         """`transfer` is left as it is (cancelled, or the bus takes no frames): the node has to be told later."""
@@ -242,6 +251,9 @@ class SdoChannel:
         while not self._inbox:
             if self._lost is not None:
                 raise self._again(self._lost)
+            if self._rebooted:
+                transfer.over = True
+                raise NodeRestarted(f"{transfer.name}: the node restarted meanwhile")
             left_s = self._left_s(transfer)
             if left_s <= 0:
                 return None

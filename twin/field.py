@@ -32,6 +32,7 @@ from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.recorded_device import RecordedDevice, load_replay
+from emulators.replay.replay import ExchangeReplay
 from emulators.signals import SignalPlayer, SignalTrack
 from gateway.core.clock import Clock
 from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
@@ -97,6 +98,8 @@ class FieldSide:
         self._listeners: list[SocketListener | SoftBusServer | UdpEnd] = []
         self._connections: list[ByteConnection | CanConnection] = []
         self._pairs: dict[str, ModemPair] = {}
+        self._tracks: dict[Path, SignalTrack] = {}
+        self._replays: dict[tuple[Path, str, str, WhenUsedUp], tuple[ExchangeReplay, int]] = {}
 
     async def open(self) -> None:
         """Build and start listening. Raises `EndpointBusy`, `Unreachable` or `FileInvalid`; then nothing stays open."""
@@ -107,6 +110,9 @@ class FieldSide:
         except BaseException:
             await self.aclose()
             raise
+        finally:
+            self._tracks.clear()
+            self._replays.clear()
 
     async def run(self) -> None:
         """Serve until cancelled; raises what an emulator raises."""
@@ -228,9 +234,13 @@ class FieldSide:
     def _recorded_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> RecordedDevice:
         """A device that is known by its exchanges."""
         assert emulated.recording is not None
-        replay, unit_id = load_replay(emulated.profile, emulated.recording, WhenUsedUp.parse(emulated.form.at_end))
+        profile, at_end = emulated.profile, WhenUsedUp.parse(emulated.form.at_end)
+        key = emulated.recording, profile.path, profile.hash, at_end
+        if key not in self._replays:  # a recording that many devices play is read once, and in memory once
+            self._replays[key] = load_replay(profile, emulated.recording, at_end)
+        replay, unit_id = self._replays[key]
         kind = self._kind(config)
-        unit = RecordedDevice(emulated.profile, replay, unit_id, kind, emulated.form.identity, config.name)
+        unit = RecordedDevice(profile, replay.copy(), unit_id, kind, emulated.form.identity, config.name)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = unit.journal
         return unit
@@ -261,8 +271,10 @@ class FieldSide:
     def _player(self, emulated: EmulatedDevice) -> SignalPlayer:
         assert emulated.recording is not None
         form = emulated.form
+        if emulated.recording not in self._tracks:
+            self._tracks[emulated.recording] = SignalTrack.load(emulated.recording)
         return SignalPlayer(
-            SignalTrack.load(emulated.recording),
+            self._tracks[emulated.recording],
             self._clock.monotonic_ns(),
             speed=form.speed,
             at_end=WhenUsedUp.parse(form.at_end),

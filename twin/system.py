@@ -51,7 +51,8 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
     file = load(path)
     form = validate(file, SystemForm)
     buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
-    devices = {n: _device(file, n, d, buses, path, profiles) for n, d in form.devices.items()}
+    known: dict[Path, DeviceProfile] = {}  # a profile that a hundred devices have is read once
+    devices = {n: _device(file, n, d, buses, path, profiles, known) for n, d in form.devices.items()}
     _check_addresses(file, devices)
     system = System(
         name=form.system,
@@ -86,7 +87,13 @@ def _bus(file: YamlFile, name: str, form: BusForm) -> BusConfig:
 
 
 def _device(
-    file: YamlFile, name: str, d: DeviceForm, buses: dict[str, BusConfig], path: Path, profiles: Iterable[Path]
+    file: YamlFile,
+    name: str,
+    d: DeviceForm,
+    buses: dict[str, BusConfig],
+    path: Path,
+    profiles: Iterable[Path],
+    known: dict[Path, DeviceProfile],
 ) -> DeviceConfig:
     loc: tuple[Key, ...] = ("devices", name)
     if d.bus not in buses:
@@ -94,7 +101,8 @@ def _device(
             (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=_near(d.bus, buses)
         )
     try:
-        profile = load_profile(find("devices", d.profile, beside=path, extra=profiles))
+        found = find("devices", d.profile, beside=path, extra=profiles)
+        profile = known[found] if found in known else known.setdefault(found, load_profile(found))
     except UsageError as e:
         raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
     is_can = buses[d.bus].endpoint.is_can

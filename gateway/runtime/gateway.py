@@ -79,8 +79,8 @@ class Gateway:
                 driver.may_trigger = config.allow_writes and trigger.tag in device.writable
             self.drivers[device.name] = driver
             self._declare(driver)
-        for bus in config.buses.values():
-            self._make_bus(bus, connector)
+        for n, bus in enumerate(config.buses.values()):
+            self._make_bus(bus, connector, n / len(config.buses))
         modbus = {name: bus for name, bus in self.buses.items() if isinstance(bus, ModbusBus)}
         self.bridges = [Bridge(b, modbus, connector, clock, audit, self._blocked) for b in config.bridges]
         self.outputs = OutputWriter(self._make_outputs(), self.tags, audit, config.allow_writes)
@@ -107,7 +107,7 @@ class Gateway:
                 stale_ms = max(config.stale_after_ms, 3 * every_ms) if tag.name in cyclic else None
                 self.tags.declare([f"{config.name}.{tag.name}"], stale_ms)
 
-    def _make_bus(self, bus: BusConfig, connector: Connector) -> None:
+    def _make_bus(self, bus: BusConfig, connector: Connector, offset: float) -> None:
         on_it = [d for d in self.drivers.values() if d.config.bus == bus.name]
         if bus.endpoint.is_can:
             nodes = [d for d in on_it if isinstance(d, CanopenDriver)]
@@ -116,7 +116,7 @@ class Gateway:
             )
         elif on_it or any(bus.name in b.buses for b in self.config.bridges):
             units = [d for d in on_it if isinstance(d, RegisterDriver)]
-            self.buses[bus.name] = ModbusBus(bus, units, connector, self.clock, self.tags, self._on_offline)
+            self.buses[bus.name] = ModbusBus(bus, units, connector, self.clock, self.tags, self._on_offline, offset)
 
     def _modbus(self, driver: RegisterDriver) -> ModbusBus:
         bus = self.buses[driver.config.bus]

@@ -1,9 +1,10 @@
 """One Modbus bus: its connection, its queue, its devices' polls. One transaction at a time, writes first in line; then
-polls that are due and the requests of bridge clients, turn by turn.
+polls that are due and the requests of bridge clients, turn by turn. While one unit has its pause, others have the line.
 
-A device that does not answer costs the others its own timeouts once and is then left alone with growing pauses
-(catalogue case 62). Nothing here opens anything but through the Connector, and a connection that ends is opened again for ever,
-with back-off; until then the devices' tags are bad and say why.
+A device that does not answer costs the others its own timeouts once. Then it is asked once after growing pauses, and all
+such tries together get no more than a stated share of the bus's time while others answer (catalogue case 62). Nothing
+here opens anything but through the Connector, and a connection that ends is opened again for ever, with back-off; until
+then the devices' tags are bad and say why.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import asyncio
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import Connector
@@ -34,6 +35,7 @@ from gateway.protocols.modbus.framings import framing_of
 from gateway.protocols.modbus.refusals import Acknowledged, ServerBusy
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.bridge_queue import GuestQueue
+from gateway.runtime.bus_turns import DeviceState, Turns, states_of
 from gateway.runtime.tags import TagTable
 
 MAX_JOBS = 256
@@ -59,23 +61,12 @@ class Job:
     done: Callable[[FieldtwinError | None], None]
 
 
-@dataclass
-class DeviceState:
-    """What the bus knows about one of its devices."""
-
-    driver: RegisterDriver
-    online: bool = False
-    error: str = "not asked yet"
-    polls: int = 0
-    poll_errors: int = 0
-    backoff: Backoff = field(default_factory=lambda: Backoff(0.25, 10.0))
-    next_try_ns: int = 0
-    due_ns: dict[str, int] = field(default_factory=dict)
-    triggered: set[str] = field(default_factory=set)
-
-
 class ModbusBus:
-    """Runs a bus until cancelled. `on_offline` is called with a driver whose device was lost."""
+    """Runs a bus until cancelled. `on_offline` is called with a driver whose device was lost.
+
+    `offset`, 0 to less than 1, moves its polls within the places that their periods give them, so that a gateway's buses
+    do not all poll at once.
+    """
 
     def __init__(
         self,
@@ -85,9 +76,10 @@ class ModbusBus:
         clock: Clock,
         tags: TagTable,
         on_offline: Callable[[RegisterDriver], None],
+        offset: float = 0.0,
     ) -> None:
         self.config = config
-        self.devices = [DeviceState(driver) for driver in drivers]
+        self.devices = states_of(drivers, offset)
         self.connected = False
         self.opens = 0
         self.error = ""
@@ -96,6 +88,7 @@ class ModbusBus:
         self.guests = GuestQueue()
         self.guests.on_put = self._wake_up
         self._guest_was_last = False
+        self._turns = Turns(self.devices, config.probe_share)
         self._connector = connector
         self._clock = clock
         self._tags = tags
@@ -146,7 +139,10 @@ class ModbusBus:
     async def run(self) -> None:
         """Open, serve, and open again, until cancelled."""
         backoff = Backoff(0.25, 5.0)
-        endpoint = self.config.endpoint
+        config, endpoint = self.config, self.config.endpoint
+        epoch_ns = self._clock.monotonic_ns()
+        for device in self.devices:
+            device.schedule.anchor(epoch_ns)
         while True:
             try:
                 connection = await self._connector.open_bytes(endpoint)
@@ -156,15 +152,26 @@ class ModbusBus:
                 self.guests.fail_all(e)
                 await self._pause(backoff.next_s())
                 continue
-            client = ModbusClient.at(endpoint, connection, self._clock, timeout_s=self.config.timeout_s)
+            client = ModbusClient.at(
+                endpoint,
+                connection,
+                self._clock,
+                timeout_s=config.timeout_s,
+                echo=config.echo,
+                strict=config.strict,
+                turnaround_s=config.turnaround_s,
+                spacing_s=config.spacing_s,
+            )
             self._client = client
             self.connected, self.error, self.down = True, "", None
             self.opens += 1
             try:
                 for device in self.devices:
                     device.driver.attach_client(connection, client)
-                    device.next_try_ns = 0
-                await self._serve(backoff)
+                    device.next_try_ns, device.tried = 0, False
+                if config.connect_pause_s:
+                    await self._pause(config.connect_pause_s)
+                await self._serve(client, backoff)
             except ConnectionLost as e:
                 self._lost(e)
                 await self._pause(backoff.next_s())
@@ -184,26 +191,39 @@ class ModbusBus:
         while self._jobs:
             self._jobs.popleft().done(error)
 
-    async def _serve(self, backoff: Backoff) -> None:
+    async def _serve(self, client: ModbusClient, backoff: Backoff) -> None:
         while True:
             self._wake.clear()
             if self._halted:
                 self._idle.set()
                 await self._wake.wait()
                 continue
-            if self._jobs:
-                await self._run_job(self._jobs.popleft())
+            now_ns = self._clock.monotonic_ns()
+            job, wake_ns = self._next_job(client, now_ns)
+            if job is not None:
+                await self._run_job(job)
                 continue
-            device, group, due_ns = self._next_poll()
-            due = due_ns <= self._clock.monotonic_ns()
+            device, group, at_ns = self._turns.next(client.spaced_ns, now_ns)
+            due = at_ns <= now_ns
             if not (due and self._guest_was_last) and await self._carry_guest():
                 backoff.reset()
             elif due and device is not None:
                 self._guest_was_last = False
-                await self._poll(device, group)
+                await self._poll(client, device, group)
                 backoff.reset()
             else:
-                await self._sleep_or_job(due_ns)
+                await self._sleep_or_job(min(at_ns, wake_ns))
+
+    def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[Job | None, int]:
+        """The first job in line whose unit has had its pause; else None, and when there may be one."""
+        wake_ns = now_ns + NS_PER_S
+        for place, job in enumerate(self._jobs):
+            ready_ns = client.spaced_ns(job.driver.config.address)
+            if ready_ns <= now_ns:
+                del self._jobs[place]
+                return job, now_ns
+            wake_ns = min(wake_ns, ready_ns)
+        return None, wake_ns
 
     async def _carry_guest(self) -> bool:
         """One request of a bridge client, if any waits."""
@@ -222,42 +242,67 @@ class ModbusBus:
         except TimeoutError:
             pass  # the next poll is due
 
-    def _next_poll(self) -> tuple[DeviceState | None, str, int]:
-        """The most overdue poll. A device that is away has only its next try."""
-        best: tuple[int, int, DeviceState, str] | None = None
-        for order, device in enumerate(self.devices):
-            choices = list(device.due_ns.items()) if device.online else [("", device.next_try_ns)]
-            for group, due_ns in choices:
-                if best is None or (due_ns, order) < (best[0], best[1]):
-                    best = (due_ns, order, device, group)
-        if best is None:  # a bus without polls only carries jobs
-            return None, "", self._clock.monotonic_ns() + NS_PER_S
-        return best[2], best[3], best[0]
-
-    async def _poll(self, device: DeviceState, group: str) -> None:
-        device.polls += 1
+    async def _poll(self, client: ModbusClient, device: DeviceState, group: str) -> None:
+        """One turn of a device: a transaction of a group, or first contact."""
+        begun_ns = self._clock.monotonic_ns()
+        device.polls += not device.online or device.reading is None
         try:
             if not device.online:
-                await self._bring_online(device)
-            else:
-                now_ns = self._clock.monotonic_ns()
-                due_ns, every_ms = device.due_ns.pop(group), device.driver.config.poll.get(group)
-                if every_ms is not None:  # else it was read once, after connecting
-                    device.due_ns[group] = max(due_ns + every_ms * NS_PER_MS, now_ns)
-                if await self._trigger(device, group, now_ns):
-                    return
-                await self._attempts(lambda: device.driver.receive(group))
+                device.tried = True
+                group = await self._bring_online(device)
+            await self._turn(device, group)
         except ConnectionLost:
             raise
         except (WireError, WrongDevice, Unreachable) as e:
             device.poll_errors += 1
             self._offline(device, e)
+            now_ns = self._clock.monotonic_ns()
+            self._turns.failed(begun_ns, now_ns, max(now_ns, client.clear_ns))
         except DeviceRefused as e:
             self._refused(device, group, e)
         else:
-            if device.online and group:
-                device.error = ""
-                device.backoff.reset()
+            device.online, device.error = True, ""
+            device.backoff.reset()
+
+    async def _bring_online(self, device: DeviceState) -> str:
+        """First contact, or contact again: is it the right device, and where do its mailboxes stand. Which group to read
+        first: where nothing says who it is, that it answers at all is what makes it online."""
+        driver = device.driver
+        if driver.learnt.missing:
+            driver.ask_again()
+        await self._attempts(device, driver.identify)
+        if isinstance(driver, TransmitterDriver):
+            await self._attempts(device, driver.synchronise)
+        device.schedule.start(self._clock.monotonic_ns())
+        group = next(iter(device.schedule.due_ns), "")
+        # Where nothing of it is ever read, nothing can tell.
+        device.online = bool(driver.config.expect) or isinstance(driver, TransmitterDriver) or not group
+        if device.online:
+            device.error = ""
+        return group
+
+    async def _turn(self, device: DeviceState, group: str) -> None:
+        """The next transaction of `group`: its trigger, its first or a further one."""
+        if not group:
+            return
+        driver, reading = device.driver, device.reading
+        if reading is None:
+            now_ns = self._clock.monotonic_ns()
+            device.reading_due_ns = device.schedule.due_ns[group]
+            device.schedule.took(group, now_ns)
+            if await self._trigger(device, group, now_ns):
+                return
+            reading = device.reading = driver.begin(group)
+        complete = False
+
+        async def next_transaction() -> None:
+            nonlocal complete
+            complete = await driver.read_next(reading)
+
+        await self._attempts(device, next_transaction)
+        if complete:
+            device.reading = None
+            driver.finish(reading)
 
     async def _trigger(self, device: DeviceState, group: str, now_ns: int) -> bool:
         """Where a device measures when asked: ask, and come back for the values; others have the bus meanwhile."""
@@ -267,9 +312,9 @@ class ModbusBus:
             device.triggered.discard(group)
             return False
         if driver.may_trigger:
-            await self._attempts(driver.trigger)
+            await self._attempts(device, driver.trigger)
             device.triggered.add(group)
-            device.due_ns[group] = self._clock.monotonic_ns() + wait_ms * NS_PER_MS
+            device.schedule.defer(group, self._clock.monotonic_ns() + wait_ms * NS_PER_MS)
         else:
             names = [f"{driver.config.name}.{t.name}" for t in driver.profile.group(group)]
             self._tags.put_bad(names, Reason.NOT_SAMPLING)
@@ -282,39 +327,34 @@ class ModbusBus:
         in its place, and the device is given time (MB-023, MB-024).
         """
         device.poll_errors += 1
-        device.error = str(error)
-        if isinstance(error, Acknowledged | ServerBusy) and device.online:
-            device.due_ns[group] = self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S)
-            return
-        names = [t.name for t in device.driver.profile.group(group)] if group else list(device.driver.profile.tags)
-        self._tags.put_bad([f"{device.driver.config.name}.{n}" for n in names], reason_of(error))
-        if not group:
+        device.reading = None
+        if not group:  # it said no when it was asked who it is
             self._offline(device, error)
-
-    async def _bring_online(self, device: DeviceState) -> None:
-        """First contact, or contact again: is it the right device, and where do its mailboxes stand."""
-        driver = device.driver
-        await self._attempts(driver.identify)
-        if isinstance(driver, TransmitterDriver):
-            await self._attempts(driver.synchronise)
-        now_ns = self._clock.monotonic_ns()
-        device.online, device.error = True, ""
-        device.backoff.reset()
-        known = driver.config.expect
-        once = [g for g in driver.plans if any(t.name not in known for t in driver.profile.group(g))]
-        device.due_ns = dict.fromkeys([*driver.config.poll, *once], now_ns)
+            return
+        device.online, device.error = True, str(error)
+        if isinstance(error, Acknowledged | ServerBusy):
+            device.schedule.defer(group, self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S))
+            return
+        names = [f"{device.driver.config.name}.{t.name}" for t in device.driver.profile.group(group)]
+        self._tags.put_bad(names, reason_of(error))
 
     def _offline(self, device: DeviceState, error: FieldtwinError) -> None:
         was_online = device.online
         device.online, device.error = False, str(error)
+        device.reading = None
+        device.schedule.stop()
         device.next_try_ns = self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S)
         self._tags.put_bad(device.driver.tag_names, reason_of(error))
         if was_online:
             self._on_offline(device.driver)
 
     async def _run_job(self, job: Job) -> None:
+        device = next((d for d in self.devices if d.driver is job.driver), None)
+        if device is not None and device.tried and not device.online:
+            job.done(Unreachable(f"the device is away: {device.error}", where=job.driver.config.where))
+            return
         try:
-            await self._attempts(job.run)
+            await self._attempts(device, job.run)
         except ConnectionLost as e:
             job.done(e)
             raise
@@ -323,9 +363,14 @@ class ModbusBus:
         else:
             job.done(None)
 
-    async def _attempts(self, what: Callable[[], Awaitable[None]]) -> None:
-        """Try `1 + retries` times as long as the wire is at fault; what the device refuses is not asked again."""
-        for left in range(self.config.retries, -1, -1):
+    async def _attempts(self, device: DeviceState | None, what: Callable[[], Awaitable[None]]) -> None:
+        """Try `1 + retries` times as long as the wire is at fault; what the device refuses is not asked again, nor is
+        one that was away asked more than once."""
+        retries = self.config.retries
+        if device is not None:
+            stated = device.driver.config.retries
+            retries = 0 if not device.retries_left else retries if stated is None else stated
+        for left in range(retries, -1, -1):
             try:
                 await what()
                 return

@@ -1,0 +1,113 @@
+"""Whose turn it is on a Modbus bus: its devices as the bus sees them, and the poll that goes next.
+
+Pure: times are monotonic nanoseconds, passed in. It must never know a connection or what a poll does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+
+from gateway.core.clock import NS_PER_S
+from gateway.devices.register_device import Reading, RegisterDriver
+from gateway.runtime.backoff import Backoff
+from gateway.runtime.poll_schedule import PollSchedule, Rate, spread
+
+
+@dataclass
+class DeviceState:
+    """What the bus knows about one of its devices. `tried`: it was asked something since the connection was opened.
+    `polls` counts groups that were read, and tries while it was away."""
+
+    driver: RegisterDriver
+    schedule: PollSchedule
+    backoff: Backoff
+    online: bool = False
+    tried: bool = False
+    error: str = "not asked yet"
+    polls: int = 0
+    poll_errors: int = 0
+    next_try_ns: int = 0
+    reading: Reading | None = None
+    """The group that is being read, of which some transactions are left; it began to be due at `reading_due_ns`."""
+    reading_due_ns: int = 0
+    triggered: set[str] = field(default_factory=set)
+
+    @property
+    def unit(self) -> int:
+        return self.driver.config.address
+
+    @property
+    def retries_left(self) -> bool:
+        """Whether a request that nobody answers is worth repeating: not while the device is known to be away."""
+        return self.online or not self.backoff.failures
+
+
+def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]:
+    """The devices of a bus, each with its groups' places in their periods; `offset` keeps several buses apart."""
+    groups: list[tuple[Hashable, int]] = []
+    stated: dict[Hashable, int] = {}
+    for n, driver in enumerate(drivers):
+        groups += [((n, group), every_ms) for group, every_ms in driver.config.poll.items()]
+        stated |= {(n, group): phase_ms for group, phase_ms in driver.config.phase.items()}
+    rates = spread(groups, stated, offset)
+    return [_state(n, driver, rates) for n, driver in enumerate(drivers)]
+
+
+def _state(n: int, driver: RegisterDriver, rates: dict[Hashable, Rate]) -> DeviceState:
+    config, known = driver.config, driver.config.expect
+    once = [
+        group
+        for group in driver.plans
+        if group not in config.poll and any(t.name not in known for t in driver.profile.group(group))
+    ]
+    schedule = PollSchedule({group: rates[n, group] for group in config.poll}, once)
+    return DeviceState(driver, schedule, Backoff(config.backoff_first_s, config.backoff_limit_s))
+
+
+class Turns:
+    """The order of polls among `devices`. Tries of those that are away get at most `probe_share` of the time, over 0 to
+    1, while others answer."""
+
+    def __init__(self, devices: list[DeviceState], probe_share: float) -> None:
+        self._devices = devices
+        self._share = probe_share
+        self._failed_ns = 0
+        self._free_ns = 0
+
+    def next(self, spaced_ns: Callable[[int], int], now_ns: int) -> tuple[DeviceState | None, str, int]:
+        """The most overdue poll of those that may go now, else the one that may go first; and when that is.
+
+        `spaced_ns` tells until when a unit has its pause. A device that is away has only its next try (group ""); a group
+        of which some was read goes on before another one of its device begins.
+        """
+        best: tuple[int, int, int] | None = None
+        found: tuple[DeviceState | None, str] = None, ""  # a bus without polls only carries jobs
+        new = any(not device.tried for device in self._devices)
+        for order, device in enumerate(self._devices):
+            if not device.online:
+                if new and device.tried:
+                    continue  # first those that were not asked at all
+                choices = [("", self._try_ns(device))]
+            elif device.reading is not None:
+                choices = [(device.reading.what, device.reading_due_ns)]
+            else:
+                choices = list(device.schedule.due_ns.items())
+            ready_ns = max(now_ns, spaced_ns(device.unit))
+            for group, due_ns in choices:
+                key = max(due_ns, ready_ns), due_ns, order
+                if best is None or key < best:
+                    best, found = key, (device, group)
+        return *found, best[0] if best is not None else now_ns + NS_PER_S
+
+    def _try_ns(self, device: DeviceState) -> int:
+        """When a device that is away is asked again. On a new connection each is asked once, whatever the share; polls
+        that fell due during one such try go before the next."""
+        return max(device.next_try_ns, self._free_ns) if device.tried else self._failed_ns
+
+    def failed(self, begun_ns: int, now_ns: int, clear_ns: int) -> None:
+        """A device had the bus in vain; the line can be used again at `clear_ns`, behind its quarantine. Those that answer
+        have their share of the time before the next try."""
+        self._failed_ns = now_ns
+        if any(device.online for device in self._devices):
+            self._free_ns = clear_ns + int((clear_ns - begun_ns) * (1 / self._share - 1))

@@ -1,0 +1,85 @@
+"""When a device's poll groups are due: each with its own period, at its own place in it.
+
+Groups of one period are spread over it in the file's order, so that a bus is not asked for everything at once. All times are
+on a grid that begins with the bus: a period that was missed is counted and skipped, never made up for. Pure: times are
+monotonic nanoseconds, passed in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import NamedTuple, TypeVar
+
+from gateway.core.clock import NS_PER_MS
+
+K = TypeVar("K", bound=Hashable)
+
+
+class Rate(NamedTuple):
+    """A group's period, and where in it the group is read (0 to less than the period), in nanoseconds."""
+
+    period_ns: int
+    phase_ns: int
+
+
+def spread(
+    groups: Sequence[tuple[K, int]], stated_ms: Mapping[K, int] | None = None, offset: float = 0.0
+) -> dict[K, Rate]:
+    """A place in its period for each of `groups` (key, period in ms), which are all on one bus.
+
+    The k-th of the n groups of one period P stands at P x (k + offset) / n. `offset`, 0 to less than 1, keeps several
+    buses apart. A phase that is stated counts as it is, modulo the period.
+    """
+    stated = stated_ms or {}
+    members: dict[int, list[K]] = {}
+    for key, period_ms in groups:
+        if key not in stated:
+            members.setdefault(period_ms, []).append(key)
+    rates = {key: Rate(period_ms * NS_PER_MS, stated.get(key, 0) % period_ms * NS_PER_MS) for key, period_ms in groups}
+    for period_ms, keys in members.items():
+        period_ns = period_ms * NS_PER_MS
+        for k, key in enumerate(keys):
+            rates[key] = Rate(period_ns, min(int(period_ns * (k + offset) / len(keys)), period_ns - 1))
+    return rates
+
+
+class PollSchedule:
+    """One device's groups: `rates` of those read again and again, and `once` those read after connecting.
+
+    `due_ns` holds what is to be read and since when; it is empty while the device is away. `missed` counts, group by
+    group, the periods in which a device that was there was not read.
+    """
+
+    def __init__(self, rates: Mapping[str, Rate], once: Sequence[str]) -> None:
+        self._rates = dict(rates)
+        self._once = tuple(once)
+        self._epoch_ns = 0
+        self.due_ns: dict[str, int] = {}
+        self.missed = dict.fromkeys(rates, 0)
+
+    def anchor(self, epoch_ns: int) -> None:
+        """The grid begins at `epoch_ns`."""
+        self._epoch_ns = epoch_ns
+
+    def start(self, now_ns: int) -> None:
+        """The device is there: everything is read once now, and then at its places on the grid."""
+        self.due_ns = dict.fromkeys([*self._rates, *self._once], now_ns)
+
+    def stop(self) -> None:
+        """The device is away: nothing is due, and nothing is missed."""
+        self.due_ns = {}
+
+    def took(self, group: str, now_ns: int) -> None:
+        """`group` is being read now: it is due again at its next place on the grid after now."""
+        due_ns = self.due_ns.pop(group)
+        rate = self._rates.get(group)
+        if rate is None:
+            return
+        start_ns = self._epoch_ns + rate.phase_ns
+        passed = (now_ns - start_ns) // rate.period_ns
+        self.missed[group] += max(0, passed - (due_ns - start_ns) // rate.period_ns)
+        self.due_ns[group] = start_ns + (passed + 1) * rate.period_ns
+
+    def defer(self, group: str, until_ns: int) -> None:
+        """`group` is wanted again at `until_ns`, whatever its grid says: the device asked for time."""
+        self.due_ns[group] = until_ns

@@ -1,0 +1,109 @@
+"""A gateway's Modbus bus in virtual time: emulated units behind a line of 19200 baud, each with a latency of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import NamedTuple
+
+from modbus_virtual import VirtualLoop, VirtualWire
+
+from emulators.modbus.rtu import RtuSlave
+from emulators.modbus.unit import ModbusUnit
+from gateway.core.connection import ByteConnection, CanConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import Unreachable
+from gateway.devices.config import BusConfig
+from gateway.devices.register_device import RegisterDriver
+from gateway.runtime.modbus_bus import ModbusBus
+from gateway.runtime.tags import TagTable
+
+LINE = Endpoint.parse("rtu:/dev/ttyVIRT?baudrate=19200&frame=8E1")
+CHAR_S = LINE.serial.char_time_s
+
+
+class Heard(NamedTuple):
+    """A request as the line carried it: when its first character came, for which unit, and its PDU."""
+
+    t_s: float
+    unit: int
+    pdu: bytes
+
+
+class VirtualLine:
+    """A Connector to one line. `units` may change while it runs; a unit answers `latency_s` behind its request."""
+
+    def __init__(self, loop: VirtualLoop, units: dict[int, ModbusUnit], latency_s: float = 0.005) -> None:
+        self.units = units
+        self.latency_s = latency_s
+        self.slow: dict[int, float] = {}
+        """Units that take longer, in seconds."""
+        self.silent: Callable[[bytes], bool] = lambda frame: False
+        """Requests to which nobody answers."""
+        self.heard: list[Heard] = []
+        self.opened_s = 0.0
+        self._loop = loop
+        self._wire: VirtualWire | None = None
+
+    async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
+        self.opened_s = self._loop.time()
+        self._wire = VirtualWire(endpoint, self._on_write)
+        return self._wire
+
+    async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
+        raise Unreachable("no CAN here", where=str(endpoint))
+
+    def _on_write(self, data: bytes) -> None:
+        self.heard.append(Heard(self._loop.time(), data[0], data[1:-2]))
+        if self.silent(data):
+            return
+        thinks_s = self.slow.get(data[0], self.latency_s)
+        for reply in RtuSlave(self.units).feed(data, self._loop.monotonic_ns()):
+            self._loop.call_later((len(data) + len(reply)) * CHAR_S + thinks_s, self._deliver, reply)
+
+    def _deliver(self, reply: bytes) -> None:
+        assert self._wire is not None
+        self._wire.feed(reply)
+
+    def times(self, unit: int, since_s: float = 0.0, address: int | None = None) -> list[float]:
+        """When requests for `unit` came, of those for a register `address` where one is named."""
+        return [
+            h.t_s
+            for h in self.heard
+            if h.unit == unit and h.t_s >= since_s and address in (None, int.from_bytes(h.pdu[1:3]))
+        ]
+
+
+class VirtualBus(NamedTuple):
+    """A bus that runs over a `VirtualLine`."""
+
+    bus: ModbusBus
+    line: VirtualLine
+    tags: TagTable
+
+
+async def run_bus(
+    make: Callable[[TagTable], list[RegisterDriver]],
+    units: dict[int, ModbusUnit],
+    scenario: Callable[[VirtualBus], Awaitable[None]],
+    *,
+    config: BusConfig | None = None,
+    latency_s: float = 0.005,
+) -> VirtualBus:
+    """Run a bus while `scenario`, a coroutine function, runs; both on the running `VirtualLoop`."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualLoop)
+    line, tags = VirtualLine(loop, units, latency_s), TagTable(loop)
+    drivers = make(tags)
+    for driver in drivers:
+        tags.declare(driver.tag_names, driver.config.stale_after_ms)
+    bus = ModbusBus(config or BusConfig("line", LINE, 0.2, 1), drivers, line, loop, tags, lambda d: None)
+    running = VirtualBus(bus, line, tags)
+    task = loop.create_task(bus.run())
+    try:
+        await scenario(running)
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+    assert task.cancelled(), task.exception()
+    return running

@@ -15,6 +15,9 @@ from pathlib import Path
 from statistics import median
 
 HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
+if str(ROOT) not in sys.path:
+    sys.path.insert(0, str(ROOT))  # started from a checkout that is not installed
 
 
 class Missing(Exception):
@@ -58,6 +61,21 @@ def cpu_s(pid: int) -> float:
     """User and system time that a process has used, in seconds."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def rss_mb(pid: int) -> float:
+    """Memory that a process has now, in MB (10^6 bytes), pages shared with others included."""
+    return _status_kib(pid, "VmRSS") * 1024 / 1e6
+
+
+def peak_mb(pid: int) -> float:
+    """The most that it ever had."""
+    return _status_kib(pid, "VmHWM") * 1024 / 1e6
+
+
+def _status_kib(pid: int, key: str) -> int:
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith(f"{key}:"))
 
 
 def free_port() -> int:

@@ -1,0 +1,211 @@
+#!/usr/bin/env python3
+"""1,000 emulated Modbus TCP devices in one process, each on a port of its own, each polled once a second by one gateway.
+
+    benchmarks/modbus_fleet.py [--devices 1000] [--seconds 30] [--runs 5] [--quick]
+
+A system and a prototype file are made for so many inverters (profile and recording as shipped). Goals: all of them listen 5 s
+after their process was started, the process never takes more than 200 MB, and in `--seconds` no device misses a poll: counted
+by the devices, not by the gateway. The gateway is the one of `fieldtwin run`, a process of its own. The peer is pymodbus: as
+many of its servers in one process, for how fast they are up and how much they take, `--runs` times in turn with ours, ratios
+pair by pair. The polling is one run. Exit status 1 when a goal is missed. Up within 5 s wants a quiet machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import math
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import msgspec
+from peers import HERE, Goals, cpu_s, peak_mb, python, ratio, rss_mb, start, stop
+
+from fieldtwin.running.children import Child
+from gateway.core.control import ControlClient
+from gateway.core.endpoint import Endpoint
+from gateway.devices.register_device import RegisterDriver
+from gateway.runtime.tags import TagTable
+from gateway.wallclock import WallClock
+from twin.controller import ControllerConfig
+from twin.field_process import FieldConfig
+from twin.mapping import mapped_endpoint, mapping_to_json
+from twin.physical import image_layout, make_drivers, make_image
+from twin.system import System, load_system
+
+PROFILE, RECORDING, UNIT = "sunspec-inverter-103", "sunspec-inverter-103.jsonl", 1
+UP_S, MOST_MB, PERIOD_S = 5.0, 200.0, 1.0
+SETTLE_S = 60.0
+"""How long all devices may take to be online at first, on a loaded machine."""
+HALF_PERIOD_S = PERIOD_S / 2
+"""The window is so much longer than whole periods: a poll that is less than that late still falls into it."""
+PROGRAM = '''
+from plc.program import Program
+
+class Idle(Program):
+    """A gateway has a PLC; this one commands nothing."""
+
+    def execute(self, scan):
+        pass
+'''
+
+
+def make_files(folder: Path, devices: int) -> Path:
+    """The system file of so many devices, each on a host of its own, with its prototype file beside it."""
+    (folder / "idle_program.py").write_text(PROGRAM)
+    buses = {f"b{i}": {"url": f"tcp://192.0.2.1:{10_000 + i}"} for i in range(devices)}
+    poll = {"values": {"every_ms": round(PERIOD_S * 1000)}}
+    on_them = {f"d{i}": {"profile": PROFILE, "bus": f"b{i}", "unit": UNIT, "poll": poll} for i in range(devices)}
+    plc = {"cycle_ms": 1000, "programs": {"idle": {"source": "python: idle_program:Idle"}}}
+    system = {"fieldtwin": 1, "system": "fleet", "buses": buses, "devices": on_them, "plc": plc}
+    prototype = {
+        "prototype_of": "fleet.yaml",
+        "buses": {bus: {"listen": "tcp://127.0.0.1:0"} for bus in buses},
+        "devices": {device: {"recording": RECORDING, "at_end": "loop"} for device in on_them},
+    }
+    for name, content in (("fleet.yaml", system), ("fleet.prototype.yaml", prototype)):
+        (folder / name).write_bytes(msgspec.json.format(msgspec.json.encode(content)))
+    return folder / "fleet.yaml"
+
+
+@dataclass
+class Up:
+    """A process with all its servers: seconds until they listened, and memory then."""
+
+    seconds: float
+    mb: float
+
+
+async def emulators_up(folder: Path, system: Path) -> tuple[Child, ControlClient, Up]:
+    config = folder / "field.json"
+    config.write_bytes(msgspec.json.encode(FieldConfig(str(system), str(folder))))
+    began = time.perf_counter()
+    child = Child("field", "twin.field_process", config, folder)
+    client = await child.connect()
+    return child, client, Up(time.perf_counter() - began, rss_mb(child.pid))
+
+
+def pymodbus_up(devices: int) -> Up:
+    began = time.perf_counter()
+    process = start([python(), str(HERE / "serve_pymodbus.py"), "0", str(devices)])
+    try:
+        return Up(time.perf_counter() - began, rss_mb(process.pid))
+    finally:
+        stop(process)
+
+
+async def compare_up(devices: int, runs: int, goals: Goals) -> None:
+    ours, theirs = [], []
+    for _ in range(runs):
+        with tempfile.TemporaryDirectory(prefix="ft-fleet-") as name:
+            child, client, up = await emulators_up(Path(name), make_files(Path(name), devices))
+            ours.append(up)
+            await client.aclose()
+            await child.end()
+        theirs.append(pymodbus_up(devices))
+    print(f"{devices} servers in a process      up, s   memory then, MB     (medians of {runs})")
+    for name, rows in (("fieldtwin, devices", ours), ("pymodbus, registers", theirs)):
+        print(f"  {name:<24} {median(r.seconds for r in rows):>6.2f}   {median(r.mb for r in rows):>6.0f}")
+    slower, more = (ratio([getattr(r, k) for r in ours], [getattr(r, k) for r in theirs]) for k in ("seconds", "mb"))
+    print(f"  ratio                    {slower:>6.2f}   {more:>6.2f}\n")
+    goals.most(f"{devices} devices up", median(r.seconds for r in ours), UP_S, "s")
+
+
+def requests(status: dict[str, Any]) -> dict[str, int]:
+    """Answered requests of each device, as the device counts them."""
+    return {name: d["counters"]["replies"] for name, d in status["devices"].items()}
+
+
+def requests_a_poll(system: System) -> int:
+    """In how many requests a device's registers are read: all must be answered for a poll to count."""
+    clock = WallClock()
+    driver = make_drivers(system, TagTable(clock), clock)["d0"]
+    assert isinstance(driver, RegisterDriver)
+    return len(driver.plans["values"].reads)
+
+
+async def poll(devices: int, seconds: float, goals: Goals) -> None:
+    with tempfile.TemporaryDirectory(prefix="ft-fleet-") as name:
+        folder = Path(name)
+        path = make_files(folder, devices)
+        field, field_client, _ = await emulators_up(folder, path)
+        try:
+            system = load_system(str(path))
+            make_image(image_layout(system), folder / "image")
+            listening = (await field_client.call("get", timeout_s=30))["listening"]
+            mapping = {
+                bus.endpoint: mapped_endpoint(bus.endpoint, Endpoint.parse(listening[bus.name]))
+                for bus in system.buses.values()
+            }
+            config = ControllerConfig(str(path), str(folder), False, mapping_to_json(mapping))
+            (folder / "gateway.json").write_bytes(msgspec.json.encode(config))
+            gateway = Child("gateway", "twin.controller", folder / "gateway.json", folder)
+            try:
+                await watch(field, field_client, gateway, system, seconds, goals)
+            finally:
+                await gateway.end(5.0)
+        finally:
+            await field_client.aclose()
+            await field.end()
+
+
+async def watch(
+    field: Child, client: ControlClient, gateway: Child, system: System, seconds: float, goals: Goals
+) -> None:
+    """Wait until every device is polled, then count for `seconds`."""
+    control, devices, each = await gateway.connect(), len(system.devices), requests_a_poll(system)
+    began = time.perf_counter()
+    counted: dict[str, int] = {}
+    while len(counted) < devices or min(counted.values()) < 4 * each:  # online, identified, polled
+        if time.perf_counter() - began > SETTLE_S or gateway.failure():
+            raise SystemExit(f"modbus_fleet: not every device was polled within {SETTLE_S} s: {gateway.failure()}")
+        await asyncio.sleep(0.5)
+        counted = requests(await client.call("get", timeout_s=30))
+    print(f"every device is polled {time.perf_counter() - began:.1f} s after the gateway was ready")
+    before, cpu_before, t0 = requests(await client.call("get", timeout_s=30)), cpu(field, gateway), time.perf_counter()
+    await asyncio.sleep(seconds + HALF_PERIOD_S)
+    after, cpu_after = requests(await client.call("get", timeout_s=30)), cpu(field, gateway)
+    took_s = time.perf_counter() - t0
+    got = {name: (after[name] - before[name]) / each for name in before}
+    due = int((took_s - HALF_PERIOD_S) / PERIOD_S)
+    short = sum(math.ceil(due - n) for n in got.values() if n < due)
+    field_cpu, gateway_cpu = ((b - a) / took_s for a, b in zip(cpu_before, cpu_after, strict=True))
+    polls = sum(got.values())
+    print(
+        f"{polls:.0f} polls of {each} requests in {took_s:.1f} s; a device got {min(got.values()):g} to {max(got.values()):g}"
+    )
+    print("                         CPU      us/poll   memory, MB (most)")
+    for name, share, child in (("emulators", field_cpu, field), ("gateway", gateway_cpu, gateway)):
+        print(f"  {name:<20} {share:>6.1%}   {share * took_s / polls * 1e6:>8.0f}   {peak_mb(child.pid):>6.0f}")
+    print()
+    goals.most(f"polls missed of {due * devices}", short, 0)
+    goals.most(f"memory of {devices} devices that are polled", peak_mb(field.pid), MOST_MB, "MB")
+    await control.aclose()
+
+
+def cpu(field: Child, gateway: Child) -> tuple[float, float]:
+    return cpu_s(field.pid), cpu_s(gateway.pid)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--devices", type=int, default=1000)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--quick", action="store_true", help="one start, 10 s")
+    options = parser.parse_args()
+    runs, seconds = (1, 10.0) if options.quick else (options.runs, options.seconds)
+    goals = Goals()
+    asyncio.run(compare_up(options.devices, runs, goals))
+    print()
+    asyncio.run(poll(options.devices, seconds, goals))
+    return goals.verdict()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

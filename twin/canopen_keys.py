@@ -9,18 +9,21 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from gateway.core.errors import UsageError
+from gateway.core.profile import DeviceProfile
 from gateway.core.yaml_file import Key, YamlFile
-from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
+from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, RpdoConfig
+from gateway.devices.canopen_rpdo import BITS
 from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
 from gateway.protocols.canopen.concise_dcf import configuration_date, settings_of
-from gateway.protocols.canopen.configure import PdoConfig, tpdos_of
-from gateway.protocols.canopen.dictionary import load_dictionary
+from gateway.protocols.canopen.configure import rpdos_of, tpdos_of
+from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
 from gateway.protocols.canopen.lss import LssAddress
+from gateway.protocols.canopen.pdo import PDO_BITS
 from twin.data_files import find
 from twin.system_schema import BusForm, DeviceForm, IdentityForm
 
 CANOPEN_BUS_KEYS = ("sync", "time_ms", "short_sdo")
-CANOPEN_KEYS = ("identity", "dcf", "store", "lss", "tpdos")
+CANOPEN_KEYS = ("identity", "dcf", "store", "lss", "tpdos", "rpdo1", "rpdos")
 
 
 def canopen_bus(file: YamlFile, name: str, form: BusForm, *, is_can: bool) -> CanopenBusConfig:
@@ -45,35 +48,74 @@ def canopen_node(
     if not is_can:
         _refuse(file, loc, form.model_fields_set.intersection(CANOPEN_KEYS), "a CANopen node")
         return CanopenNodeConfig()
-    configuration, tpdos = _configuration(file, loc, form, path, profiles)
+    dictionary = _dcf(file, loc, form, path, profiles)
+    configuration = _configuration(file, loc, form, dictionary) if dictionary is not None else None
     return CanopenNodeConfig(
         identity=ExpectedIdentity(**form.identity.model_dump()) if form.identity else ExpectedIdentity(),
         dcf=Path(form.dcf).name if form.dcf else "",
         configuration=configuration,
         lss=_address(file, loc, form.identity) if form.lss else None,
-        tpdos=tpdos,
+        tpdos=tpdos_of(dictionary) if dictionary is not None and form.tpdos == "dcf" else None,
         adopt_tpdos=form.tpdos == "node",
+        rpdo1=_rpdo1(form),
+        rpdos=rpdos_of(dictionary) if dictionary is not None and form.rpdos == "dcf" else None,
+        adopt_rpdos=form.rpdos == "node",
     )
 
 
-def _configuration(
+def check_rpdo1(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, profile: DeviceProfile, sync: bool) -> None:
+    """RPDO1's tags may be written and fit into 8 bytes; `sync`: the bus has a SYNC producer."""
+    if form.rpdo1 is None:
+        return
+    loc = (*loc, "rpdo1")
+    bits = 0
+    for i, name in enumerate(form.rpdo1.map):
+        tag = profile.tags.get(name)
+        if tag is None or not tag.writable or name not in form.writable or name in form.rpdo1.map[:i]:
+            raise file.error(
+                (*loc, "map", i), f"{name!r} in an RPDO", expected="tags of this device's `writable`, each once"
+            )
+        if tag.type not in BITS:
+            raise file.error(
+                (*loc, "map", i), f"{name!r} in an RPDO", expected="a number of a fixed size", got=tag.type
+            )
+        bits += BITS[tag.type]
+    if bits > PDO_BITS:
+        raise file.error((*loc, "map"), "this is too much for one RPDO", expected=f"{PDO_BITS} bits", got=f"{bits}")
+    if form.rpdo1.transmission == "sync" and not sync:
+        raise file.error((*loc, "transmission"), "nobody says when its values count", expected="`sync` of the bus")
+
+
+def _rpdo1(form: DeviceForm) -> RpdoConfig | None:
+    if form.rpdo1 is None:
+        return None
+    return RpdoConfig(tuple(form.rpdo1.map), form.rpdo1.transmission == "sync", form.rpdo1.event_ms or 0)
+
+
+def _dcf(
     file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, path: Path, profiles: Iterable[Path]
-) -> tuple[Configuration | None, tuple[PdoConfig, ...] | None]:
+) -> ObjectDictionary | None:
     if form.dcf is None:
-        for key in ("store", "tpdos"):
+        for key in ("store", "tpdos", "rpdos"):
             if getattr(form, key) in (True, "dcf"):
                 raise file.error((*loc, key), f"`{key}` says what to do with a DCF", expected="`dcf`, a DCF file")
-        return None, None
+        return None
     try:
         dcf = find("devices", form.dcf, beside=path, extra=profiles)
     except UsageError as e:
         raise file.error((*loc, "dcf"), "no such file", expected="a DCF", got=form.dcf) from e
-    dictionary = load_dictionary(dcf, form.node)
+    return load_dictionary(dcf, form.node)
+
+
+def _configuration(
+    file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, dictionary: ObjectDictionary
+) -> Configuration:
     settings = settings_of(dictionary)
     if not settings:
-        raise file.error((*loc, "dcf"), "this DCF sets nothing", expected="objects with ParameterValue", got=str(dcf))
-    configuration = Configuration(settings, configuration_date(dictionary), form.store)
-    return configuration, tpdos_of(dictionary) if form.tpdos == "dcf" else None
+        raise file.error(
+            (*loc, "dcf"), "this DCF sets nothing", expected="objects with ParameterValue", got=dictionary.path
+        )
+    return Configuration(settings, configuration_date(dictionary), form.store)
 
 
 def _address(file: YamlFile, loc: tuple[Key, ...], identity: IdentityForm | None) -> LssAddress:

@@ -17,7 +17,7 @@ from gateway.core.errors import UsageError
 from gateway.core.profile import DeviceProfile, Tag, load_profile
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
-from twin.canopen_keys import canopen_bus, canopen_node
+from twin.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from twin.data_files import find
 from twin.serving import Serving, resolve_serving
 from twin.system_schema import BusForm, DeviceForm, PlcForm, SystemForm
@@ -129,14 +129,13 @@ def _device(
         canopen=canopen_node(file, loc, d, path, profiles, is_can=is_can),
     )
     _check_device(file, loc, d, config)
+    check_rpdo1(file, loc, d, profile, bool(buses[d.bus].canopen.sync_ms))
     return config
 
 
 def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:
     """Every tag and poll group that the device's entry names must be in its profile, and fit its use."""
     profile = config.profile
-    if profile.protocol == "canopen" and d.poll:
-        raise file.error((*loc, "poll"), "a CANopen node is not polled: it sends", expected="`tpdo1`, a TPDO's tags")
     groups = [*profile.groups, *(["inbox"] if profile.inbox else [])]
     for group in d.poll:
         if group not in groups:

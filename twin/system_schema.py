@@ -60,6 +60,14 @@ class TpdoForm(Strict):
     event_ms: Milliseconds
 
 
+class RpdoForm(Strict):
+    """What an RPDO of the node carries, and when its values count: at once, or from the next SYNC on."""
+
+    map: list[Name] = Field(min_length=1, max_length=8)
+    transmission: Literal["event", "sync"] = "event"
+    event_ms: Milliseconds | None = Field(default=None, description="how often it is sent although nothing changed")
+
+
 class IdentityForm(Strict):
     """What a CANopen node has to hold in 1000h and 1018h (CiA 302: 1F84h to 1F88h in us)."""
 
@@ -89,6 +97,8 @@ class DeviceForm(Strict):
     store: bool = Field(default=False, description="CANopen: let the node keep its DCF over a restart")
     lss: bool = Field(default=False, description="CANopen: give the node id over LSS to the one with this identity")
     tpdos: Literal["node", "dcf"] | None = Field(default=None, description="CANopen: where TPDO mappings are from")
+    rpdo1: RpdoForm | None = None
+    rpdos: Literal["node", "dcf"] | None = Field(default=None, description="CANopen: where RPDO mappings are from")
     start: bool = False
 
 

@@ -23,11 +23,22 @@ class CanopenBusConfig:
 
 
 @dataclass(frozen=True)
+class RpdoConfig:
+    """The tags that RPDO1 of a node shall carry. `synchronous`: they count from the next SYNC on. `event_ms`: how often it
+    is sent although nothing changed, 0 for never."""
+
+    tags: tuple[str, ...]
+    synchronous: bool = False
+    event_ms: int = 0
+
+
+@dataclass(frozen=True)
 class CanopenNodeConfig:
     """`identity`: who has to answer. `configuration`: what it shall hold, from the DCF `dcf`.
 
     `lss`: the address under which it gets its node id where nobody has that. `tpdos`: the process data that it sends, as
-    its DCF has them; None where `adopt_tpdos` says to read them from the node, or where nothing is said.
+    its DCF has them; None where `adopt_tpdos` says to read them from the node, or where nothing is said. `rpdos` and
+    `adopt_rpdos`: the same of the process data that it takes; `rpdo1`: what its RPDO1 shall be.
     """
 
     identity: ExpectedIdentity = field(default_factory=ExpectedIdentity)
@@ -36,3 +47,6 @@ class CanopenNodeConfig:
     lss: LssAddress | None = None
     tpdos: tuple[PdoConfig, ...] | None = None
     adopt_tpdos: bool = False
+    rpdo1: RpdoConfig | None = None
+    rpdos: tuple[PdoConfig, ...] | None = None
+    adopt_rpdos: bool = False

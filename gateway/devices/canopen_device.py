@@ -1,12 +1,14 @@
-"""The driver of a CANopen node: identity, configuration over SDO, values from TPDO1, state from the heartbeat.
+"""The driver of a CANopen node: identity, configuration over SDO, values from TPDOs, state from the heartbeat.
 
 The node's values are good while its TPDOs come and it is OPERATIONAL; a lost heartbeat makes them bad at once. Without
 leave to write, nothing is configured and nothing is started: the mapping is read from the node and listened to. Nothing
-at all is written to a node that is another than the one expected.
+at all is written to a node that is another than the one expected. What it is commanded goes by RPDO where one of its RPDOs
+has it and may be sent, else by SDO.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 
 from gateway.core.clock import Clock
@@ -14,20 +16,27 @@ from gateway.core.connection import PROTOCOL, CanConnection
 from gateway.core.errors import Bug, NotAllowed, SdoAborted, WrongDevice
 from gateway.core.profile import Tag
 from gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
+from gateway.devices.canopen_rpdo import BITS, Rpdo, is_gap, tags_in, usable
 from gateway.devices.codec import decode_little, encode, reorder
 from gateway.devices.config import DeviceConfig
 from gateway.devices.driver import DeviceDriver, TagSink
 from gateway.protocols.canopen.boot import download_configuration, holds_configuration, identity_differences
-from gateway.protocols.canopen.cob_id import TPDO_BASES
-from gateway.protocols.canopen.configure import configure_tpdo, read_tpdo, read_tpdos, set_heartbeat_producer
+from gateway.protocols.canopen.cob_id import RPDO1_BASE, TPDO_BASES
+from gateway.protocols.canopen.configure import (
+    PdoConfig,
+    configure_rpdo,
+    configure_tpdo,
+    read_rpdos,
+    read_tpdo,
+    read_tpdos,
+    set_heartbeat_producer,
+)
 from gateway.protocols.canopen.master import CanopenMaster, PdoCallback
 from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
 from gateway.protocols.canopen.pdo import PdoLengthMismatch, PdoMapping
 
-BITS = {
-    "bool": 8, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
-    "float32": 32, "float64": 64,
-}  # fmt: skip
+CONSTANT = frozenset({0x1000, 0x1008, 0x1009, 0x100A, 0x1018})
+"""Objects that do not change while a node runs (7.5.2.1, 7.5.2.9 to 7.5.2.11, 7.5.2.19): device type, names, identity."""
 
 NMT_COMMANDS = {
     "nmt_start": NmtCommand.START,
@@ -52,6 +61,9 @@ class CanopenDriver(DeviceDriver):
         self._by_object = {t.object: t for t in self.profile.tags.values()}
         self._mappings: dict[int, PdoMapping] = {}
         self._listening: dict[int, PdoCallback] = {}
+        self._by_change: frozenset[str] = frozenset()
+        self._rpdos: dict[str, Rpdo] = {}
+        self._started = False
 
     @property
     def message_tag(self) -> str | None:
@@ -73,11 +85,28 @@ class CanopenDriver(DeviceDriver):
         names += [self._by_object[o].name for o in mapped if o in self._by_object]
         return [f"{self.config.name}.{name}" for name in dict.fromkeys(names)]
 
+    @property
+    def operational(self) -> bool:
+        """Whether it takes process data: its heartbeat says so, or, where it has none, it was started and told nothing since."""
+        state = self.master.node_state(self.node)
+        if state in (None, NmtState.INITIALISING):
+            return self._started
+        return state is NmtState.OPERATIONAL and not self.master.heartbeat_lost(self.node)
+
+    def stale_after_ms(self, tag: Tag) -> int | None:
+        """How long a value of `tag` is good without being refreshed; None for what cannot change while the node runs, and
+        for what a TPDO tells only when it changes, while a heartbeat tells that the node would."""
+        constant = tag.name in self.config.expect or (tag.object is not None and tag.object[0] in CONSTANT)
+        if constant or (tag.name in self._by_change and self.config.heartbeat is not None):
+            return None
+        return max(self.config.stale_after_ms, 3 * self.config.poll.get(tag.poll, 0))
+
     def attach_master(self, connection: CanConnection, master: CanopenMaster) -> None:
         """Use `master`, which talks over `connection`, from now on."""
         self.attach(connection)
         self._master = master
         self._mappings, self._listening = {}, {}
+        self._rpdos, self._started = {}, False
         consumer_ms = self.config.heartbeat.consumer_ms if self.config.heartbeat else 0
         master.add_node(
             self.node,
@@ -129,20 +158,20 @@ class CanopenDriver(DeviceDriver):
         if self.config.tpdo1 is not None:
             objects = [self._entry(self.profile.tags[t]) for t in self.config.tpdo1.tags]
             cob_id = TPDO_BASES[0] + self.node
-            mapping = await configure_tpdo(
-                self.master, self.node, 1, objects, cob_id, event_ms=self.config.tpdo1.event_ms
-            )
-            self._listen({cob_id: mapping} | await self._other_tpdos())
+            event_ms = self.config.tpdo1.event_ms
+            mapping = await configure_tpdo(self.master, self.node, 1, objects, cob_id, event_ms=event_ms)
+            self._listen([PdoConfig(1, cob_id, True, 254, event_ms, mapping), *await self._other_tpdos()])
         else:
             await self.adopt()
+        await self._take_rpdos()
 
     async def adopt(self) -> None:
         """Take the TPDOs as the node or its DCF has them, and listen. Reads only."""
-        mappings = await self._other_tpdos()
+        tpdos = await self._other_tpdos()
         if self.config.tpdo1 is not None:
             held = await read_tpdo(self.master, self.node, 1)
-            mappings |= {held.cob_id: held.mapping} if held.enabled else {}
-        self._listen(mappings)
+            tpdos += [held] if held.enabled else []
+        self._listen(tpdos)
 
     async def to_be_halted(self) -> bool:
         """Whether the node has to be brought to PRE-OPERATIONAL first: its configuration will change, and it may run."""
@@ -151,21 +180,59 @@ class CanopenDriver(DeviceDriver):
             return False
         return not await holds_configuration(self.master, self.node, configuration.date)
 
-    async def _other_tpdos(self) -> dict[int, PdoMapping]:
-        """COB-IDs and mappings besides what `tpdo1` says of TPDO1: from the DCF, or read from the node."""
+    async def _other_tpdos(self) -> list[PdoConfig]:
+        """Those besides what `tpdo1` says of TPDO1: from the DCF, or read from the node."""
         boot, first = self.config.canopen, 2 if self.config.tpdo1 else 1
         held = boot.tpdos or ()
         if boot.adopt_tpdos:
             held = await read_tpdos(self.master, self.node)
-        return {t.cob_id: t.mapping for t in held if t.enabled and t.number >= first and t.mapping.entries}
+        return [t for t in held if t.enabled and t.number >= first and t.mapping.entries]
 
-    def _listen(self, mappings: dict[int, PdoMapping]) -> None:
+    def _listen(self, tpdos: list[PdoConfig]) -> None:
         for cob_id, callback in self._listening.items():
             self.master.unsubscribe_pdo(cob_id, callback)
-        self._mappings = mappings
-        self._listening = {cob_id: partial(self._on_pdo, mapping) for cob_id, mapping in mappings.items()}
+        self._mappings = {t.cob_id: t.mapping for t in tpdos}
+        self._by_change = frozenset(
+            name for t in tpdos if not t.cyclic for name in tags_in(t.mapping, self._by_object) if name
+        )
+        self._listening = {cob_id: partial(self._on_pdo, mapping) for cob_id, mapping in self._mappings.items()}
         for cob_id, callback in self._listening.items():
             self.master.subscribe_pdo(cob_id, callback)
+
+    async def _take_rpdos(self) -> None:
+        """Map RPDO1 as the system file says, take others as the node or its DCF has them, and see what they hold."""
+        boot, chosen = self.config.canopen, []
+        if boot.rpdo1 is not None:
+            objects = [self._entry(self.profile.tags[t]) for t in boot.rpdo1.tags]
+            cob_id, kind = RPDO1_BASE + self.node, 1 if boot.rpdo1.synchronous else 255
+            mapping = await configure_rpdo(self.master, self.node, 1, objects, cob_id, kind)
+            chosen.append(PdoConfig(1, cob_id, True, kind, None, mapping))
+        held = await read_rpdos(self.master, self.node) if boot.adopt_rpdos else boot.rpdos or ()
+        others = [r for r in held if r.number > 1 or boot.rpdo1 is None]
+        chosen += usable(others, self._by_object, self.config.writable, boot.rpdo1.tags if boot.rpdo1 else ())
+        taken: dict[str, Rpdo] = {}
+        for config in chosen:
+            rpdo = await self._filled(config)
+            taken |= {tag: rpdo for tag in rpdo.tags if tag} if rpdo is not None else {}
+        self._rpdos = taken
+
+    async def _filled(self, config: PdoConfig) -> Rpdo | None:
+        """The RPDO with what the node holds now. None where it does not say: what is not commanded would be overwritten."""
+        held = []
+        for entry in config.mapping.entries:
+            data = b""
+            if not is_gap(entry):
+                try:
+                    data = await self.master.sdo_upload(
+                        self.node, entry.index, entry.subindex, length=(entry.bits + 7) // 8
+                    )
+                except SdoAborted:
+                    return None
+            held.append(data)
+        boot = self.config.canopen
+        repeat_ms = boot.rpdo1.event_ms if boot.rpdo1 is not None and config.number == 1 else 0
+        tags = tags_in(config.mapping, self._by_object)
+        return Rpdo(config.number, config.cob_id, config.mapping, tags, held, config.synchronous, repeat_ms)
 
     def _entry(self, tag: Tag) -> tuple[int, int, int]:
         assert tag.object is not None
@@ -176,7 +243,7 @@ class CanopenDriver(DeviceDriver):
     def _on_pdo(self, mapping: PdoMapping, data: bytes, t_ns: int) -> None:
         if self.identity_error:
             return
-        if self.master.node_state(self.node) not in (NmtState.OPERATIONAL, None):
+        if self.master.node_state(self.node) not in (NmtState.OPERATIONAL, None) and not self.operational:
             return  # a TPDO that overtook its node's last heartbeat: the state decides
         try:
             values = mapping.unpack(data)
@@ -191,10 +258,32 @@ class CanopenDriver(DeviceDriver):
 
     def on_event(self, event: NodeEvent) -> None:
         """The node's state changed, or its heartbeat was lost: its values follow at once."""
+        if event.kind == "boot-up":
+            self._rpdos, self._started = {}, False
         if event.kind == "heartbeat-lost":
             self.sink.put_bad(self.tag_names, Reason.HEARTBEAT_LOST)
         elif event.kind == "boot-up" or (event.kind == "state" and event.state is not NmtState.OPERATIONAL):
             self.sink.put_bad(self.pdo_tags, Reason.NOT_OPERATIONAL)
+
+    # -- what the node is sent -----------------------------------------------------------------------------------------
+
+    def rpdo_of(self, tag_name: str) -> Rpdo | None:
+        """The RPDO by which this tag is commanded; None where it goes by SDO."""
+        return self._rpdos.get(tag_name)
+
+    @property
+    def rpdos(self) -> list[Rpdo]:
+        """Those that this driver sends."""
+        return list(dict.fromkeys(self._rpdos.values()))
+
+    async def send_rpdo(self, rpdo: Rpdo, values: Mapping[str, bytes]) -> None:
+        """Send one frame with `values` by tag. Process data waits in no queue: the newest value is the one that counts."""
+        if self.identity_error:
+            raise NotAllowed("another node answers: nothing is written to it", got=self.identity_error).at(
+                self.config.where
+            )
+        await self.master.send(rpdo.frame(values))
+        rpdo.sent(values)
 
     # -- SDO ------------------------------------------------------------------------------------------------------------
 
@@ -207,8 +296,14 @@ class CanopenDriver(DeviceDriver):
         return value
 
     async def _read(self, what: str) -> list[DATA]:
+        """Read a poll group over SDO, without what TPDOs bring. What the node refuses has no value."""
+        brought = self.pdo_tags
         for tag in self.profile.group(what):
-            await self._upload(tag)
+            if f"{self.config.name}.{tag.name}" not in brought:
+                try:
+                    await self._upload(tag)
+                except SdoAborted:
+                    self.sink.put_bad([f"{self.config.name}.{tag.name}"], Reason.REFUSED)
         return []
 
     async def _write(self, item: DATA) -> None:
@@ -221,6 +316,7 @@ class CanopenDriver(DeviceDriver):
             )
         if item.name in NMT_COMMANDS:
             await self.master.nmt(NMT_COMMANDS[item.name], self.node)
+            self._started = item.name == "nmt_start"
             return
         tag = self.profile.tags[self.profile.form.commands.get(item.name, item.name.removeprefix("set_"))]
         assert tag.object is not None

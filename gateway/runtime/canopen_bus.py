@@ -1,23 +1,26 @@
 """One CAN bus: its connection, the CANopen master on it, and the bringing up of its nodes.
 
 Every node is brought up on its own and again whenever it restarts or was lost: identity, configuration, start, in the order of
-CiA 302-2; a node id that nobody has is given over LSS where the system file says to whom. Configuring, starting, SYNC, TIME and
-LSS are writes: on a plant that was not allowed, the nodes are listened to and nothing more.
+CiA 302-2; a node id that nobody has is given over LSS where the system file says to whom. A node that is up is polled over
+SDO for what no TPDO brings, and takes its outputs (`node_writes`). Configuring, starting, SYNC, TIME, LSS and outputs are
+writes: on a plant that was not allowed, the nodes are listened to and nothing more.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections import Counter
+from collections.abc import Callable, Hashable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 
-from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import Connector
-from gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable, UsageError
+from gateway.core.errors import ConnectionLost, FieldtwinError, NotAllowed, ReplyTimeout, Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.values import COMMAND, Reason
 from gateway.devices.canopen_device import CanopenDriver
+from gateway.devices.canopen_rpdo import Rpdo
 from gateway.devices.config import BusConfig
 from gateway.protocols.canopen.cob_id import LSS_REPLY
 from gateway.protocols.canopen.emcy import parse_emcy
@@ -25,25 +28,39 @@ from gateway.protocols.canopen.emcy_log import EmcyLog
 from gateway.protocols.canopen.lss import UNCONFIGURED, LssAddress
 from gateway.protocols.canopen.lss_master import LssMaster
 from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
+from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
 from gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.modbus_bus import reason_of
+from gateway.runtime.node_writes import Done, NodeWrites
+from gateway.runtime.poll_schedule import PollSchedule, spread
 from gateway.runtime.tags import TagTable
+
+SETTLE_NS = 100 * NS_PER_MS
+"""A TPDO or reply that is this much younger than an RPDO shows what the RPDO did, or that it did not."""
+
+
+def _nobody(driver: CanopenDriver) -> None:
+    pass
 
 
 @dataclass
 class NodeStatus:
-    """What the bus knows about one node. `wanted` is set while it has to be brought up (again)."""
+    """What the bus knows about one node. `wanted` is set while it has to be brought up (again), `up` while it is."""
 
     driver: CanopenDriver
+    writes: NodeWrites
+    schedule: PollSchedule
     online: bool = False
     error: str = "not asked yet"
     boots: int = 0
     emcy_log: EmcyLog = field(default_factory=EmcyLog)
     bring_ups: int = 0
+    polls: int = 0
+    poll_errors: int = 0
     wanted: asyncio.Event = field(default_factory=asyncio.Event)
+    up: asyncio.Event = field(default_factory=asyncio.Event)
     backoff: Backoff = field(init=False)
 
     def __post_init__(self) -> None:
@@ -56,7 +73,8 @@ class NodeStatus:
 
 
 class CanopenBus:
-    """Runs a bus until cancelled."""
+    """Runs a bus until cancelled. `on_offline` is called with the driver of a node that was lost, or may have lost what it
+    was told: it restarted, or left OPERATIONAL."""
 
     def __init__(
         self,
@@ -67,30 +85,79 @@ class CanopenBus:
         tags: TagTable,
         audit: AuditLog,
         allow_writes: bool,
+        on_offline: Callable[[CanopenDriver], None] = _nobody,
     ) -> None:
         self.config = config
-        self.nodes = {d.node: NodeStatus(d) for d in drivers}
+        self.nodes = {d.node: self._status(d, drivers, clock) for d in drivers}
         self.connected = False
         self.opens = 0
         self.error = ""
-        self.not_produced = 0
-        """SYNC and TIME messages that found no room on the bus within their time, or were overslept."""
+        self._not_produced = 0
         self._connector = connector
         self._clock = clock
         self._tags = tags
         self._audit = audit
         self._allow_writes = allow_writes
+        self._on_offline = on_offline
         self._master: CanopenMaster | None = None
         self._lss: LssMaster | None = None
         self._past: Counter[str] = Counter()
+
+    def _status(self, driver: CanopenDriver, drivers: list[CanopenDriver], clock: Clock) -> NodeStatus:
+        groups: list[tuple[Hashable, int]] = [
+            ((d.node, group), every_ms) for d in drivers for group, every_ms in d.config.poll.items()
+        ]
+        rates = spread(groups)
+        schedule = PollSchedule({group: rates[driver.node, group] for group in driver.config.poll}, ())
+        return NodeStatus(driver, NodeWrites(driver, clock, self.config.timeout_s), schedule)
+
+    # -- what others see ----------------------------------------------------------------------------------------------
+
+    @property
+    def not_produced(self) -> int:
+        """SYNC, TIME and repeated RPDO messages that found no room on the bus within their time, or were overslept."""
+        return self._not_produced + sum(status.writes.not_sent for status in self.nodes.values())
+
+    def takes(self, driver: CanopenDriver, tag: str) -> bool:
+        """Whether a write of this tag can go out now: the node is up, and OPERATIONAL where it goes by RPDO."""
+        status = self.nodes[driver.node]
+        if not status.online or self._master is None:
+            return False
+        if driver.rpdo_of(tag) is not None:
+            return driver.operational
+        return self._master.node_state(driver.node) is not NmtState.STOPPED  # no SDO then (7.3.2.2)
+
+    def frame_of(self, driver: CanopenDriver, tag: str) -> Rpdo | None:
+        """What the tag shares one frame with; None for one that is written by itself."""
+        return driver.rpdo_of(tag)
+
+    def settle_ns(self, driver: CanopenDriver, tag: str) -> int:
+        """How long after a write the node may still tell the value before it."""
+        rpdo = driver.rpdo_of(tag)
+        if rpdo is None:
+            return SETTLE_NS
+        return SETTLE_NS + (2 * self.config.canopen.sync_ms * NS_PER_MS if rpdo.synchronous else 0)
+
+    def write(self, driver: CanopenDriver, tag: str, command: COMMAND, done: Done) -> None:
+        """Put a write on its way; `done` is told how it ended, at once where it cannot go out."""
+        if not self._allow_writes:
+            done(NotAllowed("this plant is read-only", where=driver.config.where))
+        elif not self.takes(driver, tag):
+            done(Unreachable("the node takes nothing now", where=driver.config.where))
+        else:
+            self.nodes[driver.node].writes.write(tag, command, done)
 
     def totals(self) -> Counter[str]:
         """Counters over all connections so far."""
         return self._past + Counter(asdict(self._master.counters)) if self._master else Counter(self._past)
 
+    # -- running --------------------------------------------------------------------------------------------------------
+
     async def run(self) -> None:
         """Open, serve, and open again, until cancelled."""
         backoff = Backoff(0.25, 5.0)
+        for status in self.nodes.values():
+            status.schedule.anchor(self._clock.monotonic_ns())
         while True:
             try:
                 connection = await self._connector.open_can(self.config.endpoint, self.config.bitrate)
@@ -116,7 +183,12 @@ class CanopenBus:
                     for status in self.nodes.values():
                         status.driver.attach_master(connection, master)
                         status.wanted.set()
-                        nursery.start(self._keep_up(status), f"{status.driver.config.name} bring-up")
+                        name = status.driver.config.name
+                        nursery.start(self._keep_up(status), f"{name} bring-up")
+                        nursery.start(status.writes.run_downloads(), f"{name} downloads")
+                        nursery.start(status.writes.run_rpdos(), f"{name} RPDOs")
+                        if status.driver.config.poll:
+                            nursery.start(self._poll(status), f"{name} polls")
                     for producer in self._producers():
                         nursery.start(self._produce(producer, master), f"{self.config.name} {producer.name}")
                     backoff.reset()
@@ -146,13 +218,13 @@ class CanopenBus:
             await self._clock.sleep_until_ns(producer.next_ns)
             missed = producer.missed
             frame = producer.due(self._clock.monotonic_ns(), self._clock.utc_ns())
-            self.not_produced += producer.missed - missed
+            self._not_produced += producer.missed - missed
             if frame is not None:
                 try:
                     async with asyncio.timeout(producer.period_ns / NS_PER_S):
                         await master.send(frame)
                 except TimeoutError:
-                    self.not_produced += 1
+                    self._not_produced += 1
 
     async def _pause(self, seconds: float) -> None:
         await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(seconds * NS_PER_S))
@@ -160,8 +232,27 @@ class CanopenBus:
     def _lost(self, error: FieldtwinError) -> None:
         self.connected, self.error = False, str(error)
         for status in self.nodes.values():
-            status.online, status.error = False, str(error)
+            self._offline(status, error)
             self._tags.put_bad(status.driver.tag_names, Reason.UNREACHABLE)
+
+    def _offline(self, status: NodeStatus, error: FieldtwinError) -> None:
+        """The node is away, or no longer as it was brought up: what was on its way to it ends."""
+        status.online, status.error = False, str(error)
+        status.up.clear()
+        status.schedule.stop()
+        status.writes.fail(error)
+        self._on_offline(status.driver)
+
+    def _online(self, status: NodeStatus) -> None:
+        driver = status.driver
+        for tag in driver.profile.tags.values():
+            if tag.readable:  # which tags a TPDO brings, and when, may be known only now
+                self._tags.declare([f"{driver.config.name}.{tag.name}"], driver.stale_after_ms(tag))
+        status.online, status.error = True, ""
+        status.bring_ups += 1
+        status.backoff.reset()
+        status.schedule.start(self._clock.monotonic_ns())
+        status.up.set()
 
     async def _keep_up(self, status: NodeStatus) -> None:
         """Bring the node up now, and again each time that it is wanted."""
@@ -179,12 +270,41 @@ class CanopenBus:
                 self._failed(status, e)
                 await self._pause(status.backoff.next_s())
             else:
-                status.online, status.error = True, ""
-                status.bring_ups += 1
-                status.backoff.reset()
+                if not status.wanted.is_set():  # else it restarted meanwhile
+                    self._online(status)
+
+    async def _poll(self, status: NodeStatus) -> None:
+        """Read the node's groups in their turn while it is up. Periods that were missed are counted and skipped."""
+        schedule = status.schedule
+        while True:
+            await status.up.wait()
+            group, due_ns = min(schedule.due_ns.items(), key=lambda item: item[1])
+            now_ns = self._clock.monotonic_ns()
+            if due_ns > now_ns:
+                await self._clock.sleep_until_ns(due_ns)
+                continue
+            schedule.took(group, now_ns)
+            await self._read_group(status, group)
+
+    async def _read_group(self, status: NodeStatus, group: str) -> None:
+        driver, master = status.driver, status.driver.master
+        if master.node_state(driver.node) is NmtState.STOPPED:
+            return  # it answers no SDO (7.3.2.2): the values grow stale
+        status.polls += 1
+        try:
+            await driver.receive(group)
+        except ConnectionLost:
+            raise
+        except FieldtwinError as e:
+            status.poll_errors += 1
+            brought = driver.pdo_tags
+            names = [f"{driver.config.name}.{t.name}" for t in driver.profile.group(group)]
+            self._tags.put_bad([name for name in names if name not in brought], reason_of(e))
+            if status.online and driver.config.heartbeat is None:
+                self._failed(status, e)  # no heartbeat will tell
 
     def _failed(self, status: NodeStatus, error: FieldtwinError) -> None:
-        status.online, status.error = False, str(error)
+        self._offline(status, error)
         self._tags.put_bad(status.driver.tag_names, reason_of(error))
         status.wanted.set()
 
@@ -222,7 +342,7 @@ class CanopenBus:
             driver.consumer.observe(COMMAND(b"", "nmt_preoperational"))
             await driver.send()
         dcf = f"{driver.config.canopen.dcf} unless it holds that, " if driver.config.canopen.configuration else ""
-        what = f"{dcf}heartbeat and TPDO1 as in the system file"
+        what = f"{dcf}heartbeat, TPDO1 and RPDO1 as in the system file"
         self._audit.note("sdo", name, by="start-up", result="asked", what=what)
         await driver.configure()
         if driver.config.start:
@@ -238,11 +358,13 @@ class CanopenBus:
         if event.kind == "boot-up":
             status.boots += 1
             status.emcy_log.restarted()
-            status.online, status.error = False, "the node restarted"
+            self._offline(status, Unreachable("the node restarted"))
             status.wanted.set()
         elif event.kind == "heartbeat-lost":
-            status.online, status.error = False, "heartbeat lost"
+            self._offline(status, Unreachable("heartbeat lost"))
             status.wanted.set()
+        elif event.kind == "state" and event.state is not NmtState.OPERATIONAL:
+            self._on_offline(status.driver)  # what it does with its outputs then is its own affair
         elif event.kind == "conflict":
             status.error = "two nodes answer under this node id"
         elif event.kind == "emcy":

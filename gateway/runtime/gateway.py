@@ -97,10 +97,14 @@ class Gateway:
         self._stopping = False
 
     def _declare(self, driver: RegisterDriver | CanopenDriver) -> None:
-        """Tags read again and again grow stale; those read once, at identification, do not."""
+        """Tags read again and again grow stale; a register that is read once, at identification, does not."""
         config = driver.config
+        if isinstance(driver, CanopenDriver):
+            for tag in driver.profile.tags.values():
+                if tag.readable:
+                    self.tags.declare([f"{config.name}.{tag.name}"], driver.stale_after_ms(tag))
+            return
         cyclic = {t.name for g in config.poll for t in driver.profile.group(g)}
-        cyclic |= set(config.tpdo1.tags) if config.tpdo1 else set()
         for tag in driver.profile.tags.values():
             if tag.readable:
                 every_ms = config.poll.get(tag.poll, 0)
@@ -112,7 +116,7 @@ class Gateway:
         if bus.endpoint.is_can:
             nodes = [d for d in on_it if isinstance(d, CanopenDriver)]
             self.buses[bus.name] = CanopenBus(
-                bus, nodes, connector, self.clock, self.tags, self._audit, self.config.allow_writes
+                bus, nodes, connector, self.clock, self.tags, self._audit, self.config.allow_writes, self._on_offline
             )
         elif on_it or any(bus.name in b.buses for b in self.config.bridges):
             units = [d for d in on_it if isinstance(d, RegisterDriver)]
@@ -129,8 +133,8 @@ class Gateway:
         for tag in sorted(self.config.outputs | served):
             device, _, local = tag.partition(".")
             driver = self.drivers[device]
-            if isinstance(driver, RegisterDriver) and not isinstance(driver, TransmitterDriver):
-                made.append(Output(tag, local, driver, self._modbus(driver), driver.config.safe.get(local)))
+            if not isinstance(driver, TransmitterDriver):
+                made.append(Output(tag, local, driver, self.buses[driver.config.bus], driver.config.safe.get(local)))
         return made
 
     def _message_sources(self) -> dict[str, Consumer[DATA]]:
@@ -147,7 +151,7 @@ class Gateway:
         on_it = [d for d in self.drivers.values() if d.config.bus == bus and unit in (d.config.address, 0)]
         return next((f"{d.config.where}: {d.identity_error}" for d in on_it if d.identity_error), "")
 
-    def _on_offline(self, driver: RegisterDriver) -> None:
+    def _on_offline(self, driver: RegisterDriver | CanopenDriver) -> None:
         self.outputs.forget(driver)
 
     # -- running --------------------------------------------------------------------------------------------------------

@@ -2,7 +2,8 @@
 
 A dead PLC cannot make anything safe, so the gateway holds each output's safe value and writes it when the PLC's heartbeat
 stops (DESIGN.md, "Who makes outputs safe"). A value is written when it differs from what the device last confirmed; a device
-that comes back, or that reads back something else, gets it again. Nothing is written to a plant that was not allowed,
+that comes back, or that reads back something else, gets it again. Outputs that share one frame (an RPDO) are written
+together. Nothing is written to a plant that was not allowed,
 and every write and refusal is on record before it is on the wire.
 """
 
@@ -14,9 +15,11 @@ from functools import partial
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
-from gateway.core.values import Quality
+from gateway.core.values import COMMAND, Quality
+from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
+from gateway.runtime.canopen_bus import CanopenBus
 from gateway.runtime.modbus_bus import Job, ModbusBus
 from gateway.runtime.tags import TagTable
 
@@ -32,8 +35,8 @@ class Output:
 
     tag: str
     local: str
-    driver: RegisterDriver
-    bus: ModbusBus
+    driver: RegisterDriver | CanopenDriver
+    bus: ModbusBus | CanopenBus
     safe: float | None
     wanted: float | None = None
     by: str = ""
@@ -44,6 +47,39 @@ class Output:
     next_try_ns: int = 0
     asked: Callable[[FieldtwinError | None], None] | None = None
     """Who asked for one write and waits for its end; None for what the PLC or the safe state commands."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether the device takes a write now."""
+        if isinstance(self.driver, CanopenDriver):
+            assert isinstance(self.bus, CanopenBus)
+            return self.bus.takes(self.driver, self.local)
+        assert isinstance(self.bus, ModbusBus)
+        return self.bus.online(self.driver)
+
+    @property
+    def frame(self) -> object | None:
+        """What it shares one frame with: the same object for each of those outputs. None where it is written by itself."""
+        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
+            return self.bus.frame_of(self.driver, self.local)
+        return None
+
+    @property
+    def settle_ns(self) -> int:
+        """How long after a write the device may still be heard to say what it held before."""
+        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
+            return self.bus.settle_ns(self.driver, self.local)
+        return 0
+
+    def submit(self, command: COMMAND, done: Callable[[FieldtwinError | None], None]) -> None:
+        """Put the write on its way."""
+        if isinstance(self.driver, CanopenDriver):
+            assert isinstance(self.bus, CanopenBus)
+            self.bus.write(self.driver, self.local, command, done)
+        else:
+            assert isinstance(self.bus, ModbusBus)
+            self.driver.consumer.observe(command)
+            self.bus.submit(Job(self.driver, self.driver.send, done))
 
     def shown(self, value: object) -> object:
         """`value` as the audit log may show it: a secret is not written down."""
@@ -89,7 +125,7 @@ class OutputWriter:
             done(EndpointBusy("the outputs are in their safe state", where=where))
         elif output.pending or self._now_ns < output.next_try_ns:
             done(EndpointBusy("another write has just been made, or is under way", where=where))
-        elif not output.bus.online(output.driver):
+        elif not output.ready:
             done(Unreachable("the device does not answer", where=where))
         else:
             output.wanted, output.by, output.asked = value, by, done
@@ -106,7 +142,7 @@ class OutputWriter:
         """The PLC is back: its commands count again."""
         self.safe_active = False
 
-    def forget(self, driver: RegisterDriver) -> None:
+    def forget(self, driver: RegisterDriver | CanopenDriver) -> None:
         """A device was lost: what it holds when it comes back is not known."""
         for output in self.outputs:
             if output.driver is driver:
@@ -120,17 +156,27 @@ class OutputWriter:
         )
 
     def _possible(self, output: Output) -> bool:
-        return output.bus.online(output.driver) and output.refused != (output.wanted, output.by)
+        return output.ready and output.refused != (output.wanted, output.by)
 
     def tick(self, now_ns: int) -> None:
         """Start what needs writing now."""
         self._now_ns = now_ns
+        due: list[tuple[Output, float]] = []
         for output in self.outputs:
             if output.wanted is None or output.pending:
                 continue
             self._compare_with_device(output, now_ns)
             if output.held != output.wanted and self._possible(output) and now_ns >= output.next_try_ns:
-                self._start(output, output.wanted)
+                due.append((output, output.wanted))
+        waiting = self._waiting_frames(now_ns) if due else set()
+        for output, value in due:
+            if output.frame is None or output.frame not in waiting:
+                self._start(output, value)
+
+    def _waiting_frames(self, now_ns: int) -> set[object]:
+        """Frames of which an output has to wait: the others wait with it, so that what a scan commanded goes out whole."""
+        waits = [o for o in self.outputs if o.pending or now_ns < o.next_try_ns]
+        return {o.frame for o in waits if o.frame is not None}
 
     def _compare_with_device(self, output: Output, now_ns: int) -> None:
         """A device that reads back something else lost what it was told (a restart): tell it again.
@@ -138,7 +184,11 @@ class OutputWriter:
         Compared as sent: a device may hold a rounded value, and that is no other one.
         """
         current = self._tags.current(output.tag, now_ns)
-        if output.held is None or current.t_ns <= output.held_since_ns or current.quality is Quality.BAD:
+        if (
+            output.held is None
+            or current.t_ns <= output.held_since_ns + output.settle_ns
+            or current.quality is Quality.BAD
+        ):
             return
         sent = output.driver.command(output.local, output.held).data
         if int.from_bytes(current.raw) != int.from_bytes(sent):
@@ -172,8 +222,7 @@ class OutputWriter:
             output.answer(Unreachable("the write could not be put on record", where=name))
             return
         output.pending = True
-        output.driver.consumer.observe(command)
-        output.bus.submit(Job(output.driver, output.driver.send, partial(self._done, output, value)))
+        output.submit(command, partial(self._done, output, value))
 
     def _on_record(self, output: Output, name: str, old: object, value: float) -> bool:
         """Note the write before it happens. Without a record only a safe value is written; the rest is tried again."""

@@ -70,7 +70,10 @@ def _devices(gateway: Gateway, now_ns: int) -> dict[str, Any]:
                     "emcys": status.emcys,
                     "emcy": [f"{code:04X}h" for code in status.emcy_log.active],
                     "emcy_log": status.emcy_log.describe(now_ns),
-                    "errors": driver.malformed_pdos,
+                    "errors": driver.malformed_pdos + status.poll_errors,
+                    "polls": status.polls,
+                    "rpdos": {str(r.number): [tag for tag in r.tags if tag] for r in driver.rpdos},
+                    "rpdos_sent": status.writes.frames,
                 }
         else:
             for state in bus.devices:
@@ -95,6 +98,7 @@ def _bus(bus: Any) -> dict[str, Any]:
         "opens": bus.opens,
         "error": bus.error,
         "counters": dict(bus.totals()),
+        **({"not_produced": bus.not_produced} if isinstance(bus, CanopenBus) else {}),
     }
 
 

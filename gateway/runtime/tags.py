@@ -39,11 +39,13 @@ class TagTable:
         self.journal_dropped = 0
 
     def declare(self, names: list[str], stale_after_ms: int | None) -> None:
-        """Make tags known. A value not refreshed for `stale_after_ms` is bad; None for values read once (an identity)."""
+        """Make tags known. A value not refreshed for `stale_after_ms` is bad; None for what does not age (an identity)."""
         for name in names:
             self._values.setdefault(name, NEVER)
             if stale_after_ms is not None:
                 self._stale_ns[name] = stale_after_ms * NS_PER_MS
+            else:
+                self._stale_ns.pop(name, None)
 
     @property
     def names(self) -> list[str]:

@@ -1,0 +1,85 @@
+"""The process data that a node is sent: what stands in each RPDO, and which of its RPDOs we may fill at all.
+
+An RPDO carries all of its objects each time, so that it may be used only where each of them may be written, and is filled
+from what the node held when it was brought up. Pure: it must never know a bus, a master or when something is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+from gateway.core.canframe import CanFrame
+from gateway.core.profile import Tag
+from gateway.protocols.canopen.configure import PdoConfig
+from gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
+
+BITS = {
+    "bool": 8, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
+    "float32": 32, "float64": 64,
+}  # fmt: skip
+"""Bits of a tag's object; a BOOLEAN object may be mapped with 1."""
+
+DUMMY_MAX = 0x1F
+"""Objects up to here are data types: in a mapping, a gap (7.4.8)."""
+
+ObjectTags = Mapping[tuple[int, int] | None, Tag]
+
+
+@dataclass(eq=False)
+class Rpdo:
+    """One RPDO. `held` is what the node last was told, object by object; `repeat_ms` 0: sent only when something changes."""
+
+    number: int
+    cob_id: int
+    mapping: PdoMapping
+    tags: tuple[str, ...]
+    held: list[bytes]
+    synchronous: bool = False
+    repeat_ms: int = 0
+
+    def frame(self, values: Mapping[str, bytes]) -> CanFrame:
+        """The frame with `values` (tag: bytes, little endian) in place of what is held."""
+        return CanFrame(self.cob_id, self.mapping.pack(self._with(values)))
+
+    def sent(self, values: Mapping[str, bytes]) -> None:
+        """`frame(values)` is on the bus: that is what the node holds."""
+        self.held = self._with(values)
+
+    def _with(self, values: Mapping[str, bytes]) -> list[bytes]:
+        return [values.get(tag, held) for tag, held in zip(self.tags, self.held, strict=True)]
+
+
+def is_gap(entry: PdoEntry) -> bool:
+    """Whether a mapped object is none, but room."""
+    return entry.index <= DUMMY_MAX
+
+
+def tags_in(mapping: PdoMapping, by_object: ObjectTags) -> tuple[str, ...]:
+    """The tag of each mapped object, "" for a gap and for an object that is no tag of this size."""
+    return tuple(_tag_of(entry, by_object) for entry in mapping.entries)
+
+
+def _tag_of(entry: PdoEntry, by_object: ObjectTags) -> str:
+    tag = by_object.get((entry.index, entry.subindex))
+    if tag is None or (entry.bits != BITS.get(tag.type) and (tag.type, entry.bits) != ("bool", 1)):
+        return ""
+    return tag.name
+
+
+def usable(
+    held: Collection[PdoConfig], by_object: ObjectTags, writable: Collection[str], taken: Collection[str] = ()
+) -> list[PdoConfig]:
+    """Those of a node's RPDOs that we may send: enabled, each object in `writable`, and no tag in two of them.
+
+    `taken` are tags that another RPDO has already: a second one would put back what the first changed.
+    """
+    found, seen = [], set(taken)
+    for config in held:
+        tags = [
+            t for t, e in zip(tags_in(config.mapping, by_object), config.mapping.entries, strict=True) if not is_gap(e)
+        ]
+        if config.enabled and tags and all(t in writable for t in tags) and not seen.intersection(tags):
+            seen.update(tags)
+            found.append(config)
+    return found

@@ -1,0 +1,152 @@
+"""What is on its way to one CANopen node: RPDOs with their newest values, and SDO downloads one behind the other.
+
+What is offered together goes in one frame. Process data is never queued: a newer value takes an older one's place, whose
+sender is told of the same end. It must never know what is wanted or safe, nor whether writing is allowed at all.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable
+from gateway.core.values import COMMAND
+from gateway.devices.canopen_device import CanopenDriver
+from gateway.devices.canopen_rpdo import Rpdo
+
+Done = Callable[[FieldtwinError | None], None]
+"""Told once how a write ended."""
+
+
+@dataclass
+class _Staged:
+    """What shall go with an RPDO's next frame, and who waits for that."""
+
+    values: dict[str, bytes] = field(default_factory=dict)
+    waiting: list[Done] = field(default_factory=list)
+
+
+class NodeWrites:
+    """Writes to the node of `driver`. `timeout_s` is how long the bus may take to accept a frame.
+
+    At most one write of a tag is under way, which its caller sees to: so there are never more than a node has tags.
+    """
+
+    def __init__(self, driver: CanopenDriver, clock: Clock, timeout_s: float) -> None:
+        self.frames = self.not_sent = 0
+        """RPDOs that went out, and repetitions for which the bus had no room."""
+        self._driver = driver
+        self._clock = clock
+        self._timeout_s = timeout_s
+        self._staged: dict[Rpdo, _Staged] = {}
+        self._downloads: deque[tuple[COMMAND, Done]] = deque()
+        self._repeat_ns: dict[Rpdo, int] = {}
+        self._rpdo_wake, self._download_wake = asyncio.Event(), asyncio.Event()
+
+    def write(self, tag: str, command: COMMAND, done: Done) -> None:
+        """Put one write on its way, by RPDO where the tag has one."""
+        rpdo = self._driver.rpdo_of(tag)
+        if rpdo is None:
+            self._downloads.append((command, done))
+            self._download_wake.set()
+        else:
+            staged = self._staged.setdefault(rpdo, _Staged())
+            staged.values[tag] = command.data
+            staged.waiting.append(done)
+            self._rpdo_wake.set()
+
+    def fail(self, error: FieldtwinError) -> None:
+        """The node or the bus is gone: whatever was on its way ends with `error`."""
+        waiting = [done for staged in self._staged.values() for done in staged.waiting]
+        waiting += [done for _, done in self._downloads]
+        self._staged.clear()
+        self._downloads.clear()
+        self._repeat_ns.clear()
+        for done in waiting:
+            done(error)
+
+    # -- running --------------------------------------------------------------------------------------------------------
+
+    async def run_downloads(self) -> None:
+        """Carry out SDO downloads until cancelled; raises `ConnectionLost`."""
+        while True:
+            await self._download_wake.wait()
+            self._download_wake.clear()
+            while self._downloads:
+                command, done = item = self._downloads[0]
+                error: FieldtwinError | None = None
+                self._driver.consumer.observe(command)
+                try:
+                    await self._driver.send()
+                except ConnectionLost:
+                    raise  # `fail` tells everybody
+                except FieldtwinError as e:
+                    error = e
+                finally:
+                    self._driver.consumer.queue.clear()  # what failed must not go out ahead of something newer
+                if self._downloads and self._downloads[0] is item:  # else it was told already that the node is gone
+                    self._downloads.popleft()
+                    done(error)
+
+    async def run_rpdos(self) -> None:
+        """Send RPDOs that changed, and those that are repeated, until cancelled; raises `ConnectionLost`."""
+        while True:
+            self._rpdo_wake.clear()
+            for rpdo in list(self._staged):
+                await self._send(rpdo)
+            await self._repeat()
+            if not self._staged:
+                await self._sleep()
+
+    async def _send(self, rpdo: Rpdo) -> None:
+        staged = self._staged[rpdo]
+        values, waiting = dict(staged.values), len(staged.waiting)
+        error = await self._put_on_bus(rpdo, values)
+        if self._staged.get(rpdo) is not staged:
+            return  # the node was lost meanwhile, and everybody told
+        ended, staged.waiting = staged.waiting[:waiting], staged.waiting[waiting:]
+        staged.values = {tag: data for tag, data in staged.values.items() if values.get(tag) != data}
+        if not staged.waiting:
+            del self._staged[rpdo]
+        for done in ended:
+            done(error)
+
+    async def _put_on_bus(self, rpdo: Rpdo, values: dict[str, bytes]) -> FieldtwinError | None:
+        """Send; what went wrong, if something did. Nothing is sent to a node that would not take it."""
+        if not self._driver.operational or rpdo not in self._driver.rpdos:
+            return Unreachable("the node is not OPERATIONAL: it takes no process data", where=self._driver.config.where)
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                await self._driver.send_rpdo(rpdo, values)
+        except TimeoutError:
+            return ReplyTimeout("the bus takes no frames", where=self._driver.config.where)
+        except ConnectionLost:
+            raise
+        except FieldtwinError as e:
+            return e
+        self.frames += 1
+        if rpdo.repeat_ms:
+            self._repeat_ns[rpdo] = self._clock.monotonic_ns() + rpdo.repeat_ms * NS_PER_MS
+        return None
+
+    async def _repeat(self) -> None:
+        """Once more what has not changed for its time: a node may watch over its RPDOs (1400h:05)."""
+        now_ns = self._clock.monotonic_ns()
+        for rpdo in [r for r, due_ns in self._repeat_ns.items() if due_ns <= now_ns]:
+            if rpdo not in self._driver.rpdos or not self._driver.operational:
+                del self._repeat_ns[rpdo]  # it goes on with the next change
+            elif await self._put_on_bus(rpdo, {}) is not None:
+                self.not_sent += 1
+                self._repeat_ns[rpdo] = now_ns + rpdo.repeat_ms * NS_PER_MS
+
+    async def _sleep(self) -> None:
+        due_ns = min(self._repeat_ns.values(), default=None)
+        left_s = None if due_ns is None else max(0.0, (due_ns - self._clock.monotonic_ns()) / NS_PER_S)
+        try:
+            async with asyncio.timeout(left_s):
+                await self._rpdo_wake.wait()
+        except TimeoutError:
+            pass  # something is to be repeated

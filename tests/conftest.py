@@ -34,6 +34,21 @@ def leaves_nothing_to_the_collector() -> Iterator[None]:
     gc.collect()
 
 
+WHOLE_SYSTEMS = ("system", "spec", "interop")
+"""Folders whose tests start many processes: two such tests at once would only wait for each other."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """With several processes (pytest-xdist): whole systems in one of them, one after the other; all else file by file."""
+    if not config.pluginmanager.hasplugin("xdist"):
+        return
+    here = Path(__file__).parent
+    for item in items:
+        folder = item.path.relative_to(here).parts[0]
+        item.add_marker(pytest.mark.xdist_group("systems" if folder in WHOLE_SYSTEMS else item.path.name))
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Tests marked `socketcan` want a kernel with CAN and its vcan0; scripts/test-vcan provides both."""
     if item.get_closest_marker("socketcan") and not Path("/sys/class/net/vcan0").exists():

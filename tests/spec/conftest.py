@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 
 
 def _parts(nodeid: str) -> tuple[str, str]:
-    name = nodeid.rpartition("::")[2].partition("[")[0].removeprefix("test_")
+    name = nodeid.rpartition("::")[2].partition("[")[0].partition("@")[0].removeprefix("test_")
     if name.startswith("prose_"):
         _, number, what = name.split("_", 2)
         return f"Prose, row {number}", what.replace("_", " ")

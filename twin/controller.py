@@ -10,6 +10,7 @@ import asyncio
 import os
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from gateway.core.connection import Connector
 from gateway.core.control import ControlServer
 from gateway.core.errors import FieldtwinError, Unreachable
 from gateway.core.nursery import Nursery
+from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
+from gateway.runtime.learnt import LearntFile, describe_learnt
 from gateway.runtime.status import describe
 from gateway.store.exchange_log import ExchangeLog
 from gateway.wallclock import WallClock
@@ -80,6 +83,11 @@ class GatewayProcess:
                     allow_writes=self._config.allow_writes,
                     free_ports=self._config.mapping is not None,
                 )
+                # What emulators teach is no fact about the devices of a plant.
+                kept = "learnt.json" if self._config.mapping is None else "learnt.prototype.json"
+                drivers = [d for d in self._gateway.drivers.values() if isinstance(d, RegisterDriver)]
+                self._learnt = LearntFile(run_dir / kept, drivers, system.buses)
+                self._learnt.load()
                 await self._serve(run_dir / "gateway.sock")
         finally:
             log.close()
@@ -118,6 +126,7 @@ class GatewayProcess:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + FLUSH_EVERY_NS)
             try:
                 await asyncio.to_thread(self._gateway.log.flush)
+                self._learnt.save()
                 self._store_error = ""
             except Unreachable as e:
                 self._store_error = str(e)
@@ -126,7 +135,14 @@ class GatewayProcess:
         return {"ready": True, "pid": os.getpid()}
 
     async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {**describe(self._gateway, self._clock.monotonic_ns()), "store_error": self._store_error}
+        return self._status()
+
+    def _status(self) -> dict[str, Any]:
+        return {
+            **describe(self._gateway, self._clock.monotonic_ns()),
+            "learnt": describe_learnt(self._gateway.drivers.values()),
+            "store_error": self._store_error,
+        }
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
         """At most `PUBLISHED_AT_ONCE` entries, the oldest first: who wants them all asks again."""
@@ -139,7 +155,9 @@ class GatewayProcess:
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""
         safe = await self._gateway.shut_down()
-        status = describe(self._gateway, self._clock.monotonic_ns())
+        with suppress(Unreachable):  # then it is learnt again
+            self._learnt.save()
+        status = self._status()
         asyncio.get_running_loop().call_later(0.05, self._stop.set)
         return {"safe": safe, "status": status}
 

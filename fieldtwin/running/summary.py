@@ -33,6 +33,7 @@ def summarise(run: RunSession) -> dict[str, Any]:
         "published": {"values": gateway.get("published", 0), **run.oracle.describe()},
         "mailboxes": gateway.get("mailboxes", {}),
         "far_end": run.shore.describe() if run.shore else None,
+        "learnt": gateway.get("learnt", {}),
         "logged": gateway.get("logged", 0),
         "writes": gateway.get("writes", {}),
         "outputs_safe": run.outputs_confirmed_safe,

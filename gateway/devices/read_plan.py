@@ -171,7 +171,6 @@ class GroupPlan:
         """The device refused `read` with exception `code`: what to read instead. Empty when a single value is
         refused: it is left out."""
         self._refused_any = True
-        self._splits.pop(read, None)  # the gap beside it is not proved: this refusal explains the one of the whole
         parts = split(self._profile, read) or ()
         self.reads = [r for known in self.reads for r in (parts if known == read else (known,))]
         if not parts:
@@ -188,7 +187,7 @@ class GroupPlan:
             return
         whole.taken.add(read)
         first, second = whole.first, whole.second
-        if len(whole.taken) == 2 and first in self._splits and second in self._splits:
+        if len(whole.taken) == 2:  # a side that was refused explains the refusal of the whole by itself
             gap = second.range.address - first.range.end if whole.code == ILLEGAL_ADDRESS else 0
             self.learnt.learn_gap(RegisterRange(first.range.table, first.range.end, gap))
             del self._splits[first], self._splits[second]

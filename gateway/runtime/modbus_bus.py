@@ -120,8 +120,11 @@ class ModbusBus:
         self._wake.set()
 
     def totals(self) -> Counter[str]:
-        """Counters over all connections so far: requests, replies, timeouts..."""
-        return self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
+        """Counters over all connections so far: requests, replies, timeouts... and `missed_polls`, periods in which a
+        group of a device that was there was not read."""
+        totals = self._past + Counter(asdict(self._client.counters)) if self._client else Counter(self._past)
+        totals["missed_polls"] = sum(sum(d.schedule.missed.values()) for d in self.devices)
+        return totals
 
     async def halt(self, timeout_s: float) -> None:
         """Send nothing more: return when the request under way has ended, or after `timeout_s` seconds."""

@@ -2,7 +2,7 @@
 
 Knows no protocol. What a real port does and a pty does not is made up for here: the port stays when nobody has it open
 (a spare descriptor of the far end is kept, or reading would fail with EIO), bytes pass unchanged (raw mode), and with
-`pace` a reply takes the time that the line would have needed. Parity does not exist on a pty.
+`pace` a request and its reply take the time that the line would have needed. Parity does not exist on a pty.
 """
 
 from __future__ import annotations
@@ -51,10 +51,12 @@ class PtyEnd(ByteConnection):
         self._room: asyncio.Future[None] | None = None
         self._reading = False
         self._settle_check: asyncio.TimerHandle | None = None
+        self._on_its_way: asyncio.TimerHandle | None = None
 
     @classmethod
     async def open(cls, link: Path, endpoint: Endpoint, pace: SerialSettings | None = None) -> PtyEnd:
-        """Make the port and its link, replacing a link that is there. With `pace`, replies come at that line's speed.
+        """Make the port and its link, replacing a link that is there. With `pace`, bytes come and go at that line's speed:
+        what is read is there when its last character is.
 
         Raises `EndpointBusy` where something that is no link stands in the way, `Unreachable` where none can be made.
         """
@@ -98,7 +100,12 @@ class PtyEnd(ByteConnection):
         self._close()
 
     def on_room(self) -> None:
-        if not self._reading and self._master >= 0 and len(self.inbound.data_stream) < self.max_pending:
+        if (
+            not self._reading
+            and self._on_its_way is None
+            and self._master >= 0
+            and len(self.inbound.data_stream) < self.max_pending
+        ):
             self._resume_reading()
 
     # -- the line's time ------------------------------------------------------------------------------------------
@@ -130,10 +137,20 @@ class PtyEnd(ByteConnection):
             return
         _raise_idle_flags(self._spare)
         if self._inward is not None:
-            self._inward.send(self._now_ns(), len(data))
-        if not self.feed(data):
-            self._reading = False
-            self._loop.remove_reader(self._master)
+            self._stop_reading()  # what follows goes behind it, and waits in the pty
+            end_ns = self._inward.send(self._now_ns(), len(data))
+            self._on_its_way = self._loop.call_at(end_ns / NS_PER_S, self._arrived, data)
+        elif not self.feed(data):
+            self._stop_reading()
+
+    def _arrived(self, data: bytes) -> None:
+        self._on_its_way = None
+        if self.feed(data):
+            self._resume_reading()
+
+    def _stop_reading(self) -> None:
+        self._reading = False
+        self._loop.remove_reader(self._master)
 
     def _unsettle(self) -> None:
         """Keep the port open to the next program, whatever the last one set."""
@@ -175,8 +192,9 @@ class PtyEnd(ByteConnection):
     def _close(self) -> None:
         if self._master < 0:
             return
-        if self._settle_check is not None:
-            self._settle_check.cancel()
+        for timer in (self._settle_check, self._on_its_way):
+            if timer is not None:
+                timer.cancel()
         self._loop.remove_reader(self._master)
         self._loop.remove_writer(self._master)
         self._on_writable()

@@ -236,6 +236,45 @@ def test_a_paced_reply_takes_the_time_of_the_line(tmp_path: Path, settings: Seri
     run(main())
 
 
+def test_what_is_read_is_there_when_the_line_has_carried_it(tmp_path: Path) -> None:
+    """A device begins to think when it has heard the last character, and hears one request after the other."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        settings = SerialSettings(9600, "8N1")
+        end = await PtyEnd.open(tmp_path / "line1", LINE, settings)
+        port = open_port(tmp_path / "line1")
+        line = SerialPacer(settings)
+        began_s = loop.time()
+        heard = bytearray()
+        os.write(port, b"1234567")
+        while len(heard) < 15:
+            heard += await end.read()
+            assert loop.time() - began_s >= line.duration_ns(len(heard)) / 1e9 - 1e-6, "heard before it was there"
+            if len(heard) == 7:
+                os.write(port, b"89")
+                os.write(port, b"abcdef")
+        assert heard == b"123456789abcdef"
+        os.close(port)
+        await end.aclose()
+
+    run(main())
+
+
+def test_a_port_that_closes_while_something_is_on_its_way_forgets_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        end = await PtyEnd.open(tmp_path / "line1", LINE, SerialSettings(1200, "8N1"))
+        port = open_port(tmp_path / "line1")
+        os.write(port, bytes(100))
+        await eventually(lambda: end._on_its_way is not None)
+        await end.aclose()
+        assert end._on_its_way is not None
+        assert end._on_its_way.cancelled()
+        os.close(port)
+
+    run(main())
+
+
 def test_a_paced_reply_comes_in_pieces_as_it_is_sent(tmp_path: Path) -> None:
     """A master that waits for the first byte must not wait for the last one."""
 

@@ -141,7 +141,7 @@ class FieldSide:
             return
         units = {d.address: self._modbus_unit(d) for d in on_it}
         stated_s = max((self.prototype.devices[d.name].form.latency_ms for d in on_it), default=0.0) / 1000
-        plant = self.system.buses[bus.name].endpoint
+        plant, echo = self.system.buses[bus.name].endpoint, self.system.buses[bus.name].echo
         latency_s: float | Latency = stated_s
         if not stated_s and any(isinstance(unit, RecordedDevice) for unit in units.values()):
             latency_s = as_recorded(plant.serial if listen.scheme == "pty" and bus.pace else None)
@@ -151,7 +151,7 @@ class FieldSide:
             self._connections.append(end)
             self.listening[bus.name] = Endpoint("pty", path=str(end.link))
             self._nursery.start(
-                serve_rtu(end, line_of(plant, units), self._clock, latency_s), f"emulators on {bus.name}"
+                serve_rtu(end, line_of(plant, units), self._clock, latency_s, echo=echo), f"emulators on {bus.name}"
             )
         elif listen.scheme == "udp":
             datagrams = await UdpEnd.open(listen)
@@ -162,7 +162,7 @@ class FieldSide:
         elif plant.is_serial or plant.scheme == "rtu+tcp":
             line = line_of(plant, units)
             self.listening[bus.name] = await self._listen(
-                listen, lambda c: serve_rtu(c, line, self._clock, latency_s), 1
+                listen, lambda c: serve_rtu(c, line, self._clock, latency_s, echo=echo), 1
             )
         else:
             self.listening[bus.name] = await self._listen(

@@ -10,6 +10,7 @@ import mmap
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from gateway.core.clock import Clock
@@ -121,11 +122,12 @@ def _check_variables(system: System, bound: BoundProgram) -> None:
 
 
 def gateway_config(system: System, *, allow_writes: bool, free_ports: bool = False) -> GatewayConfig:
-    """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host."""
+    """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host;
+    and no line is strict about silences: those of virtual ports say nothing."""
     serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
     return GatewayConfig(
-        buses=system.buses,
+        buses={name: replace(bus, strict=bus.strict and not free_ports) for name, bus in system.buses.items()},
         devices=system.devices,
         cycle_ms=fastest_ms(system),
         plc_lost_ms=max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system)),

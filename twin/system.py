@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gateway.core.endpoint import Endpoint
@@ -19,6 +19,7 @@ from gateway.core.yaml_file import Key, YamlFile, load, validate
 from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from twin.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from twin.data_files import find
+from twin.modbus_keys import connect_pauses, modbus_bus, modbus_device
 from twin.serving import Serving, resolve_serving
 from twin.system_schema import BusForm, DeviceForm, PlcForm, SystemForm
 
@@ -53,6 +54,7 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
     buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
     known: dict[Path, DeviceProfile] = {}  # a profile that a hundred devices have is read once
     devices = {n: _device(file, n, d, buses, path, profiles, known) for n, d in form.devices.items()}
+    buses = connect_pauses(buses, form, devices)
     _check_addresses(file, devices)
     system = System(
         name=form.system,
@@ -83,7 +85,7 @@ def _bus(file: YamlFile, name: str, form: BusForm) -> BusConfig:
     except UsageError as e:
         raise file.error(("buses", name, "url"), e.message, expected=e.expected, got=e.got) from e
     canopen = canopen_bus(file, name, form, is_can=endpoint.is_can)
-    return BusConfig(name, endpoint, form.timeout_ms / 1000, form.retries, form.bitrate, canopen=canopen)
+    return replace(modbus_bus(file, name, form, endpoint), canopen=canopen)
 
 
 def _device(
@@ -130,7 +132,7 @@ def _device(
     )
     _check_device(file, loc, d, config)
     check_rpdo1(file, loc, d, profile, bool(buses[d.bus].canopen.sync_ms))
-    return config
+    return modbus_device(file, loc, d, config)
 
 
 def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Name = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 Milliseconds = Annotated[int, Field(ge=1, le=3_600_000)]
+Pause = Annotated[int, Field(ge=0, le=60_000)]
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 TagName = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*\.[a-zA-Z][a-zA-Z0-9_]*$")]
 
@@ -35,15 +36,26 @@ class BusForm(Strict):
     timeout_ms: Milliseconds = 1000
     retries: int = Field(default=1, ge=0, le=10)
     bitrate: int = Field(default=125_000, ge=10_000, le=1_000_000, description="CAN only; checked, not set")
+    spacing_ms: Pause = Field(default=0, description="Modbus: pause behind every exchange on the bus")
+    turnaround_ms: Milliseconds = Field(default=100, description="Modbus: pause behind a broadcast")
+    connect_pause_ms: Pause | None = Field(
+        default=None, description="Modbus: pause behind connecting; default: the longest of its devices' profiles"
+    )
+    echo: bool = Field(default=False, description="serial: the adapter gives back what is sent")
+    strict: bool = Field(default=False, description="RTU: refuse frames with pauses that the standard forbids")
+    probe_percent: int = Field(
+        default=10, ge=1, le=100, description="Modbus: time for devices that do not answer, at most, while others do"
+    )
     sync: SyncForm | None = None
     time_ms: Milliseconds | None = Field(default=None, description="CANopen: how often TIME is sent")
     short_sdo: bool = Field(default=False, description="CANopen: take SDO replies of fewer than 8 bytes")
 
 
 class PollForm(Strict):
-    """How often a poll group is read."""
+    """How often a poll group is read, and where in its period; by default groups of one period are spread over it."""
 
     every_ms: Milliseconds
+    phase_ms: int | None = Field(default=None, ge=0, lt=3_600_000)
 
 
 class HeartbeatForm(Strict):
@@ -87,6 +99,13 @@ class DeviceForm(Strict):
     node: int | None = Field(default=None, ge=1, le=127)
     expect: dict[Name, str] = {}
     poll: dict[Name, PollForm] = {}
+    timeout_ms: Milliseconds | None = Field(default=None, description="Modbus; default: the profile's, else the bus's")
+    retries: int | None = Field(default=None, ge=0, le=10, description="Modbus; default: the bus's")
+    spacing_ms: Pause | None = Field(
+        default=None, description="Modbus: pause between a reply and the next request for it"
+    )
+    backoff_first_ms: Milliseconds = Field(default=250, description="Modbus: how long it is left alone when it is lost")
+    backoff_limit_ms: Milliseconds = Field(default=10_000, description="Modbus: that doubles up to this")
     stale_after_ms: Milliseconds = 5000
     writable: list[Name] = []
     safe: dict[Name, int | float] = {}

@@ -275,14 +275,14 @@ def print_summary(summary: dict[str, Any]) -> None:
         data.print(f"  far end        commands {far['commands_sent']}, responses {far['responses']}")
     data.print(f"  logged         {summary['logged']} exchanges")
     for name, learnt in summary["learnt"].items():
-        data.print(f"  {name:<14} {_learnt_text(learnt)}", soft_wrap=True, markup=False)
+        data.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
     for error in summary["errors"]:
         data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
 
 
-def _learnt_text(learnt: dict[str, Any]) -> str:
-    """What a device taught; the line for its profile last, so that it can be taken as it is."""
+def _learnt_text(learnt: dict[str, Any], kind: str) -> str:
+    """What a device, or what stood in for it, taught; the line for its profile last, so that it can be taken as it is."""
     parts = []
     if learnt["missing"]:
         parts.append(f"does not have {', '.join(learnt['missing'])}")
@@ -292,7 +292,7 @@ def _learnt_text(learnt: dict[str, Any]) -> str:
         )
     if learnt["line"]:
         parts.append(f"for the profile of {learnt['profile']}: {learnt['line']}")
-    return "learnt: " + "; ".join(parts)
+    return f"learnt from the {kind}: " + "; ".join(parts)
 
 
 def _exchange_text(row: dict[str, Any]) -> str:

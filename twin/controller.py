@@ -27,7 +27,7 @@ from gateway.runtime.audit import AuditLog
 from gateway.runtime.learnt import LearntFile, describe_learnt
 from gateway.runtime.status import describe
 from gateway.store.exchange_log import ExchangeLog
-from gateway.wallclock import WallClock
+from gateway.wallclock import WallClock, run
 from twin.mapping import MappedConnector, mapping_from_json
 from twin.physical import EmbeddedControlSystem, attached
 from twin.system import load_system
@@ -170,7 +170,7 @@ def main(argv: list[str]) -> int:
     """Run the process; errors go to stderr as one line."""
     try:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=ControllerConfig)
-        return asyncio.run(GatewayProcess(config).run())
+        return run(GatewayProcess(config).run())
     except FieldtwinError as e:
         print(f"fieldtwin gateway: {e}", file=sys.stderr)
         return e.exit_code

@@ -20,7 +20,7 @@ from gateway.core.control import ControlServer
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, UsageError
 from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
+from gateway.wallclock import WallClock, run
 from twin.field import FieldSide
 from twin.prototype import DigitalTwinPrototype
 from twin.prototype_file import load_prototype
@@ -127,7 +127,7 @@ def main(argv: list[str]) -> int:
     """Run the process; errors go to stderr as one line."""
     try:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=FieldConfig)
-        return asyncio.run(FieldProcess(config).run())
+        return run(FieldProcess(config).run())
     except FieldtwinError as e:
         print(f"fieldtwin field side: {e}", file=sys.stderr)
         return e.exit_code

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import sys
 
@@ -14,6 +13,7 @@ from fieldtwin.running.bridging import BridgeOptions, run_bridge
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from gateway.runtime.bridge_policy import LOOPBACK, network
+from gateway.wallclock import run
 
 ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
 
@@ -98,7 +98,7 @@ def command(
     )
     if not networks and options.listen.host not in ANYWHERE:
         talk.print("only clients of this host may ask; --allow NETWORK lets others in")
-    result = asyncio.run(run_bridge(options, lambda text: talk.print(text, soft_wrap=True, markup=False)))
+    result = run(run_bridge(options, lambda text: talk.print(text, soft_wrap=True, markup=False)))
     if as_json:
         json.dump(result, sys.stdout, indent=2)
         sys.stdout.write("\n")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import click
@@ -89,8 +88,9 @@ def command(
                 hint="a system's prototype file says where it listens",
             )
         from fieldtwin.running.field_here import FieldOptions, run_field
+        from gateway.wallclock import run as run_precise
 
-        return asyncio.run(
+        return run_precise(
             run_field(
                 FieldOptions(
                     system=path,
@@ -126,7 +126,8 @@ def command(
         raise UsageError("a device has a unit id or a node id, not both")
     unit = node if unit is None else unit
     recording = Path(recordings[0]) if recordings else None
-    return run_loop(run_device(kind, path, endpoints, unit, recording, speed or 1.0, bitrate))
+    serial = any(endpoint.startswith("pty:") for endpoint in endpoints)
+    return run_loop(run_device(kind, path, endpoints, unit, recording, speed or 1.0, bitrate), serial=serial)
 
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:

@@ -11,13 +11,17 @@ from dataclasses import dataclass
 from types import CodeType
 
 from gateway.core.errors import FileInvalid
+from plc.program import Program
 from plc.st import tree as t
 from plc.st import types as ty
 from plc.st.declarations import Declarations
-from plc.st.expressions import Expressions
 from plc.st.parse import parse
 from plc.st.scope import Environment, Parameter, Signature, Symbol, Writer, by_reference
 from plc.st.statements import Statements
+
+MAX_CALLS = 64
+"""POUs that call each other in a row."""
+_API = frozenset(name for name in vars(Program) if not name.startswith("__")) | {"execute"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,21 +69,26 @@ class _Unit:
         self.unit = unit
         self._check_names()
         self.declarations = Declarations(self.env, unit, self.out)
-        self._write_globals()
+        self._declare_global_constants()
+        self.declarations.resolve()
+        self._declare_globals()
         for pou in unit.pous:
             if pou.kind == "FUNCTION":
-                self.env.functions[pou.name.lower()] = self._signature(pou)
+                with self.declarations.within(pou):
+                    self.env.functions[pou.name.lower()] = self._signature(pou)
 
     def compiled(self) -> CompiledUnit:
         programs = []
         for pou in self.unit.pous:
-            if pou.kind == "FUNCTION":
-                self._write_function(pou)
-            elif pou.kind == "FUNCTION_BLOCK":
-                self._write_block(pou)
-            else:
-                programs.append(self._write_program(pou))
+            with self.declarations.within(pou):
+                if pou.kind == "FUNCTION":
+                    self._write_function(pou)
+                elif pou.kind == "FUNCTION_BLOCK":
+                    self._write_block(pou)
+                else:
+                    programs.append(self._write_program(pou))
         self._refuse_recursion()
+        self._write_globals()
         text = "\n".join(line for line, _ in self.out.lines) + "\n"
         return CompiledUnit(self.env.path, self._code(text), text, tuple(programs))
 
@@ -102,23 +111,48 @@ class _Unit:
                     node.lineno = node.end_lineno = lines[min(node.lineno, len(lines)) - 1]
                     node.col_offset = node.end_col_offset = 0
             return compile(tree, self.env.path or "<st>", "exec")
-        except (SyntaxError, MemoryError, RecursionError) as e:
-            raise FileInvalid(f"too deep for the compiler: {e}", path=self.env.path) from e
+        except (SyntaxError, MemoryError, RecursionError) as e:  # Python's limits; those of this compiler are narrower
+            at = e.lineno if isinstance(e, SyntaxError) and e.lineno else 1
+            line = lines[min(at, len(lines)) - 1]
+            raise FileInvalid(f"too deep for the compiler: {e}", path=self.env.path, line=line, column=1) from e
 
     # -- variables --------------------------------------------------------------------------------------------------------
 
+    def _declare_global_constants(self) -> None:
+        """Those with a value that is known at once: types may name them in their limits."""
+        for block in self.unit.globals:
+            for v in block.variables if "CONSTANT" in block.qualifiers else ():
+                if isinstance(v.type, t.NamedType) and v.type.name.upper() in ty.ELEMENTARY:
+                    symbol = self.declarations.constant(v, f"_G.v_{v.name.lower()}")
+                    if symbol is not None:
+                        self.env.globals[v.name.lower()] = symbol
+
+    def _declare_globals(self) -> None:
+        seen: set[str] = set()
+        for block in self.unit.globals:
+            self._no_retain(block, "a VAR_GLOBAL")
+            for v in block.variables:
+                self._no_address(v)
+                if v.name.lower() in seen:
+                    self.env.fail(v.pos, f"{v.name} is declared twice")
+                seen.add(v.name.lower())
+                self.env.globals[v.name.lower()] = self._symbol(v, block, f"_G.v_{v.name.lower()}")
+        if seen:
+            first = self.unit.globals[0].pos
+            self.declarations.bounded(first, (symbol.type for symbol in self.env.globals.values()))
+
     def _write_globals(self) -> None:
-        with self.out.block("class _G:"):
-            for block in self.unit.globals:
-                for v in block.variables:
-                    self._no_address(v)
-                    if v.name.lower() in self.env.globals:
-                        self.env.fail(v.pos, f"{v.name} is declared twice")
-                    symbol = self._symbol(v, block, f"_G.v_{v.name.lower()}")
-                    self.env.globals[v.name.lower()] = symbol
-                    self.out.line(
-                        f"v_{v.name.lower()} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos
-                    )
+        """Behind everything that they may be made of, and before any program is made."""
+        self.out.line("class _G: pass")
+        for block in self.unit.globals:
+            for v in block.variables:
+                symbol = self.env.globals[v.name.lower()]
+                if symbol.constant is None:
+                    self.out.line(f"{symbol.code} = {self.declarations.initial(symbol.type, v.initial, v.type)}", v.pos)
+
+    def _no_retain(self, block: t.VarBlock, what: str) -> None:
+        if block.qualifiers & {"RETAIN", "PERSISTENT"}:
+            self.env.fail(block.pos, f"{what} cannot be RETAIN", hint="a PROGRAM's VAR RETAIN can, also a block in it")
 
     def _no_address(self, v: t.VarDecl) -> None:
         if v.location:
@@ -131,19 +165,14 @@ class _Unit:
         kind = self.declarations.type_of(v.type, block.kind)
         if "CONSTANT" not in block.qualifiers:
             return Symbol(v.name, kind, code, writable=block.kind != "VAR_INPUT")
-        if v.initial is None or isinstance(v.initial, t.InitArray | t.InitStruct):
-            return Symbol(v.name, kind, code, writable=False)
-        compiler = Expressions(self.env, {}, self.out)
-        value = compiler.value(v.initial)
-        text = compiler.coerced(value, kind, v.initial.pos, "an initial value")
-        if value.constant is None:
-            return Symbol(v.name, kind, code, writable=False)
-        return Symbol(v.name, kind, text, writable=False, constant=value.constant)
+        return self.declarations.constant(v, code) or Symbol(v.name, kind, code, writable=False)
 
     def _symbols(self, pou: t.Pou, prefix: str) -> dict[str, Symbol]:
         """All variables of a POU. `prefix`: where they are kept; VAR_TEMP is always local to a call."""
         symbols: dict[str, Symbol] = {}
         for block in pou.blocks:
+            if pou.kind != "PROGRAM":
+                self._no_retain(block, f"a variable of a {pou.kind}")
             for v in block.variables:
                 key = v.name.lower()
                 self._no_address(v)
@@ -153,6 +182,8 @@ class _Unit:
                     symbols[key] = self._external(v)
                     continue
                 symbols[key] = self._symbol(v, block, f"{'' if block.kind == 'VAR_TEMP' else prefix}v_{key}")
+        own = (symbols[v.name.lower()].type for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables)
+        self.declarations.bounded(pou.pos, own)
         return symbols
 
     def _external(self, v: t.VarDecl) -> Symbol:
@@ -182,9 +213,8 @@ class _Unit:
             for v in block.variables:
                 if block.kind in found:
                     kind = self.declarations.type_of(v.type)
-                    found[block.kind].append(
-                        Parameter(v.name, kind, self.declarations.initial(kind, v.initial, v.type))
-                    )
+                    initial = self.declarations.shared(self.declarations.initial(kind, v.initial, v.type))
+                    found[block.kind].append(Parameter(v.name, kind, initial))
         return Signature(
             pou.name,
             self.declarations.type_of(pou.returns),
@@ -197,6 +227,8 @@ class _Unit:
         signature = self.env.functions[pou.name.lower()]
         key = pou.name.lower()
         symbols = self._symbols(pou, "")
+        if key in symbols:
+            self.env.fail(pou.pos, f"{pou.name} is its own result, and declared once more")
         symbols.setdefault(key, Symbol(pou.name, signature.returns, f"v_{key}"))
         arguments = ", ".join(f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs)
         body = Statements(self.env, symbols, self.out, pou.name.lower())
@@ -241,6 +273,10 @@ class _Unit:
                 if "CONSTANT" not in block.qualifiers:
                     kind = symbols[v.name.lower()].type
                     self._check_interface(v, kind, role or "")
+                    if v.name in _API or v.name.startswith("st_"):
+                        self.env.fail(v.pos, f"a PROGRAM's variable needs another name than {v.name}")
+                    if retain and isinstance(kind, ty.MessagesIn | ty.MessagesOut):
+                        self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
                     variables.append(ProgramVariable(v.name, role or "", kind, retain))
         with self.out.block(f"class P_{pou.name.lower()}:", pou.pos):
             with self.out.block("def __init__(self):"):
@@ -284,6 +320,9 @@ class _Unit:
         """IEC 61131-3, 6.6.1.5: a POU never calls itself, nor through others."""
 
         def walk(name: str, path: tuple[str, ...]) -> None:
+            if len(path) > MAX_CALLS:
+                pos = next(iter(self.env.calls[path[-2]].values()))
+                self.env.fail(pos, "calls nested too deep", expected=f"at most {MAX_CALLS}")
             for callee, pos in self.env.calls.get(name, {}).items():
                 if callee in path:
                     self.env.fail(pos, f"{callee} calls itself: {' -> '.join((*path[path.index(callee) :], callee))}")

@@ -52,7 +52,7 @@ def _convert(x: Expressions, call: t.Call, source: ty.Type | None, target: ty.Ty
         if isinstance(source, ty.String) and not isinstance(kind, ty.String):
             x.env.fail(expr.pos, f"the argument of {call.ref.name}", expected="a string", got=str(kind))
     if isinstance(kind, ty.AnyInt):
-        kind = ty.LINT
+        kind = ty.LINT if ty.fits(kind, ty.LINT) else ty.ULINT
     elif isinstance(kind, ty.AnyReal):
         kind = ty.LREAL
     elif isinstance(kind, ty.Enum):
@@ -61,6 +61,8 @@ def _convert(x: Expressions, call: t.Call, source: ty.Type | None, target: ty.Ty
     made = _of_string(code, target) if isinstance(kind, ty.String) else _of_value(code, kind, target, cut)
     if made is None:
         x.env.fail(call.pos, f"there is no conversion from {kind} to {target}")
+    if isinstance(kind, ty.String) and isinstance(target, ty.String):
+        target = ty.String(kind.length, target.wide)
     return Value(made, target)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from math import prod
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from gateway.core.image_layout import MAX_DEPTH, MAX_MESSAGE_BYTES
 from plc.blocks import BLOCKS
@@ -10,8 +11,10 @@ from plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
 from plc.st import tree as t
 from plc.st import types as ty
 from plc.st.expressions import Expressions
-from plc.st.scope import Environment, Writer
+from plc.st.scope import Environment, Symbol, Writer
 
+MAX_REPEATED = 100
+"""Characters of Python that are written out wherever they are needed."""
 _STANDARD = ty.standard_blocks(BLOCKS)
 
 
@@ -21,6 +24,11 @@ class Declarations:
     def __init__(self, env: Environment, unit: t.Unit, out: Writer) -> None:
         self.env = env
         self.out = out
+        self.scope: dict[str, Symbol] = {}
+        """The constants of the POU whose declarations are being read."""
+        self._constants: dict[str, dict[str, Symbol]] = {}
+        self._deep = 0
+        self._unit = unit
         self._types: dict[str, t.TypeDecl] = {}
         self._blocks = {p.name.lower(): p for p in unit.pous if p.kind == "FUNCTION_BLOCK"}
         self._open: list[str] = []
@@ -30,8 +38,51 @@ class Declarations:
             self._types[declared.name.lower()] = declared
             if isinstance(declared, t.EnumDecl):
                 self._declare_enum(declared)
-        for declared in unit.types:
+
+    def resolve(self) -> None:
+        """Work out all types: once the global constants are known, which their limits may name."""
+        for declared in self._unit.types:
             self.named(declared.name, declared.pos)
+
+    @contextmanager
+    def within(self, pou: t.Pou) -> Iterator[None]:
+        """Limits and initial values may name the constants of `pou`."""
+        before = self.scope
+        self.scope = self._constants.setdefault(pou.name.lower(), {})
+        if not self.scope:
+            for block in pou.blocks:
+                for v in block.variables if "CONSTANT" in block.qualifiers else ():
+                    found = self.constant(v, f"v_{v.name.lower()}")
+                    if found is not None:
+                        self.scope[v.name.lower()] = found
+        yield
+        self.scope = before
+
+    def constant(self, v: t.VarDecl, code: str) -> Symbol | None:
+        """A CONSTANT as what it is worth; None where that is more than an elementary value, or too long to be repeated."""
+        if v.initial is None or isinstance(v.initial, t.InitArray | t.InitStruct):
+            return None
+        kind = self.type_of(v.type)
+        compiler = self._expressions()
+        value = compiler.value(v.initial)
+        text = compiler.coerced(value, kind, v.initial.pos, "an initial value")
+        if value.constant is None or len(text) > MAX_REPEATED or isinstance(kind, ty.String):
+            return None
+        return Symbol(v.name, kind, text, writable=False, constant=value.constant)
+
+    def _expressions(self) -> Expressions:
+        compiler = Expressions(self.env, self.scope, Writer())
+        compiler.only_constants = True
+        return compiler
+
+    def shared(self, code: str) -> str:
+        """`code`, or if it is long a call of a function that has it, so that it stands in the program once."""
+        if len(code) <= MAX_REPEATED:
+            return code
+        name = f"_new{len(self.out.lines)}"
+        with self.out.block(f"def {name}():"):
+            self.out.line(f"return {code}")
+        return f"{name}()"
 
     # -- types ----------------------------------------------------------------------------------------------------------
 
@@ -39,6 +90,8 @@ class Declarations:
         """The type that is written; `role` is VAR_INPUT... where MESSAGES may stand."""
         if isinstance(spec, t.NamedType):
             return self.named(spec.name, spec.pos)
+        if isinstance(spec, t.ArrayType):
+            return self._array(spec)
         if isinstance(spec, t.SubrangeType):
             return self._subrange(spec)
         if isinstance(spec, t.StringType):
@@ -46,14 +99,32 @@ class Declarations:
             if not 1 <= length <= ty.MAX_STRING:
                 self.env.fail(spec.pos, "the length of a string", expected=f"1 to {ty.MAX_STRING}", got=str(length))
             return ty.String(length, spec.wide)
-        if isinstance(spec, t.MessagesType):
-            return self._messages(spec, role)
+        return self._messages(spec, role)
+
+    def _array(self, spec: t.ArrayType) -> ty.Array:
+        if self._deep >= ty.MAX_NESTED:
+            self.env.fail(spec.pos, "arrays nested too deep", expected=f"at most {ty.MAX_NESTED}")
         ranges = tuple((self._constant(a, "an index"), self._constant(b, "an index")) for a, b in spec.ranges)
         if any(low > high for low, high in ranges):
             self.env.fail(spec.pos, "an empty range of indices")
-        if prod(high - low + 1 for low, high in ranges) > ty.MAX_ELEMENTS:
-            self.env.fail(spec.pos, "too large an array", expected=f"at most {ty.MAX_ELEMENTS} elements")
-        return ty.Array(ranges, self.type_of(spec.of))
+        self._deep += 1
+        of = self.type_of(spec.of)
+        self._deep -= 1
+        if isinstance(of, ty.MessagesIn | ty.MessagesOut):
+            self.env.fail(spec.pos, "an array of MESSAGES")
+        made = ty.Array(ranges, of)
+        self.bounded(spec.pos, [made])
+        return made
+
+    def bounded(self, pos: t.Pos, kinds: Iterable[ty.Type]) -> tuple[int, int]:
+        """What variables of these types take, and how deep they are nested. Raises `FileInvalid` for too much."""
+        found = list(kinds)
+        total, nested = sum(map(ty.elements, found)), max(map(ty.nested, found), default=0)
+        if total > ty.MAX_ELEMENTS:
+            self.env.fail(pos, "too much data", expected=f"at most {ty.MAX_ELEMENTS} elements", got=str(total))
+        if nested > ty.MAX_NESTED:
+            self.env.fail(pos, "arrays, structures and blocks nested too deep", expected=f"at most {ty.MAX_NESTED}")
+        return total, nested
 
     def _messages(self, spec: t.MessagesType, role: str) -> ty.Type:
         if role == "VAR_INPUT" and spec.max_bytes is None:
@@ -81,6 +152,8 @@ class Declarations:
             return found
         if key in self._open:
             self.env.fail(pos, f"type {name} contains itself")
+        if len(self._open) > ty.MAX_NESTED:
+            self.env.fail(pos, "arrays, structures and blocks nested too deep", expected=f"at most {ty.MAX_NESTED}")
         self._open.append(key)
         if key in self._types:
             found = self._declared(self._types[key])
@@ -102,13 +175,15 @@ class Declarations:
                 if field.name.lower() in fields:
                     self.env.fail(field.pos, f"{field.name} is declared twice")
                 fields[field.name.lower()] = (field.name, self.type_of(field.type))
-            struct = ty.Struct(declared.name, fields)
+            total, nested = self.bounded(declared.pos, (kind for _, kind in fields.values()))
+            struct = ty.Struct(declared.name, fields, total, nested + 1)
             self._write_struct(struct, declared)
             return struct
         assert isinstance(declared, t.AliasDecl)
         kind = self.type_of(declared.type)
         if declared.initial is not None:
-            self.env.type_initials[declared.name.lower()] = self.initial(kind, declared.initial)
+            code = self.initial(kind, declared.initial)
+            self.env.type_initials[declared.name.lower()] = self.shared(code)
         return kind
 
     def _declare_enum(self, declared: t.EnumDecl) -> None:
@@ -142,16 +217,21 @@ class Declarations:
 
     def _block(self, pou: t.Pou) -> ty.Block:
         members: dict[str, dict[str, tuple[str, ty.Type]]] = {"VAR_INPUT": {}, "VAR_OUTPUT": {}, "VAR_IN_OUT": {}}
-        for block in pou.blocks:
-            for v in block.variables:
-                if block.kind in members:
-                    members[block.kind][v.name.lower()] = (v.name, self.type_of(v.type))
-                elif block.kind == "VAR":
-                    self.type_of(v.type)  # finds a block that holds itself
-        return ty.Block(pou.name, members["VAR_INPUT"], members["VAR_OUTPUT"], members["VAR_IN_OUT"])
+        held: list[ty.Type] = []
+        with self.within(pou):
+            for block in pou.blocks:
+                for v in block.variables if block.kind in (*members, "VAR") else ():
+                    kind = self.type_of(v.type)  # finds a block that holds itself, too
+                    if block.kind != "VAR_IN_OUT":
+                        held.append(kind)
+                    if block.kind in members:
+                        members[block.kind][v.name.lower()] = (v.name, kind)
+        total, nested = self.bounded(pou.pos, held)
+        inputs, outputs, in_outs = members.values()
+        return ty.Block(pou.name, inputs, outputs, in_outs, elements=total, nested=nested + 1)
 
     def _constant(self, expr: t.Expr, what: str) -> int:
-        return Expressions(self.env, {}, self.out).constant_integer(expr, what)
+        return self._expressions().constant_integer(expr, what)
 
     # -- initial values -------------------------------------------------------------------------------------------------
 
@@ -164,9 +244,11 @@ class Declarations:
             return self._initial_array(kind, init)
         if isinstance(init, t.InitStruct):
             return self._initial_struct(kind, init)
-        compiler = Expressions(self.env, {}, self.out)
-        value = compiler.value(init)
-        return compiler.coerced(value, kind, init.pos, "an initial value")
+        compiler = self._expressions()
+        code = compiler.coerced(compiler.value(init), kind, init.pos, "an initial value")
+        if compiler.out.lines:
+            self.env.fail(init.pos, "too deep an expression for an initial value")
+        return code
 
     def _default(self, kind: ty.Type) -> str:
         if isinstance(kind, ty.Subrange):
@@ -190,17 +272,18 @@ class Declarations:
     def _initial_array(self, kind: ty.Type, init: t.InitArray) -> str:
         if not isinstance(kind, ty.Array):
             self.env.fail(init.pos, "an array's value for what is none", got=str(kind))
-        items: list[str] = []
-        total = prod(high - low + 1 for low, high in kind.ranges)
-        for count, item in init.items:
-            if len(items) + count > total:
+        items, count = [], 0
+        total = ty.elements(ty.Array(kind.ranges, ty.INT))
+        for often, item in init.items:
+            if often < 0 or count + often > total:
                 self.env.fail(init.pos, "more values than elements", expected=f"at most {total}")
-            items += [self.initial(kind.of, item)] * count
-        items += [self._default(kind.of)] * (total - len(items))
-        for low, high in reversed(kind.ranges[1:]):  # the last index changes fastest
-            size = high - low + 1
-            items = [f"[{', '.join(items[i : i + size])}]" for i in range(0, len(items), size)]
-        return f"[{', '.join(items)}]"
+            count += often
+            code = self.initial(kind.of, item)
+            items.append(code if often == 1 else f"*({code} for _ in range({often}))")
+        if count < total:
+            items.append(f"*({self._default(kind.of)} for _ in range({total - count}))")
+        sizes = tuple(high - low + 1 for low, high in kind.ranges[1:])
+        return f"_v.shaped([{', '.join(items)}], {sizes})" if sizes else f"[{', '.join(items)}]"
 
     def _initial_struct(self, kind: ty.Type, init: t.InitStruct) -> str:
         members = kind.fields if isinstance(kind, ty.Struct) else kind.inputs if isinstance(kind, ty.Block) else None

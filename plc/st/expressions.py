@@ -4,6 +4,7 @@ to the `Writer` first, in order.
 
 from __future__ import annotations
 
+from math import isfinite
 from typing import NoReturn
 
 from plc.st import tree as t
@@ -13,6 +14,10 @@ from plc.st.literals import Malformed, constant
 from plc.st.scope import Environment, Parameter, Signature, Symbol, Value, Writer, by_reference
 from plc.st.standard import FUNCTIONS
 
+MAX_DEEP = 80
+"""Calls, parentheses and indices inside each other."""
+MAX_OPEN = 40
+"""Brackets inside each other in the Python of one line: what is deeper is worked out on a line before."""
 _COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 _LOGIC = {"AND": "&", "&": "&", "OR": "|", "XOR": "^", "AND_THEN": "and", "OR_ELSE": "or"}
 
@@ -25,6 +30,9 @@ class Expressions:
         self.symbols = symbols
         self.out = out
         self.pou = pou
+        self.only_constants = False
+        """Whether variables and a user's functions are refused: in initial values and limits of types."""
+        self._deep = 0
         self.program_inputs: set[str] = set()
         """Where a PROGRAM is compiled: the inputs whose quality can be asked for."""
 
@@ -74,13 +82,34 @@ class Expressions:
     def value(self, expr: t.Expr) -> Value:
         if isinstance(expr, t.Literal):
             return self._literal(expr)
-        if isinstance(expr, t.Ref):
-            return self.reference(expr)
-        if isinstance(expr, t.Call):
-            return self.call(expr)
-        if isinstance(expr, t.Unary):
-            return self._unary(expr)
-        return self._binary(expr)
+        if self._deep >= MAX_DEEP:
+            self.env.fail(expr.pos, "an expression nested too deep", expected=f"at most {MAX_DEEP} levels")
+        self._deep += 1
+        try:
+            if isinstance(expr, t.Ref):
+                return self.reference(expr)
+            if isinstance(expr, t.Call):
+                return self._flat(self.call(expr), expr.pos)
+            return self._flat(self._unary(expr) if isinstance(expr, t.Unary) else self._binary(expr), expr.pos)
+        finally:
+            self._deep -= 1
+
+    def _flat(self, value: Value, pos: t.Pos) -> Value:
+        """`value`, worked out on a line before if Python could not read so many brackets."""
+        if value.code.count("(") + value.code.count("[") <= MAX_OPEN or _open(value.code) <= MAX_OPEN:
+            return value
+        name = self.out.temporary()
+        self.out.line(f"{name} = {value.code}", pos)
+        return Value(name, value.type, value.constant)
+
+    def known(self, expr: t.Expr, result: float) -> Value:
+        """A constant without a type that was worked out here."""
+        if isinstance(result, int) and not -(2**63) <= result < 2**64:
+            self.env.fail(expr.pos, "a whole number that no type holds")
+        if isinstance(result, float) and not isfinite(result):
+            self.env.fail(expr.pos, "a number beyond the range of LREAL")
+        kind: ty.Type = ty.AnyInt(result) if isinstance(result, int) else ty.AnyReal(result)
+        return Value(repr(result), kind, result)
 
     def _literal(self, literal: t.Literal) -> Value:
         if literal.kind == "ENUM_REF":
@@ -114,15 +143,27 @@ class Expressions:
             self.env.fail(expr.pos, f"the sign {expr.op}", expected="a number or a duration", got=str(kind))
         if expr.op == "+":
             return value
-        if isinstance(kind, ty.AnyInt):
-            return Value(repr(-kind.value), ty.AnyInt(-kind.value), -kind.value)
-        if isinstance(kind, ty.AnyReal):
-            return Value(repr(-kind.value), ty.AnyReal(-kind.value), -kind.value)
+        if isinstance(kind, ty.AnyInt | ty.AnyReal):
+            return Value(f"(-{value.code})", kind) if value.constant is None else self.known(expr, -value.constant)
         assert isinstance(kind, ty.Elementary)
         return Value(wrapped(f"-{value.code}", kind), kind)
 
     def _binary(self, expr: t.Binary) -> Value:
-        left, right = self.value(expr.left), self.value(expr.right)
+        """A chain of operators from its left end, so that its length is not depth."""
+        chain, first = [expr], expr.left
+        while isinstance(first, t.Binary):
+            chain.append(first)
+            first = first.left
+        value = self.value(first)
+        for link in reversed(chain):
+            value = self._flat(self._joined(link, value), link.pos)
+        return value
+
+    def _joined(self, expr: t.Binary, left: Value) -> Value:
+        mark = len(self.out.lines)
+        right = self.value(expr.right)
+        if expr.op in ("AND_THEN", "OR_ELSE") and len(self.out.lines) > mark:
+            left, right = self._only_if_needed(expr, left, right, self.out.since(mark))
         if expr.op in _LOGIC:
             return self._logic(expr, left, right)
         if expr.op in _COMPARISONS:
@@ -149,6 +190,19 @@ class Expressions:
             return Value(wrapped(f"_v.{'divide' if kind.kind == 'int' else 'divide_real'}({a}, {b})", kind), kind)
         return Value(wrapped(f"{a} {expr.op} {b}", kind), kind)
 
+    def _only_if_needed(
+        self, expr: t.Binary, left: Value, right: Value, prepared: list[tuple[str, int]]
+    ) -> tuple[Value, Value]:
+        """Both sides where the right one takes lines of its own: they are run only if the left one does not decide."""
+        name = self.out.temporary()
+        self.out.line(f"{name} = {left.code}", expr.pos)
+        decided = "not " if expr.op == "OR_ELSE" else ""
+        with self.out.block(f"if {decided}{name}:", expr.pos):
+            self.out.again(prepared)
+            self.out.line(f"{name} = {right.code}", expr.pos)
+        known = Value(name, left.type)
+        return known, Value(name, right.type)
+
     def _logic(self, expr: t.Binary, left: Value, right: Value) -> Value:
         kind = ty.common(left.type, right.type)
         if kind is None or not ty.is_kind(kind, "bool", "bits"):
@@ -171,8 +225,7 @@ class Expressions:
     def _with_time(self, op: str, left: Value, right: Value) -> Value | None:
         """Durations, dates and times of day (IEC 61131-3, Table 35); None where neither side is one."""
         a, b = ty.plain(left.type), ty.plain(right.type)
-        ka = a.kind if isinstance(a, ty.Elementary) else "int" if isinstance(a, ty.AnyInt) else "real"
-        kb = b.kind if isinstance(b, ty.Elementary) else "int" if isinstance(b, ty.AnyInt) else "real"
+        ka, kb = _kind(a), _kind(b)
         x, y = left.code, right.code
         moments = ("dt", "tod", "date")
         result: ty.Type | None = None
@@ -186,12 +239,12 @@ class Expressions:
         elif op in "*/" and ka == "duration" and kb in ("int", "real"):
             result = a
             if kb == "real":
-                code = f"round({x} * {y})" if op == "*" else f"round(_v.divide_real({x}, {y}))"
+                code = f"_v.time_{'times' if op == '*' else 'over'}({x}, {y})"
             elif op == "/":
                 code = f"_v.divide({x}, {y})"
         elif op == "*" and kb == "duration" and ka in ("int", "real"):
             result = b
-            code = f"round({code})" if ka == "real" else code
+            code = f"_v.time_times({y}, {x})" if ka == "real" else code
         if result is None:
             return None
         assert isinstance(result, ty.Elementary)
@@ -199,6 +252,10 @@ class Expressions:
 
     def _folded(self, expr: t.Binary, left: Value, right: Value) -> Value:
         a, b = left.constant, right.constant
+        if a is None or b is None:  # a choice between constants (SEL, MAX)
+            if expr.op == "MOD":
+                self._mismatch(expr, left, right, "integers")
+            return Value(_of_reals(expr.op, left.code, right.code), ty.AnyReal(0.0))
         whole = isinstance(a, int) and isinstance(b, int)
         try:
             if expr.op == "/":
@@ -213,8 +270,7 @@ class Expressions:
                 self._mismatch(expr, left, right, "integers")
         except values.LogicError as e:
             self.env.fail(expr.pos, e.message)
-        kind: ty.Type = ty.AnyInt(result) if isinstance(result, int) else ty.AnyReal(result)
-        return Value(repr(result), kind, result)
+        return self.known(expr, result)
 
     def _mismatch(self, expr: t.Binary, left: Value, right: Value, expected: str) -> NoReturn:
         self.env.fail(expr.pos, f"operands of {expr.op}", expected=expected, got=f"{left.type} and {right.type}")
@@ -225,6 +281,8 @@ class Expressions:
         symbol = self.symbols.get(ref.name.lower()) or self.env.globals.get(ref.name.lower())
         if symbol is None:
             return self._enum_value(ref)
+        if self.only_constants and symbol.constant is None:
+            self.env.fail(ref.pos, f"{ref.name} is no constant", expected="a constant expression")
         value = Value(symbol.code, symbol.type, symbol.constant, place=True, writable=symbol.writable)
         for selector in ref.selectors:
             if isinstance(selector, t.Member):
@@ -251,7 +309,7 @@ class Expressions:
         if isinstance(kind, ty.Struct) and name in kind.fields:
             return Value(f"{value.code}.m_{name}", kind.fields[name][1], place=True, writable=value.writable)
         if isinstance(kind, ty.Block):
-            for members, writable in ((kind.inputs, True), (kind.outputs, False), (kind.in_outs, True)):
+            for members, writable in ((kind.inputs, True), (kind.outputs, False)):
                 if name in members:
                     attribute = members[name][0] if kind.standard else f"v_{name}"
                     return Value(f"{value.code}.{attribute}", members[name][1], place=True, writable=writable)
@@ -259,7 +317,7 @@ class Expressions:
         if isinstance(kind, ty.Struct):
             known = [f for f, _ in kind.fields.values()]
         elif isinstance(kind, ty.Block):
-            known = [f for f, _ in (*kind.inputs.values(), *kind.outputs.values(), *kind.in_outs.values())]
+            known = [f for f, _ in (*kind.inputs.values(), *kind.outputs.values())]
         raise self.env.unknown(member.pos, f"in {kind}, a member", member.name, known)
 
     def _index(self, value: Value, selector: t.Index) -> Value:
@@ -272,7 +330,7 @@ class Expressions:
             )
         code = value.code
         for expr, (low, high) in zip(selector.indices, kind.ranges, strict=True):
-            index = self.value(expr)
+            index = self._flat(self.value(expr), expr.pos)
             if not ty.is_kind(index.type, "int", "bits"):
                 self.env.fail(expr.pos, "an index", expected="a whole number", got=str(index.type))
             if isinstance(index.constant, int):
@@ -296,6 +354,8 @@ class Expressions:
     def call(self, call: t.Call) -> Value:
         name = call.ref.name.lower()
         if not call.ref.selectors and name in self.env.functions:
+            if self.only_constants:
+                self.env.fail(call.pos, f"{call.ref.name} is called", expected="a constant expression")
             return self._user_function(call, self.env.functions[name])
         if not call.ref.selectors and name not in self.symbols:
             standard = FUNCTIONS.find(name.upper())
@@ -366,10 +426,20 @@ class Expressions:
             self._bit(whole, ref.selectors[-1])
             code = f"_v.set_bit({whole.code}, {ref.selectors[-1].number}, {self.coerced(value, ty.BOOL, pos)})"
             kind = ty.plain(whole.type)
-            self.out.line(f"{whole.code} = {wrapped(code, kind) if isinstance(kind, ty.Elementary) else code}", pos)
+            assert isinstance(kind, ty.Elementary)
+            code = wrapped(code, kind)
+            if isinstance(whole.type, ty.Subrange):
+                code = f"_v.inside({code}, {whole.type.low}, {whole.type.high})"
+            self.out.line(f"{whole.code} = {code}", pos)
             return
         target = self.writable(ref)
-        self.out.line(f"{target.code} = {self.coerced(value, target.type, pos, f'assigned to {ref.name}')}", pos)
+        code = self.coerced(value, target.type, pos, f"assigned to {ref.name}")
+        if isinstance(target.type, ty.Array):  # in place: a VAR_IN_OUT may stand for it
+            self.out.line(f"{target.code}[:] = {code}", pos)
+        elif isinstance(target.type, ty.Struct):
+            self.out.line(f"_v.put({target.code}, {code})", pos)
+        else:
+            self.out.line(f"{target.code} = {code}", pos)
 
     def writable(self, ref: t.Ref) -> Value:
         target = self.reference(ref)
@@ -412,6 +482,30 @@ class Expressions:
                 self.env.fail(argument.pos, f"{key} of {signature.name} is given twice")
             given[key] = argument.value
         return given
+
+
+def _open(code: str) -> int:
+    """How many brackets are open at the deepest place; those in strings count too, which does no harm."""
+    open_, most = 0, 0
+    for char in code:
+        if char in "([":
+            open_ += 1
+            most = max(most, open_)
+        elif char in ")]":
+            open_ -= 1
+    return most
+
+
+def _kind(kind: ty.Type) -> str:
+    if isinstance(kind, ty.Elementary):
+        return kind.kind
+    return "int" if isinstance(kind, ty.AnyInt) else "real" if isinstance(kind, ty.AnyReal) else ""
+
+
+def _of_reals(op: str, a: str, b: str) -> str:
+    if op in ("/", "**"):
+        return f"_v.{'divide_real' if op == '/' else 'power'}({a}, {b})"
+    return f"({a} {op} {b})"
 
 
 def _into(p: Parameter, signature: Signature) -> str:

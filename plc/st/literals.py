@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fractions import Fraction
+from math import isfinite
 from typing import Any
 
 from plc.st import types as ty
@@ -31,8 +32,21 @@ class Constant:
 
 
 def constant(literal: Literal) -> Constant:
-    """The value and type of any literal but an enumerated one."""
-    kind, text = literal.kind, literal.text
+    """The value and type of any literal but an enumerated one. Raises `Malformed`."""
+    try:
+        found = _constant(literal.kind, literal.text)
+    except Malformed:
+        raise
+    except ValueError as e:  # more digits than Python converts
+        raise Malformed("more digits than anything holds") from e
+    if isinstance(found.value, float) and not isfinite(found.value):
+        raise Malformed("a number beyond the range of its type")
+    if isinstance(found.value, int) and not -(2**63) <= found.value < 2**64:
+        raise Malformed("a whole number that no type holds")
+    return found
+
+
+def _constant(kind: str, text: str) -> Constant:
     if kind == "INTEGER":
         value = int(text.replace("_", ""))
         return Constant(value, ty.AnyInt(value))
@@ -120,6 +134,8 @@ def _string(text: str, wide: bool) -> Constant:
         if not wide and ord(char) > 255:
             raise Malformed('a STRING holds characters of one byte; write a WSTRING ("...")')
         out.append(char)
+    if len(out) > ty.MAX_STRING:
+        raise Malformed(f"a string of more than {ty.MAX_STRING} characters")
     return Constant("".join(out), ty.String(max(1, len(out)), wide))
 
 

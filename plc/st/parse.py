@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib import resources
 from typing import Any
 
-from lark import Lark, Token, Transformer, UnexpectedCharacters, UnexpectedEOF, UnexpectedToken, v_args
-from lark.exceptions import UnexpectedInput
+from lark import Lark, Token, UnexpectedCharacters, UnexpectedEOF, UnexpectedToken, v_args
+from lark.exceptions import UnexpectedInput, VisitError
+from lark.lexer import PatternStr
 from lark.tree import Meta
+from lark.visitors import Transformer_NonRecursive
 
 from gateway.core.errors import FileInvalid
 from plc.st import tree as t
+from plc.st.source import MAX_NAME, blanked, shortened
 
-MAX_BYTES = 4_000_000
 MAX_EXPECTED = 8
 """How many of the tokens that could have stood somewhere an error names."""
 
@@ -29,20 +32,33 @@ _READABLE = {
 
 def parse(text: str, path: str = "") -> t.Unit:
     """The tree of `text`. Raises `FileInvalid` with line and column."""
-    if len(text) > MAX_BYTES:
-        raise FileInvalid("too long for a program", path=path, expected=f"at most {MAX_BYTES} characters")
+    text = blanked(text, path)
     try:
         return _Build().transform(_parser().parse(text))  # type: ignore[no-any-return]
     except UnexpectedInput as e:
         raise _invalid(e, text, path) from e
-    except RecursionError as e:
-        raise FileInvalid("nested too deep", path=path) from e
+    except VisitError as e:
+        if not isinstance(e.orig_exc, _Bad):
+            raise
+        raise e.orig_exc.at(path) from e
 
 
 @cache
 def _parser() -> Lark:
     grammar = resources.files("plc.st").joinpath("grammar.lark").read_text(encoding="utf-8")
-    return Lark(grammar, parser="lalr", propagate_positions=True, maybe_placeholders=False)
+    return Lark(grammar, parser="lalr", propagate_positions=True, maybe_placeholders=False, g_regex_flags=re.ASCII)
+
+
+class _Bad(Exception):
+    """A token that is well formed and means nothing."""
+
+    def __init__(self, token: Token, message: str) -> None:
+        super().__init__(message)
+        self.token = token
+
+    def at(self, path: str) -> FileInvalid:
+        where = _pos(self.token)
+        return FileInvalid(str(self), path=path, line=where.line, column=where.column, got=shortened(str(self.token)))
 
 
 def _invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
@@ -53,19 +69,27 @@ def _invalid(e: UnexpectedInput, text: str, path: str) -> FileInvalid:
         got, line, column = e.char, e.line, e.column
         names = e.allowed or set()
     else:  # the end of the text
-        lines = text.rstrip().splitlines() or [""]
-        got, line, column = "the end of the file", len(lines), len(lines[-1]) + 1
+        before = text.rstrip()
+        got, line, column = "the end of the file", before.count("\n") + 1, len(before) - before.rfind("\n")
         names = getattr(e, "accepts", None) or (set() if isinstance(e, UnexpectedEOF) else e.expected)  # type: ignore[attr-defined]
-    readable = sorted({_READABLE.get(name, name.replace("__", "")) for name in names})
+    readable = sorted({_readable(name) for name in names})
     more = f" and {len(readable) - MAX_EXPECTED} more" if len(readable) > MAX_EXPECTED else ""
     return FileInvalid(
         "not Structured Text",
         path=path,
         line=line,
         column=column,
-        got=got,
+        got=shortened(got if got.isprintable() else repr(got)),
         expected=", ".join(readable[:MAX_EXPECTED]) + more,
     )
+
+
+@cache
+def _readable(name: str) -> str:
+    for terminal in _parser().terminals:
+        if terminal.name == name and isinstance(terminal.pattern, PatternStr):
+            return str(terminal.pattern.value)
+    return _READABLE.get(name, name)
 
 
 def _pos(where: Meta | Token) -> t.Pos:
@@ -73,8 +97,13 @@ def _pos(where: Meta | Token) -> t.Pos:
 
 
 @v_args(meta=True)
-class _Build(Transformer[Token, Any]):
-    """Bottom up: children are nodes already, tokens still tokens."""
+class _Build(Transformer_NonRecursive[Token, Any]):
+    """Bottom up: children are nodes already, tokens still tokens. Not recursive: nothing is nested too deep for it."""
+
+    def NAME(self, token: Token) -> Token:
+        if len(token) > MAX_NAME:
+            raise _Bad(token, f"a name of more than {MAX_NAME} characters")
+        return token
 
     def start(self, meta: Meta, items: list[Any]) -> t.Unit:
         types = tuple(one for item in items if isinstance(item, list) for one in item)
@@ -143,7 +172,7 @@ class _Build(Transformer[Token, Any]):
         return str(items[0]), items[1] if len(items) > 1 else None
 
     def signed_integer(self, meta: Meta, items: list[Any]) -> int:
-        number = integer(str(items[-1]))
+        number = _integer(items[-1])
         return -number if str(items[0]) == "-" else number
 
     def alias_decl(self, meta: Meta, items: list[Any]) -> t.AliasDecl:
@@ -181,7 +210,7 @@ class _Build(Transformer[Token, Any]):
         return 1, items[0]
 
     def repeated_item(self, meta: Meta, items: list[Any]) -> tuple[int, t.Init | None]:
-        return integer(str(items[0])), items[1] if len(items) > 1 else None
+        return _integer(items[0]), items[1] if len(items) > 1 else None
 
     def init_struct(self, meta: Meta, items: list[Any]) -> t.InitStruct:
         return t.InitStruct(_pos(meta), tuple(items))
@@ -219,6 +248,9 @@ class _Build(Transformer[Token, Any]):
         return tuple(items[:-1]), items[-1]
 
     def case_label(self, meta: Meta, items: list[Any]) -> t.CaseLabel:
+        return t.CaseLabel(_pos(meta), items[0], items[1] if len(items) > 1 else None)
+
+    def next_label(self, meta: Meta, items: list[Any]) -> t.CaseLabel:
         return t.CaseLabel(_pos(meta), items[0], items[1] if len(items) > 1 else None)
 
     def case_number(self, meta: Meta, items: list[Any]) -> t.Expr:
@@ -277,7 +309,7 @@ class _Build(Transformer[Token, Any]):
         return t.Member(_pos(meta), str(items[0]))
 
     def bit(self, meta: Meta, items: list[Any]) -> t.Bit:
-        return t.Bit(_pos(meta), integer(str(items[0])))
+        return t.Bit(_pos(meta), _integer(items[0]))
 
     def index(self, meta: Meta, items: list[Any]) -> t.Index:
         return t.Index(_pos(meta), tuple(items))
@@ -294,10 +326,13 @@ def _initial(items: list[Any]) -> t.Init | None:
     return next((i[1] for i in items if isinstance(i, tuple) and i[0] == "initial"), None)
 
 
-def integer(text: str) -> int:
-    """The value of an integer literal: underscores, ``16#``, ``8#``, ``2#``."""
-    base, _, digits = text.replace("_", "").rpartition("#")
-    return int(digits, int(base) if base else 10)
+def _integer(token: Token) -> int:
+    """The value of an integer literal: underscores, ``16#``, ``8#``, ``2#``, with or without a type before it."""
+    *_, base, digits = ["10", *token.replace("_", "").split("#")]
+    try:
+        return int(digits, int(base))
+    except ValueError as e:
+        raise _Bad(token, "not a whole number that anything holds") from e
 
 
-__all__ = ["integer", "parse"]
+__all__ = ["parse"]

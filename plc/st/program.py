@@ -46,59 +46,59 @@ class Context:
 class StProgram(Program):
     """Base of the classes that `program_class` makes."""
 
-    unit: CompiledUnit
-    declared: CompiledProgram
+    st_unit: CompiledUnit
+    st_declared: CompiledProgram
 
     def __init__(self) -> None:
-        self.context = Context(lambda name: self.tag(name))
-        space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS}
-        exec(self.unit.code, space)
-        self.body: Any = space[f"P_{self.declared.name.lower()}"]()
+        self.st_context = Context(lambda name: self.tag(name))
+        space: dict[str, Any] = {"_v": values, "_c": self.st_context, "_blocks": BLOCKS}
+        exec(self.st_unit.code, space)
+        self.st_body: Any = space[f"P_{self.st_declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
-        self._inputs = [_Input(v) for v in self.declared.variables if v.role == "input"]
-        self._attributes = {v.name: _attribute(v) for v in self.declared.variables}
-        self._outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
-        for v in self.declared.variables:
+        self.st_inputs = [_Input(v) for v in self.st_declared.variables if v.role == "input"]
+        self.st_attributes = {v.name: _attribute(v) for v in self.st_declared.variables}
+        self.st_outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
+        for v in self.st_declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
-                setattr(self.body, _attribute(v), self.__dict__[v.name])
+                setattr(self.st_body, _attribute(v), self.__dict__[v.name])
             elif v.role != "input" and _tag_kind(v.kind) is not None:
-                self._outputs.append((v.name, _attribute(v), _to_tag(v.kind)))
-        self._show()
+                self.st_outputs.append((v.name, _attribute(v), _to_tag(v.kind)))
+        self.st_show()
 
     def execute(self, scan: ScanInfo) -> None:
-        self.context.now_ns, self.context.first_scan = scan.now_ns, scan.first_scan
-        body, namespace = self.body, self.__dict__
-        for item in self._inputs:
+        self.st_context.now_ns, self.st_context.first_scan = scan.now_ns, scan.first_scan
+        body, namespace = self.st_body, self.__dict__
+        for item in self.st_inputs:
             value = namespace[item.name]
             if value is not None:
                 setattr(body, item.attribute, item.convert(value) if item.convert else value)
         body.execute()
-        self._show()
+        self.st_show()
 
-    def _show(self) -> None:
-        body, namespace = self.body, self.__dict__
-        for name, attribute, convert in self._outputs:
+    def st_show(self) -> None:
+        body, namespace = self.st_body, self.__dict__
+        for name, attribute, convert in self.st_outputs:
             value = getattr(body, attribute)
             namespace[name] = convert(value) if convert else value
 
     def put(self, name: str, value: Scalar) -> None:
         super().put(name, value)
-        if name in self._attributes:
-            setattr(self.body, self._attributes[name], value)
+        if name in self.st_attributes:
+            setattr(self.st_body, self.st_attributes[name], value)
 
     # -- what is kept over a restart --------------------------------------------------------------------------------------
 
     def retained(self) -> dict[str, Any]:
         """Every VAR RETAIN by name, as JSON-able data, also what is no tag."""
-        return {v.name: _dump(getattr(self.body, _attribute(v))) for v in self.declared.variables if v.retain}
+        return {v.name: _dump(getattr(self.st_body, _attribute(v))) for v in self.st_declared.variables if v.retain}
 
     def restore(self, kept: dict[str, Any]) -> None:
         """The inverse: variables that are in `kept` take its values."""
-        for v in self.declared.variables:
+        for v in self.st_declared.variables:
             if v.retain and v.name in kept:
                 attribute = _attribute(v)
-                setattr(self.body, attribute, _load(getattr(self.body, attribute), kept[v.name]))
-        self._show()
+                setattr(self.st_body, attribute, _load(getattr(self.st_body, attribute), kept[v.name]))
+        self.st_show()
 
 
 class _Input:
@@ -133,7 +133,7 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
             expected=", ".join(names) or "a PROGRAM in the file",
             hint="write FILE.st:NAME where a file has several" if len(names) > 1 else "",
         )
-    body: dict[str, Any] = {"unit": unit, "declared": found, "source_path": unit.path, "__module__": __name__}
+    body: dict[str, Any] = {"st_unit": unit, "st_declared": found, "source_path": unit.path, "__module__": __name__}
     for v in found.variables:
         kind = _tag_kind(v.kind)
         if isinstance(v.kind, ty.MessagesIn):
@@ -141,14 +141,9 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
         elif isinstance(v.kind, ty.MessagesOut):
             body[v.name] = message_output(v.kind.max_bytes, v.kind.depth)
         elif kind is not None:
-            if hasattr(StProgram, v.name) or v.name in _RESERVED:
-                raise FileInvalid(f"variable {v.name} of {found.name} needs another name", path=unit.path, got=v.name)
             unit_of = "ns" if ty.is_kind(v.kind, "duration") else ""
             body[v.name] = Variable(v.name, _ROLES[v.role], kind, unit=unit_of, retain=v.retain)
     return type(found.name, (StProgram,), body)
-
-
-_RESERVED = frozenset({"context", "body", "declared", "unit", "source_path", "_inputs", "_outputs", "_attributes"})
 
 
 def load_file(path: Path, name: str = "") -> type[StProgram]:

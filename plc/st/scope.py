@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from gateway.core.errors import FileInvalid
 from plc.st import types as ty
+from plc.st.source import shortened
 from plc.st.tree import Pos
 
 
@@ -78,7 +79,7 @@ class Environment:
 
     def error(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid:
         return FileInvalid(
-            message, path=self.path, line=pos.line, column=pos.column, expected=expected, got=got, hint=hint
+            message, path=self.path, line=pos.line, column=pos.column, expected=expected, got=shortened(got), hint=hint
         )
 
     def fail(self, pos: Pos, message: str, *, expected: str = "", got: str = "", hint: str = "") -> NoReturn:
@@ -111,6 +112,21 @@ class Writer:
         if len(self.lines) == before:
             self.line("pass", pos)
         self._depth -= 1
+
+    @property
+    def depth(self) -> int:
+        """Blocks around what is written next."""
+        return self._depth
+
+    def since(self, mark: int) -> list[tuple[str, int]]:
+        """Take back the lines written since there were `mark` of them, without their indentation here."""
+        taken = [(code[4 * self._depth :], line) for code, line in self.lines[mark:]]
+        del self.lines[mark:]
+        return taken
+
+    def again(self, lines: list[tuple[str, int]]) -> None:
+        """Write lines that were taken back, indented as it is now."""
+        self.lines += [("    " * self._depth + code, line) for code, line in lines]
 
     def temporary(self) -> str:
         self._temporaries += 1

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from plc.st import tree as t
 from plc.st import types as ty
+from plc.st import values
 from plc.st.conversions import conversion
 from plc.st.scope import Value
 
@@ -74,10 +75,15 @@ def _meeting(x: Expressions, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
 
 @FUNCTIONS.add(*_MATH)
 def _of_real(x: Expressions, call: t.Call) -> Value:
-    value = _number(x, x.positional(call, 1)[0], "real", "int")
+    expr = x.positional(call, 1)[0]
+    value = _number(x, expr, "real", "int")
     name = _MATH[call.ref.name.upper()]
-    if value.constant is not None:
-        return Value(f"_v.of_real({name!r}, {value.constant!r})", ty.AnyReal(0.0))
+    if isinstance(value.type, ty.AnyInt | ty.AnyReal) and value.constant is not None:
+        try:
+            known = values.of_real(name, value.constant)
+        except values.LogicError as e:
+            x.env.fail(expr.pos, e.message, got=e.got)
+        return x.known(call, known)
     kind = value.type if isinstance(value.type, ty.Elementary) and value.type.kind == "real" else ty.LREAL
     code = f"_v.of_real({name!r}, {value.code})"
     return Value(f"_v.real({code})" if kind.bits == 32 else code, kind)
@@ -86,6 +92,8 @@ def _of_real(x: Expressions, call: t.Call) -> Value:
 @FUNCTIONS.add("ATAN2")
 def _atan2(x: Expressions, call: t.Call) -> Value:
     a, b = (_number(x, e, "real", "int") for e in x.positional(call, 2))
+    if {a.type, b.type} == {ty.REAL}:
+        return Value(f"_v.real(_v.math.atan2({a.code}, {b.code}))", ty.REAL)
     return Value(f"_v.math.atan2({a.code}, {b.code})", ty.LREAL)
 
 
@@ -93,6 +101,22 @@ def _atan2(x: Expressions, call: t.Call) -> Value:
 def _expt(x: Expressions, call: t.Call) -> Value:
     a, b = x.positional(call, 2)
     return x.value(t.Binary(call.pos, "**", a, b))
+
+
+_OPERATORS = {
+    "ADD": "+", "MUL": "*", "SUB": "-", "DIV": "/", "GT": ">", "GE": ">=", "EQ": "=", "LE": "<=", "LT": "<", "NE": "<>",
+}  # fmt: skip
+
+
+@FUNCTIONS.add(*_OPERATORS)
+def _operator(x: Expressions, call: t.Call) -> Value:
+    """Operators by their function's name (Tables 29 and 33): ADD and MUL of two or more, comparisons of two."""
+    name = call.ref.name.upper()
+    first, *rest = x.positional(call, 2, MANY if name in ("ADD", "MUL") else None)
+    made: t.Expr = first
+    for operand in rest:
+        made = t.Binary(call.pos, _OPERATORS[name], made, operand)
+    return x.value(made)
 
 
 @FUNCTIONS.add("ABS")
@@ -163,7 +187,8 @@ def _string(x: Expressions, expr: t.Expr) -> tuple[str, ty.String]:
 
 @FUNCTIONS.add("LEN")
 def _len(x: Expressions, call: t.Call) -> Value:
-    return Value(f"len({_string(x, x.positional(call, 1)[0])[0]})", ty.INT)
+    s, kind = _string(x, x.positional(call, 1)[0])
+    return Value(f"len({s})", ty.INT if kind.length <= ty.INT.high else ty.DINT)
 
 
 @FUNCTIONS.add("LEFT", "RIGHT")
@@ -172,9 +197,7 @@ def _side(x: Expressions, call: t.Call) -> Value:
     (s, kind), n = _string(x, what), _number(x, length, "int").code
     if call.ref.name.upper() == "LEFT":
         return Value(f"{s}[:max(0, {n})]", kind)
-    temporary = x.out.temporary()
-    x.out.line(f"{temporary} = {s}", call.pos)
-    return Value(f"{temporary}[max(0, len({temporary}) - max(0, {n})):]", kind)
+    return Value(f"_v.right({s}, {n})", kind)
 
 
 @FUNCTIONS.add("MID", "DELETE")
@@ -190,8 +213,9 @@ def _concat(x: Expressions, call: t.Call) -> Value:
     parts = [_string(x, e) for e in x.positional(call, 1, MANY)]
     if len({kind.wide for _, kind in parts}) > 1:
         x.env.fail(call.pos, "CONCAT of STRING and WSTRING")
-    longest = min(ty.MAX_STRING, sum(kind.length for _, kind in parts))
-    return Value(f"({' + '.join(s for s, _ in parts)})", ty.String(longest, parts[0][1].wide))
+    total = sum(kind.length for _, kind in parts)
+    code = f"({' + '.join(s for s, _ in parts)})" + (f"[:{ty.MAX_STRING}]" if total > ty.MAX_STRING else "")
+    return Value(code, ty.String(min(ty.MAX_STRING, total), parts[0][1].wide))
 
 
 @FUNCTIONS.add("INSERT", "REPLACE", "FIND")
@@ -200,7 +224,7 @@ def _within(x: Expressions, call: t.Call) -> Value:
     what, other, *numbers = x.positional(call, {"INSERT": 3, "REPLACE": 4, "FIND": 2}[name])
     (s, kind), (o, other_kind) = _string(x, what), _string(x, other)
     if name == "FIND":
-        return Value(f"({s}.find({o}) + 1 if {o} else 0)", ty.INT)
+        return Value(f"_v.find({s}, {o})", ty.INT if kind.length <= ty.INT.high else ty.DINT)
     longest = ty.String(min(ty.MAX_STRING, kind.length + other_kind.length), kind.wide)
     rest = ", ".join(_number(x, n, "int").code for n in numbers)
     return Value(f"_v.{'inserted' if name == 'INSERT' else 'replaced'}({s}, {o}, {rest})", longest)
@@ -274,6 +298,8 @@ def _msg_room(x: Expressions, call: t.Call) -> Value:
 @FUNCTIONS.add("MSG_SEND")
 def _msg_send(x: Expressions, call: t.Call) -> Value:
     what, text, *when = x.positional(call, 2, 3)
-    box, (s, _) = _messages(x, what, ty.MessagesOut), _string(x, text)
+    box, (s, kind) = _messages(x, what, ty.MessagesOut), _string(x, text)
+    if kind.wide:
+        x.env.fail(text.pos, "a message", expected="a STRING: a character a byte", got=str(kind))
     t_ns = _number(x, when[0], "duration").code if when else "_c.now_ns"
     return Value(f"{box}.send({s}.encode('latin-1'), {t_ns})", ty.BOOL)

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 from plc.st import tree as t
 from plc.st import types as ty
 from plc.st.expressions import Expressions
 from plc.st.scope import Environment, Symbol, Value, Writer, by_reference
+
+MAX_DEEP = 60
+"""Statements inside each other."""
+MAX_LOOPS = 18
+"""Loops inside each other: Python has no more than 20."""
+MAX_CONTINUES = 50
+"""CONTINUEs of one REPEAT: each has its condition written out."""
+_CHAIN = 48
+"""Branches of a chain of elif: longer ones are cut, since to Python each is inside the one before."""
 
 
 class Statements(Expressions):
@@ -19,10 +28,16 @@ class Statements(Expressions):
     def __init__(self, env: Environment, symbols: dict[str, Symbol], out: Writer, pou: str = "") -> None:
         super().__init__(env, symbols, out, pou)
         self._loops: list[t.Expr | None] = []  # those around the statement; a REPEAT's with its condition
+        self._continues: dict[int, int] = {}
+        self._inside = 0
 
     def body(self, statements: tuple[t.Statement, ...]) -> None:
+        if self._inside >= MAX_DEEP and statements:
+            self.env.fail(statements[0].pos, "statements nested too deep", expected=f"at most {MAX_DEEP} levels")
+        self._inside += 1
         for statement in statements:
             getattr(self, f"_{type(statement).__name__.lower()}")(statement)
+        self._inside -= 1
 
     # -- assignment and calls -----------------------------------------------------------------------------------------
 
@@ -94,21 +109,46 @@ class Statements(Expressions):
     # -- selection ----------------------------------------------------------------------------------------------------
 
     def _if(self, s: t.If) -> None:
-        self._branches(list(s.branches), s.otherwise, s.pos)
+        if len(s.branches) <= _CHAIN:
+            self._chain(s.branches, lambda: self.body(s.otherwise), bool(s.otherwise), s.pos)
+            return
+        done = self.out.temporary()
+        self.out.line(f"{done} = False", s.pos)
+        for n in range(0, len(s.branches), _CHAIN):
+            with self.out.block(f"if not {done}:", s.pos):
+                self.out.line(f"{done} = True", s.pos)
+                self._chain(s.branches[n : n + _CHAIN], lambda: self.out.line(f"{done} = False", s.pos), True, s.pos)
+        if s.otherwise:
+            with self.out.block(f"if not {done}:", s.pos):
+                self.body(s.otherwise)
 
-    def _branches(
-        self, branches: list[tuple[t.Expr, tuple[t.Statement, ...]]], otherwise: tuple[t.Statement, ...], pos: t.Pos
+    def _chain(
+        self,
+        branches: tuple[tuple[t.Expr, tuple[t.Statement, ...]], ...],
+        otherwise: Callable[[], None],
+        more: bool,
+        pos: t.Pos,
     ) -> None:
-        (condition, body), *rest = branches
-        code = self.condition(condition, "IF")
-        with self.out.block(f"if {code}:", condition.pos):
-            self.body(body)
-        if rest:  # nested, since a condition may have to be prepared
-            with self.out.block("else:", pos):
-                self._branches(rest, otherwise, pos)
-        elif otherwise:
-            with self.out.block("else:", pos):
-                self.body(otherwise)
+        """if, elif..., and `otherwise` if there is `more`. A condition that has to be prepared begins a chain of its own,
+        inside the else of the one before."""
+        with ExitStack() as inside:
+            word = "if"
+            for condition, body in branches:
+                mark = len(self.out.lines)
+                code = self.condition(condition, "IF")
+                prepared = self.out.since(mark)
+                if prepared and word == "elif":
+                    if self.out.depth >= MAX_DEEP:
+                        self.env.fail(condition.pos, "too many conditions with calls in one IF")
+                    inside.enter_context(self.out.block("else:", pos))
+                    word = "if"
+                self.out.again(prepared)
+                with self.out.block(f"{word} {code}:", condition.pos):
+                    self.body(body)
+                word = "elif"
+            if more:
+                with self.out.block("else:", pos):
+                    otherwise()
 
     def _case(self, s: t.Case) -> None:
         selector = self.value(s.selector)
@@ -119,38 +159,72 @@ class Statements(Expressions):
             )
         name = self.out.temporary()
         self.out.line(f"{name} = {selector.code}", s.pos)
-        taken: list[tuple[int, int]] = []
+        labels = [[(*self._label(label, kind), label.pos) for label in of] for of, _ in s.branches]
+        self._check_labels([label for of in labels for label in of])
+        bodies = [body for _, body in s.branches]
+        places = [of[0].pos for of, _ in s.branches]
+        if len(bodies) <= _CHAIN:
+            tests = [
+                " or ".join(f"{name} == {low}" if low == high else f"{low} <= {name} <= {high}" for low, high, _ in of)
+                for of in labels
+            ]
+        else:
+            rows = sorted((low, high, n) for n, of in enumerate(labels) for low, high, _ in of)
+            lows, highs, numbers = (tuple(column) for column in zip(*rows, strict=True))
+            self.out.line(f"{name} = _v.branch({name}, {lows}, {highs}, {numbers})", s.pos)
+            tests = [f"{name} == {n}" for n in range(len(bodies))]
+        self._cases(name, list(zip(tests, bodies, places, strict=True)), 0, s)
+
+    def _cases(self, name: str, rows: list[tuple[str, tuple[t.Statement, ...], t.Pos]], first: int, s: t.Case) -> None:
+        """A chain; for many branches, which then go by their number, halves of them."""
+        if len(rows) > _CHAIN:
+            half = len(rows) // 2
+            with self.out.block(f"if 0 <= {name} < {first + half}:", s.pos):
+                self._cases(name, rows[:half], first, s)
+            with self.out.block(f"elif {name} >= {first + half}:", s.pos):
+                self._cases(name, rows[half:], first + half, s)
+            if s.otherwise and len(rows) == len(s.branches):
+                with self.out.block("else:", s.pos):
+                    self.body(s.otherwise)
+            return
         word = "if"
-        for labels, body in s.branches:
-            tests = [self._label(label, kind, name, taken) for label in labels]
-            with self.out.block(f"{word} {' or '.join(tests)}:", labels[0].pos):
+        for test, body, pos in rows:
+            with self.out.block(f"{word} {test}:", pos):
                 self.body(body)
             word = "elif"
-        if s.otherwise:
+        if s.otherwise and len(rows) == len(s.branches):
             with self.out.block("else:" if word == "elif" else "if True:", s.pos):
                 self.body(s.otherwise)
 
-    def _label(self, label: t.CaseLabel, kind: ty.Type, name: str, taken: list[tuple[int, int]]) -> str:
+    def _label(self, label: t.CaseLabel, kind: ty.Type) -> tuple[int, int]:
         ends = []
         for expr in (label.low, label.high or label.low):
             value = self.value(expr)
-            if value.constant is None or ty.common(value.type, kind) is None:
+            whole = ty.is_kind(value.type, "int", "bits") or isinstance(value.type, ty.Enum)
+            if value.constant is None or not whole or ty.common(value.type, kind) is None:
                 self.env.fail(expr.pos, "a label of CASE", expected=f"a constant of {kind}", got=str(value.type))
             ends.append(int(value.constant))
         low, high = ends
         if low > high:
             self.env.fail(label.pos, "an empty range", got=f"{low}..{high}")
-        if any(low <= b and a <= high for a, b in taken):
-            self.env.fail(
-                label.pos, "a label that another branch has too", got=str(low) if low == high else f"{low}..{high}"
-            )
-        taken.append((low, high))
-        return f"{name} == {low}" if low == high else f"{low} <= {name} <= {high}"
+        return low, high
+
+    def _check_labels(self, labels: list[tuple[int, int, t.Pos]]) -> None:
+        """No two overlap; the later one is named."""
+        before: tuple[int, int, t.Pos] | None = None
+        for label in sorted(labels, key=lambda each: each[:2]):
+            if before is not None and label[0] <= before[1]:
+                low, high, pos = max(before, label, key=lambda each: (each[2].line, each[2].column))
+                got = str(low) if low == high else f"{low}..{high}"
+                self.env.fail(pos, "a label that another branch has too", got=got)
+            before = label
 
     # -- iteration ----------------------------------------------------------------------------------------------------
 
     @contextmanager
     def _loop(self, head: str, pos: t.Pos, until: t.Expr | None = None) -> Iterator[None]:
+        if len(self._loops) >= MAX_LOOPS:
+            self.env.fail(pos, "loops nested too deep", expected=f"at most {MAX_LOOPS}")
         self._loops.append(until)
         with self.out.block(head, pos):
             yield
@@ -195,8 +269,12 @@ class Statements(Expressions):
         if s.word == "EXIT":
             self.out.line("break", s.pos)
             return
-        if self._loops[-1] is not None:  # CONTINUE in REPEAT goes to its condition
-            self._until(self._loops[-1])
+        until = self._loops[-1]
+        if until is not None:  # CONTINUE in REPEAT goes to its condition
+            self._continues[id(until)] = self._continues.get(id(until), 0) + 1
+            if self._continues[id(until)] > MAX_CONTINUES:
+                self.env.fail(s.pos, "too many CONTINUEs in one REPEAT", expected=f"at most {MAX_CONTINUES}")
+            self._until(until)
         self.out.line("continue", s.pos)
 
 

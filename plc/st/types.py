@@ -10,13 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import prod
 
 from plc.blocks import FunctionBlock
 
 DEFAULT_STRING = 80
 MAX_STRING = 65_535
 MAX_ELEMENTS = 1_000_000
-"""Elements of an array, over all its dimensions."""
+"""Of an array over all its dimensions, and of all that a structure, a block or a program holds."""
+MAX_NESTED = 32
+"""Structures, arrays and blocks inside each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +129,12 @@ class Array:
 
 @dataclass(frozen=True, slots=True)
 class Struct:
-    """`fields`: name as declared and type, by the name in lower case; `python`: the class that holds it."""
+    """`fields`: name as declared and type, by the name in lower case."""
 
     name: str
     fields: Mapping[str, tuple[str, Type]] = field(hash=False)
+    elements: int = 1
+    nested: int = 1
 
     def __str__(self) -> str:
         return self.name
@@ -144,6 +149,8 @@ class Block:
     outputs: Mapping[str, tuple[str, Type]] = field(hash=False)
     in_outs: Mapping[str, tuple[str, Type]] = field(hash=False, default_factory=dict)
     standard: type[FunctionBlock] | None = None
+    elements: int = 8
+    nested: int = 1
 
     def __str__(self) -> str:
         return self.name
@@ -176,6 +183,22 @@ Type = (
 def plain(kind: Type) -> Type:
     """The type that a value has once it is read: a subrange's is its base."""
     return kind.base if isinstance(kind, Subrange) else kind
+
+
+def elements(kind: Type) -> int:
+    """How much a variable of this type takes: 1 for a number, and for each 64 characters of a string."""
+    if isinstance(kind, Array):
+        return prod(high - low + 1 for low, high in kind.ranges) * elements(kind.of)
+    if isinstance(kind, String):
+        return 1 + kind.length // 64
+    return kind.elements if isinstance(kind, Struct | Block) else 1
+
+
+def nested(kind: Type) -> int:
+    """How many structures, arrays and blocks are inside each other."""
+    if isinstance(kind, Array):
+        return len(kind.ranges) + nested(kind.of)
+    return kind.nested if isinstance(kind, Struct | Block) else 0
 
 
 def is_kind(kind: Type, *names: str) -> bool:

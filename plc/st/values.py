@@ -8,15 +8,20 @@ stops the task with its outputs safe. Pure.
 from __future__ import annotations
 
 import math
+import re
 import struct
+from bisect import bisect_right
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from gateway.core.errors import Blame, FieldtwinError
 
 _FLOAT = struct.Struct("<f")
+_WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)
+_REAL = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[+-]?[0-9]+)?", re.ASCII | re.IGNORECASE)
 _NS = 1_000_000_000
 MS = 1_000_000
+MAX_SHOWN = 60
 
 
 class LogicError(FieldtwinError):
@@ -60,7 +65,7 @@ def modulo(a: int, b: int) -> int:
 
 def power(a: float, b: float) -> float:
     try:
-        result = a**b
+        result = float(a) ** float(b)  # never of integers, whose powers have no end
     except OverflowError:
         return math.inf
     except ZeroDivisionError as e:
@@ -91,6 +96,19 @@ def steps(first: int, last: int, by: int) -> range:
 def copied(x: list[Any]) -> list[Any]:
     """An array of its own: elements that are objects or arrays are copied too."""
     return [copied(e) if isinstance(e, list) else e.copy() if hasattr(e, "copy") else e for e in x]
+
+
+def shaped(x: list[Any], sizes: tuple[int, ...]) -> list[Any]:
+    """The elements of an array of several dimensions from a list of them, the last index changing fastest."""
+    for size in reversed(sizes):
+        x = [x[i : i + size] for i in range(0, len(x), size)]
+    return x
+
+
+def put(target: Any, source: Any) -> None:
+    """Assign a structure: `target` stays the object that it is, since a VAR_IN_OUT may stand for it."""
+    for name in target.__slots__:
+        setattr(target, name, getattr(source, name))
 
 
 def with_members(made: Any, **members: Any) -> Any:
@@ -144,12 +162,35 @@ def truncated(x: float, low: int, high: int) -> int:
     raise LogicError("a value that does not fit its type", expected=f"{low} to {high}", got=str(x))
 
 
+def time_times(ns: int, factor: float) -> int:
+    return to_integer(ns * factor, -(2**63), 2**63 - 1)
+
+
+def time_over(ns: int, divisor: float) -> int:
+    return to_integer(divide_real(ns, divisor), -(2**63), 2**63 - 1)
+
+
+def branch(x: int, lows: tuple[int, ...], highs: tuple[int, ...], branches: tuple[int, ...]) -> int:
+    """CASE with many labels: which branch has `x`, -1 if none. `lows` in order."""
+    at = bisect_right(lows, x) - 1
+    return branches[at] if at >= 0 and x <= highs[at] else -1
+
+
 def pick(selector: int, *choices: Any) -> Any:
     """MUX: a selector outside the choices is a `LogicError`."""
     return choices[index(selector, 0, len(choices) - 1)]
 
 
 # -- strings: positions count from 1 ------------------------------------------------------------------------------------
+
+
+def right(s: str, length: int) -> str:
+    return s[max(0, len(s) - max(0, length)) :]
+
+
+def find(s: str, what: str) -> int:
+    """0 where it is not, and for an empty one."""
+    return s.find(what) + 1 if what else 0
 
 
 def mid(s: str, length: int, position: int) -> str:
@@ -220,15 +261,16 @@ def _moment(ns: int) -> datetime:
 
 def number_of(text: str, low: int, high: int) -> int:
     """STRING_TO_integer: spaces around are ignored; what is no number is a `LogicError`."""
-    try:
-        value = int(text.strip().replace("_", ""))
-    except ValueError as e:
-        raise LogicError("a string that is no whole number", got=repr(text)) from e
-    return to_integer(value, low, high) if abs(value) < 2**53 else inside(value, low, high)
+    digits = text.strip()
+    if not _WHOLE.fullmatch(digits):
+        raise LogicError("a string that is no whole number", got=repr(text[:MAX_SHOWN]))
+    value = int(digits.replace("_", ""))
+    if low <= value <= high:
+        return value
+    raise LogicError("a value that does not fit its type", expected=f"{low} to {high}", got=str(value))
 
 
 def real_of(text: str) -> float:
-    try:
-        return float(text.strip())
-    except ValueError as e:
-        raise LogicError("a string that is no number", got=repr(text)) from e
+    if not _REAL.fullmatch(text.strip()):
+        raise LogicError("a string that is no number", got=repr(text[:MAX_SHOWN]))
+    return float(text)

@@ -73,7 +73,7 @@ def test_an_export_runs() -> None:
         scan(made, number)
     assert (made.n, made.m, made.kept) == (9, 4, 3)  # type: ignore[attr-defined]
     assert made.retained() == {"kept": 3}
-    assert made.body.v_t.Q
+    assert made.st_body.v_t.Q
 
 
 def test_errors_name_lines_of_the_export(tmp_path: Path) -> None:

@@ -134,8 +134,8 @@ def test_globals_constants_and_first_scan() -> None:
     for number in (1, 2):
         scan(one, number)
     scan(other)
-    assert (one.body.v_r, one.body.v_f, len(one.body.v_a)) == (11, 1, 4)
-    assert other.body.v_r == 8  # each program has globals of its own
+    assert (one.st_body.v_r, one.st_body.v_f, len(one.st_body.v_a)) == (11, 1, 4)
+    assert other.st_body.v_r == 8  # each program has globals of its own
 
 
 def test_inputs_keep_their_last_value_and_is_good_tells() -> None:
@@ -181,7 +181,7 @@ def test_retained_variables_survive_as_plain_data() -> None:
     assert other.n == 3  # type: ignore[attr-defined]
     assert other.retained() == one.retained()
     scan(other, 1)
-    assert (other.body.v_n, other.body.v_m, other.body.v_c.CV) == (4, 1, 2)
+    assert (other.st_body.v_n, other.st_body.v_m, other.st_body.v_c.CV) == (4, 1, 2)
     with pytest.raises(FileInvalid, match="another form"):
         program(text).restore({"n": "text"})
 
@@ -212,7 +212,7 @@ def test_retained_variables_survive_as_plain_data() -> None:
             1,
             "contains itself",
         ),
-        ("PROGRAM p VAR a : ARRAY[0..9999, 0..9999] OF INT; END_VAR END_PROGRAM", 1, "too large an array"),
+        ("PROGRAM p VAR a : ARRAY[0..9999, 0..9999] OF INT; END_VAR END_PROGRAM", 1, "too much data"),
         ("PROGRAM p VAR b : BYTE; x : BOOL; END_VAR\nx := b.8; END_PROGRAM", 2, "bits 0 to 7"),
         ("PROGRAM p\nVAR a : INT END_VAR END_PROGRAM", 2, "not Structured Text"),
         ("PROGRAM p\nIF TRUE THEN", 2, "the end of the file"),

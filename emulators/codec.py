@@ -34,6 +34,9 @@ NUMBERS = {
 }
 """Type name to its struct code and number of registers."""
 
+BCD = {"bcd16": 1, "bcd32": 2}
+"""Binary-coded decimals, four digits a register: type name to its number of registers."""
+
 ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
 
 
@@ -43,7 +46,7 @@ def register_count(type_name: str, registers: int = 0) -> int:
         if registers < 1:
             raise Bug("a string of no registers")
         return registers
-    return _number(type_name)[1]
+    return BCD[type_name] if type_name in BCD else _number(type_name)[1]
 
 
 def encode(value: float | int | str, type_name: str, order: str = "ABCD", *, registers: int = 0) -> list[int]:
@@ -59,6 +62,8 @@ def encode(value: float | int | str, type_name: str, order: str = "ABCD", *, reg
         return _split(raw[:size].ljust(size, b"\0"), order, reverse=False)
     if isinstance(value, str):
         raise Bug("text for a number", expected=type_name, got=repr(value))
+    if type_name in BCD:
+        return _split(_as_digits(value, 4 * BCD[type_name]), order)
     code, _ = _number(type_name)
     if code == "f":
         return _split(_float32(value), order)
@@ -72,6 +77,8 @@ def decode(words: Sequence[int], type_name: str, order: str = "ABCD") -> float |
     if type_name == "string":
         raw = _join(words, order, reverse=False)
         return raw.split(b"\0", 1)[0].decode("ascii", "replace")
+    if type_name in BCD:
+        return _digits_of(words, type_name, order)
     code, count = _number(type_name)
     if len(words) != count:
         raise Bug(f"registers of a {type_name}", expected=str(count), got=str(len(words)))
@@ -83,7 +90,7 @@ def _number(type_name: str) -> tuple[str, int]:
     try:
         return NUMBERS[type_name]
     except KeyError:
-        raise Bug("unknown type", expected=", ".join([*NUMBERS, "string"]), got=repr(type_name)) from None
+        raise Bug("unknown type", expected=", ".join([*NUMBERS, *BCD, "string"]), got=repr(type_name)) from None
 
 
 def _float32(value: float) -> bytes:
@@ -101,6 +108,23 @@ def _as_integer(value: float, code: str) -> int:
     if math.isinf(value):
         return high if value > 0 else low
     return min(max(round(value), low), high)
+
+
+def _as_digits(value: float, digits: int) -> bytes:
+    """`value` as decimal digits, two a byte, held within what they can show; NaN as all digits F, which are none."""
+    if math.isnan(value):
+        return b"\xff" * (digits // 2)
+    held = min(max(value, 0.0), 10.0**digits - 1)
+    return bytes.fromhex(f"{round(held):0{digits}d}")
+
+
+def _digits_of(words: Sequence[int], type_name: str, order: str) -> int:
+    if len(words) != BCD[type_name]:
+        raise Bug(f"registers of a {type_name}", expected=str(BCD[type_name]), got=str(len(words)))
+    number = 0
+    for byte in _join(words, order):
+        number = number * 100 + (byte >> 4) * 10 + (byte & 0x0F)
+    return number
 
 
 def _split(raw: bytes, order: str, *, reverse: bool = True) -> list[int]:

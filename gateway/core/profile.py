@@ -379,6 +379,36 @@ def _box(file: YamlFile, form: ProfileForm, name: str, box: BoxForm) -> Box:
     return Box(name, at, box.bytes, ack)
 
 
+WRITE_FUNCTIONS: dict[Table, tuple[int, ...]] = {"coil": (5, 15), "holding": (6, 16), "discrete": (), "input": ()}
+
+
+def _check_functions(file: YamlFile, p: DeviceProfile) -> None:
+    """Every value must be readable, and writable where it says so, with a function that the device has."""
+    functions = p.form.limits.functions
+    for tag in p.tags.values():
+        if tag.at is None:
+            continue
+        table, loc = tag.at.table, ("tags", tag.name)
+        if tag.readable and functions is not None and READ_FUNCTION[table] not in functions:
+            raise file.error(
+                loc,
+                f"the value {tag.name!r} is read with a function that the device does not have",
+                expected=f"{READ_FUNCTION[table]} in `limits: functions`",
+            )
+        if not tag.writable:
+            continue
+        if not WRITE_FUNCTIONS[table]:
+            raise file.error(loc, f"the value {tag.name!r} cannot be written: it is in the table {table!r}")
+        usable = [f for f in WRITE_FUNCTIONS[table] if functions is None or f in functions]
+        if not usable or (usable == [6] and tag.at.count > 1):
+            needed = "16" if tag.at.count > 1 else " or ".join(str(f) for f in WRITE_FUNCTIONS[table])
+            raise file.error(
+                loc,
+                f"the value {tag.name!r} is written with a function that the device does not have",
+                expected=f"{needed} in `limits: functions`",
+            )
+
+
 def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
     """What is one value, message or sample must come in one read, and a sample's counter must be able to count."""
     most = p.form.limits.read_registers
@@ -430,6 +460,7 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
         if tag not in p.tags:
             raise file.error(loc, f"no tag {tag!r} in this profile", expected="one of " + ", ".join(p.tags))
     _check_reads(file, p)
+    _check_functions(file, p)
     for command, tag in p.form.commands.items():
         if not p.tags[tag].writable:
             raise file.error(("commands", command), f"the tag {tag!r} is read-only", expected="`access: rw` or `wo`")

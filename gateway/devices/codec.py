@@ -34,13 +34,17 @@ def reorder(data: bytes, order: str) -> bytes:
 
 
 def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
-    """The value of `tag` from its register bytes as on the wire. Text ends at the first NUL.
+    """The value of `tag` from its register bytes as on the wire. Text ends at the first NUL; its registers keep their
+    order whatever `order` says, its bytes are swapped where that swaps bytes.
 
     Not a number, a digit that is none and a sentinel are bad values and never good ones; a value outside the profile's range
     is uncertain.
     """
     if tag.type == "string":
-        text = data.split(b"\0", 1)[0].decode("ascii", errors="replace").rstrip()
+        swapped = tag.order in ("BADC", "DCBA")  # characters change places within a register, registers never do
+        text = (
+            (reorder(data, "BADC") if swapped else data).split(b"\0", 1)[0].decode("ascii", errors="replace").rstrip()
+        )
         return TagValue(text, Quality.GOOD, Reason.NONE, t_ns, data)
     if tag.type == "bytes":
         return TagValue(data, Quality.GOOD, Reason.NONE, t_ns, data)

@@ -265,10 +265,13 @@ class RegisterDriver(DeviceDriver):
                 )
 
     async def _write_tag(self, tag: Tag, data: bytes) -> None:
-        """Write a tag's registers with one request: function 10h, or 05 and 06 where the device has no other."""
+        """Write a tag's registers with one request: function 10h, or 06 where the device has no other; a coil with 05, or
+        0Fh where it has no other."""
         at = tag.registers
         functions = self.profile.form.limits.functions
-        if at.table == "coil":
+        if at.table == "coil" and functions is not None and 5 not in functions:
+            await self.client.write_coils(self.config.address, at.address, [bool(int.from_bytes(data))])
+        elif at.table == "coil":
             await self.client.write_coil(self.config.address, at.address, bool(int.from_bytes(data)))
         elif at.count == 1 and functions is not None and 16 not in functions:
             await self.client.write_register(self.config.address, at.address, int.from_bytes(data))

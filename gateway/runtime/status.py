@@ -14,7 +14,7 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
     return {
         "devices": _devices(gateway, now_ns),
         "buses": {name: _bus(bus) for name, bus in gateway.buses.items()},
-        "tags": {name: gateway.tags.current(name, now_ns).describe(now_ns) for name in gateway.tags.names},
+        "tags": _tags(gateway, now_ns),
         "outputs": [
             {"tag": o.tag, "wanted": o.wanted, "held": o.held, "by": o.by, "refused": o.refused == (o.wanted, o.by)}
             for o in gateway.outputs.outputs
@@ -51,6 +51,18 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
         "logged": gateway.log.stored,
         "log_dropped": gateway.log.dropped,
     }
+
+
+def _tags(gateway: Gateway, now_ns: int) -> dict[str, Any]:
+    """Every tag; one whose profile names its values has a `text` too, while its value is one of those."""
+    found: dict[str, Any] = {name: gateway.tags.current(name, now_ns).describe(now_ns) for name in gateway.tags.names}
+    for driver in gateway.drivers.values():
+        for tag in driver.profile.tags.values():
+            shown = found.get(f"{driver.config.name}.{tag.name}")
+            if tag.values and shown is not None:
+                text = dict(tag.values).get(shown["value"])
+                found[f"{driver.config.name}.{tag.name}"] = {**shown, **({"text": text} if text is not None else {})}
+    return found
 
 
 def _devices(gateway: Gateway, now_ns: int) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from support import run
 
 from emulators import codec as emulated
+from emulators.modbus.bank import MapBank, Span
 from emulators.modbus.unit import ModbusUnit
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.signals import SignalPlayer, SignalTrack
@@ -290,8 +291,49 @@ def test_every_order_is_its_own_inverse(data: bytes, order: str) -> None:
     assert reorder(reorder(data, order), order) == data
 
 
-@given(st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=12))
-def test_text_ends_at_its_first_nul(text: str) -> None:
-    tag = profile('tags:\n  x: {at: "holding:0", type: string, registers: 6}\n').tags["x"]
-    wire = b"".join(w.to_bytes(2) for w in emulated.encode(text, "string", registers=6))
+@given(st.text(st.characters(min_codepoint=33, max_codepoint=126), max_size=12), st.sampled_from(ORDERS))
+def test_text_ends_at_its_first_nul_whatever_the_order_of_bytes(text: str, order: str) -> None:
+    tag = profile(f'tags:\n  x: {{at: "holding:0", type: string, registers: 6, order: {order}}}\n').tags["x"]
+    wire = b"".join(w.to_bytes(2) for w in emulated.encode(text, "string", order, registers=6))
     assert decode(tag, wire, 0).value == text
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize(("kind", "digits"), [("bcd16", 4), ("bcd32", 8)])
+@given(data=st.data())
+def test_binary_coded_decimals_are_the_digits_that_one_reads(
+    kind: str, digits: int, order: str, data: st.DataObject
+) -> None:
+    number = data.draw(st.integers(0, 10**digits - 1))
+    tag = profile(f'tags:\n  x: {{at: "holding:0", type: {kind}, order: {order}, access: rw}}\n').tags["x"]
+    words = emulated.encode(number, kind, order)
+    wire = b"".join(w.to_bytes(2) for w in words)
+    if order == "ABCD":
+        assert wire.hex() == f"{number:0{digits}d}"
+    assert decode(tag, wire, 0).value == number
+    assert encode(tag, number) == wire
+    assert emulated.decode(words, kind, order) == number
+    assert decode(tag, emulated.encode(math.nan, kind)[0].to_bytes(2) * (digits // 4), 0).value is None
+    assert emulated.encode(10.0**digits, kind) == emulated.encode(10**digits - 1, kind)  # as much as it can show
+
+
+def test_a_coil_is_written_with_0fh_where_the_device_has_no_05() -> None:
+    async def main(functions: str, expected: int) -> None:
+        p = profile(f'limits: {{functions: {functions}}}\ntags:\n  c: {{at: "coil:3", type: bool, access: rw}}\n')
+        bank = MapBank([Span("coil", 0, 8)])
+        field = FieldBus({1: ModbusUnit(bank)})
+        connection = await field.open_bytes(LINE)
+        client = ModbusClient(connection, WallClock(), framing="rtu", serial=LINE.serial, timeout_s=0.3)
+        driver = SensorDriver(DeviceConfig("d", p, "line1", 1), TagTable(WallClock()))
+        driver.attach_client(connection, client)
+        try:
+            driver.consumer.observe(driver.command("c", 1))
+            await driver.send()
+        finally:
+            await client.aclose()
+            await field.aclose()
+        assert bank.peek("coil", 3) == 1
+        assert expected in [adu[1] for adu in field.heard]
+
+    run(main("[1, 15]", 15))
+    run(main("[1, 5, 15]", 5))

@@ -193,3 +193,19 @@ def test_a_range_that_is_none_is_refused(text: str) -> None:
 def test_a_gap_where_a_value_stands_is_refused() -> None:
     with pytest.raises(FileInvalid, match=r"holding:2\.\.5.*where the tag 't1' stands"):
         profile_of([(0, "uint16"), (4, "uint16")], gaps=["holding:1", "holding:2..5"])
+
+
+@pytest.mark.parametrize(
+    ("functions", "tag", "why"),
+    [
+        ("[3]", '{at: "input:0"}', "read with a function.*expected 4"),
+        ("[3]", '{at: "holding:0", access: rw}', "written with a function.*expected 6 or 16"),
+        ("[3, 6]", '{at: "holding:0", type: float32, access: rw}', "written with a function.*expected 16"),
+        ("[1]", '{at: "coil:0", type: bool, access: rw}', "expected 5 or 15"),
+        ("[4]", '{at: "input:0", access: rw}', "cannot be written"),
+    ],
+)
+def test_a_value_that_the_device_has_no_function_for_is_refused(functions: str, tag: str, why: str) -> None:
+    head = 'device: test/functions\nsource: "a test"\nprotocol: modbus\n'
+    with pytest.raises(FileInvalid, match=why):
+        resolve(parse(f"{head}limits: {{functions: {functions}}}\ntags: {{x: {tag}}}\n", "test.yaml"))

@@ -72,14 +72,18 @@ def usable(
 ) -> list[PdoConfig]:
     """Those of a node's RPDOs that we may send: enabled, each object in `writable`, and no tag in two of them.
 
-    `taken` are tags that another RPDO has already: a second one would put back what the first changed.
+    `taken` are tags that another RPDO has already: a second one would put back what the first changed. The RPDO with the
+    most tags comes first, so that what belongs together goes in one frame.
     """
-    found, seen = [], set(taken)
+    candidates = []
     for config in held:
-        tags = [
-            t for t, e in zip(tags_in(config.mapping, by_object), config.mapping.entries, strict=True) if not is_gap(e)
-        ]
-        if config.enabled and tags and all(t in writable for t in tags) and not seen.intersection(tags):
+        named = zip(tags_in(config.mapping, by_object), config.mapping.entries, strict=True)
+        tags = [tag for tag, entry in named if not is_gap(entry)]
+        if config.enabled and tags and all(tag in writable for tag in tags):
+            candidates.append((config, tags))
+    found, seen = [], set(taken)
+    for config, tags in sorted(candidates, key=lambda c: (-len(c[1]), c[0].number)):
+        if not seen.intersection(tags) and len(set(tags)) == len(tags):
             seen.update(tags)
             found.append(config)
     return found

@@ -53,6 +53,11 @@ class PtyEnd(ByteConnection):
         self._settle_check: asyncio.TimerHandle | None = None
         self._on_its_way: asyncio.TimerHandle | None = None
 
+    @property
+    def paced(self) -> bool:
+        """Whether bytes take the time of a line."""
+        return self._inward is not None
+
     @classmethod
     async def open(cls, link: Path, endpoint: Endpoint, pace: SerialSettings | None = None) -> PtyEnd:
         """Make the port and its link, replacing a link that is there. With `pace`, bytes come and go at that line's speed:
@@ -84,14 +89,18 @@ class PtyEnd(ByteConnection):
     async def write(self, data: bytes) -> None:
         """Send `data`, one writer after the other; with pacing, return when the line would have carried it."""
         async with self._writing:
-            if self._outward is None:
+            await self._send(data, self._line_is_ours_ns())
+
+    async def answer(self, data: bytes, after_s: float) -> None:
+        """Send `data`, `after_s` behind the last character that was heard; with pacing, never before t3.5 of silence, and
+        by the line's time: that this process woke up late takes nothing from the line."""
+        async with self._writing:
+            if self._inward is None:
+                await asyncio.sleep(after_s)
                 await self._hand_over(data)
                 return
-            start_ns = self._line_is_ours_ns()
-            for at in range(0, len(data), FIFO_CHARS):
-                piece = data[at : at + FIFO_CHARS]
-                await self._sleep_until_ns(self._outward.send(start_ns, len(piece)))
-                await self._hand_over(piece)
+            pause_ns = max(round(after_s * NS_PER_S), self._inward.t3_5_ns)
+            await self._send(data, self._inward.busy_until_ns + pause_ns)
 
     async def aclose(self) -> None:
         """Close the port; remove the link unless somebody else's port took its place."""
@@ -110,12 +119,22 @@ class PtyEnd(ByteConnection):
 
     # -- the line's time ------------------------------------------------------------------------------------------
 
+    async def _send(self, data: bytes, start_ns: int) -> None:
+        if self._outward is None:
+            await self._hand_over(data)
+            return
+        for at in range(0, len(data), FIFO_CHARS):
+            piece = data[at : at + FIFO_CHARS]
+            await self._sleep_until_ns(self._outward.send(start_ns, len(piece)))
+            await self._hand_over(piece)
+
     def _now_ns(self) -> int:
         return round(self._loop.time() * NS_PER_S)
 
     def _line_is_ours_ns(self) -> int:
         """From when on we may send: the pause of t3.5 after the last character that the other side sent."""
-        assert self._inward is not None
+        if self._inward is None:
+            return self._now_ns()
         return max(self._now_ns(), self._inward.busy_until_ns + self._inward.t3_5_ns)
 
     async def _sleep_until_ns(self, deadline_ns: int) -> None:

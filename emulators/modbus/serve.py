@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import SocketEnd
 from emulators.endpoints.udp_end import UdpEnd
 from emulators.modbus.line import Exchange, LineSlave
@@ -56,7 +57,11 @@ async def serve_rtu(
             now_ns = clock.monotonic_ns()
             if echo and data:
                 await connection.write(data)
-            await _reply(connection.write, slave.receive(data, now_ns), clock, now_ns, latency_s, on_frame)
+            exchanges = slave.receive(data, now_ns)
+            if isinstance(connection, PtyEnd) and connection.paced:
+                await _reply_on_line(connection, exchanges, clock, now_ns, latency_s, on_frame)
+            else:
+                await _reply(connection.write, exchanges, clock, now_ns, latency_s, on_frame)
     except ConnectionLost:
         return
 
@@ -134,17 +139,44 @@ async def _reply(
     latency_s: float | Latency,
     on_frame: OnFrame | None,
 ) -> None:
-    if on_frame is not None:
-        for exchange in exchanges:  # all of them came before any is answered
-            on_frame(Direction.SENT, now_ns, exchange.heard)
+    _tell_heard(exchanges, now_ns, on_frame)
     due_ns = now_ns
     for exchange in exchanges:
         if not exchange.reply:
             continue
-        thinks_s = latency_s(exchange) if callable(latency_s) else latency_s
+        thinks_s = _thinks_s(exchange, latency_s)
         if thinks_s > 0:
             due_ns += round(thinks_s * NS_PER_S)
             await clock.sleep_until_ns(due_ns)
         await send(exchange.reply)
         if on_frame is not None:
             on_frame(Direction.RECEIVED, clock.monotonic_ns(), exchange.reply)
+
+
+async def _reply_on_line(
+    end: PtyEnd,
+    exchanges: list[Exchange],
+    clock: Clock,
+    now_ns: int,
+    latency_s: float | Latency,
+    on_frame: OnFrame | None,
+) -> None:
+    """As `_reply`, where the line itself keeps the time: a device thinks from the request's last character on."""
+    _tell_heard(exchanges, now_ns, on_frame)
+    after_s = 0.0
+    for exchange in exchanges:
+        if exchange.reply:
+            after_s += _thinks_s(exchange, latency_s)
+            await end.answer(exchange.reply, after_s)
+            if on_frame is not None:
+                on_frame(Direction.RECEIVED, clock.monotonic_ns(), exchange.reply)
+
+
+def _tell_heard(exchanges: list[Exchange], now_ns: int, on_frame: OnFrame | None) -> None:
+    if on_frame is not None:
+        for exchange in exchanges:  # all of them came before any is answered
+            on_frame(Direction.SENT, now_ns, exchange.heard)
+
+
+def _thinks_s(exchange: Exchange, latency_s: float | Latency) -> float:
+    return latency_s(exchange) if callable(latency_s) else latency_s

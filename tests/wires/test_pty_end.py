@@ -261,6 +261,34 @@ def test_what_is_read_is_there_when_the_line_has_carried_it(tmp_path: Path) -> N
     run(main())
 
 
+@pytest.mark.parametrize("settings", [SerialSettings(9600, "8N1"), None], ids=["paced", "unpaced"])
+@pytest.mark.parametrize("after_s", [0.0, 0.012])
+def test_an_answer_begins_so_long_after_the_last_character(
+    tmp_path: Path, settings: SerialSettings | None, after_s: float
+) -> None:
+    """A device's own time counts from the request's end on the line, and is never less than the silence of 3.5 characters."""
+
+    async def main() -> None:
+        loop = asyncio.get_running_loop()
+        end = await PtyEnd.open(tmp_path / "line1", LINE, settings)
+        port = open_port(tmp_path / "line1")
+        line = SerialPacer(settings or SerialSettings(9600, "8N1"))
+        for _ in range(3):
+            asked_s = loop.time()
+            os.write(port, b"12345678")
+            assert await received(end, 8) == b"12345678"
+            await end.answer(b"123", after_s)
+            least_s = after_s
+            if settings is not None:
+                least_s = line.duration_ns(11) / 1e9 + max(after_s, line.t3_5_ns / 1e9)
+            assert loop.time() - asked_s >= least_s - 1e-6
+            assert await take(port, 3) == b"123"
+        os.close(port)
+        await end.aclose()
+
+    run(main())
+
+
 def test_a_port_that_closes_while_something_is_on_its_way_forgets_it(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line1", LINE, SerialSettings(1200, "8N1"))

@@ -217,13 +217,6 @@ def test_a_transmitter_on_a_serial_line_is_refused_when_the_file_is_read(
     assert "TCP" in err
 
 
-def test_polling_a_node_is_refused_instead_of_ignored(invoke: Invoke, plant: Callable[..., str]) -> None:
-    path = plant("    start: true", "    poll: {identity: {every_ms: 500}}\n    start: true")
-    code, _, err = invoke("run", path, "--plant", "--for", "1s")
-    assert code == 3, err
-    assert "TPDO" in err
-
-
 # -- recordings ---------------------------------------------------------------------------------------------------------
 
 

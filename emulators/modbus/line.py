@@ -118,7 +118,8 @@ class LineSlave(ABC):
         response = addressed.respond(pdu, now_ns)
         if response is None:
             return Exchange(heard)
-        for unit in self.units.values():
-            if unit is not addressed:  # a reply is a message to its neighbours; the sender's receiver is off meanwhile
-                unit.heard(messages=1)
+        if len(self.units) > 1:
+            for unit in self.units.values():
+                if unit is not addressed:  # a reply is a message to its neighbours; the sender's receiver is off meanwhile
+                    unit.heard(messages=1)
         return Exchange(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)

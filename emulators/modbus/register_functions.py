@@ -52,6 +52,9 @@ class UnitLimits:
             )
 
 
+_ADDRESS_AND_COUNT = struct.Struct(">HH").unpack_from
+
+
 class RegisterFunctions:
     """The functions over one bank, within one device's limits."""
 
@@ -62,7 +65,7 @@ class RegisterFunctions:
     def read(self, pdu: bytes, now_ns: int) -> bytes:
         table = TABLES[pdu[0]]
         require_length(pdu, 5)
-        address, count = _words(pdu[1:5])
+        address, count = _ADDRESS_AND_COUNT(pdu, 1)
         if pdu[0] <= 0x02:
             _require_count(count, self.limits.read_bits)
             _require_range(address, count)

@@ -61,6 +61,10 @@ class RtuReceiver:
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
         """Frames that are whole now, oldest first, each with unit and CRC. Never raises, whatever comes."""
+        if not self._buffer and self._is_a_request(data):
+            self._last_ns = now_ns
+            self.frames += 1
+            return [data]
         frames: list[bytes] = []
         if self._buffer and now_ns - self._last_ns >= self.gap_ns:
             while frame := self._next_frame(wait=False):
@@ -74,6 +78,12 @@ class RtuReceiver:
                 frames.append(frame)
         self.frames += len(frames)
         return frames
+
+    def _is_a_request(self, data: bytes) -> bool:
+        """As a rule a chunk is a request to us, whole and alone; whatever else it is, `_next_frame` finds out."""
+        if len(data) < MIN_FRAME or data[0] not in self._own or self._hunt is not None:
+            return False
+        return FIXED_REQUESTS.get(data[1]) == len(data) and crc16(data) == 0
 
     def _next_frame(self, wait: bool) -> bytes | None:
         if self._hunt is None:

@@ -162,7 +162,7 @@ class ModbusUnit:
         """The line carried so many whole and damaged frames, for whomever."""
         self.counters.bus_messages += messages
         self.counters.bus_errors += errors
-        for _ in range(min(errors, MAX_EVENTS)):
+        for _ in range(min(errors, MAX_EVENTS)) if errors else ():
             self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, damaged=True)
 
     def _counted(self, pdu: bytes, now_ns: int, busy: bool) -> bytes | None:

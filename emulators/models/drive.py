@@ -103,7 +103,7 @@ class Drive(DeviceModel):
             self._change_mode(now_ns, objects)
         if (CONTROLWORD, 0) in situation.written:
             self._obey(now_ns, objects)
-        elif self._in(PROFILE_SPEED) and {(TARGET_VELOCITY, 0), (ACCELERATION, 0), (DECELERATION, 0)} & set(
+        if self._in(PROFILE_SPEED) and {(TARGET_VELOCITY, 0), (ACCELERATION, 0), (DECELERATION, 0)} & set(
             situation.written
         ):
             self._follow_speed(now_ns, objects)

@@ -203,8 +203,9 @@ def test_the_drive_runs_and_a_lost_plc_stops_it(tmp_path: Path) -> None:
         async with rig(tmp_path) as r:
             r.want(mode=3)  # no RPDO carries it: over SDO
             for word in (6, 7, 15):
-                r.want(controlword=word, target_velocity=800)
+                r.want(controlword=word, target_velocity=0)
                 await asyncio.sleep(0.15)
+            r.want(target_velocity=800)  # the controlword goes with it, as it was
             await asyncio.sleep(1)
             assert r.field.downloaded(0x6060) == [b"\x03"]
             assert r.tags.current("d.velocity", 0).value == 800

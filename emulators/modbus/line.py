@@ -120,6 +120,8 @@ class LineSlave(ABC):
             return Exchange(heard)
         if len(self.units) > 1:
             for unit in self.units.values():
-                if unit is not addressed:  # a reply is a message to its neighbours; the sender's receiver is off meanwhile
+                if (
+                    unit is not addressed
+                ):  # a reply is a message to its neighbours; the sender's receiver is off meanwhile
                     unit.heard(messages=1)
         return Exchange(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)

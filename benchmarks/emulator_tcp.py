@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """The emulator over TCP against libmodbus's and pymodbus's servers: 10 registers a request.
 
-    benchmarks/emulator_tcp.py [--runs 5] [--seconds 2] [--clients 64]
+    benchmarks/emulator_tcp.py [--runs 5] [--seconds 2] [--clients 64] [--quick]
 
 One libmodbus C client, then many clients at once. Runs of all servers interleaved, ratios pair by pair, medians. Exit
 status 1 when a goal is missed. Needs gcc and libmodbus-dev; uvloop (the `perf` extra) for its rows; a quiet machine.
@@ -69,7 +69,9 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--clients", type=int, default=64)
+    parser.add_argument("--quick", action="store_true", help="one run of 1 s")
     options = parser.parse_args()
+    runs, seconds = (1, 1.0) if options.quick else (options.runs, options.seconds)
     try:
         one, many, libmodbus = build("modbus_client"), build("modbus_clients"), build("modbus_server")
     except Missing as e:
@@ -77,7 +79,7 @@ def main() -> int:
         return 2
     goals = Goals()
     print("one client (libmodbus, C)\n")
-    single = compare(servers(libmodbus), [str(one)], options.runs, options.seconds)
+    single = compare(servers(libmodbus), [str(one)], runs, seconds)
     for name, rate, cpu in ((PLAIN, 0.80, 2.2), (FAST, 0.85, 1.6)):
         if name in single:
             goals.least(f"{name} / libmodbus, requests/s", ratio(single[name].rate, single["libmodbus"].rate), rate)
@@ -86,7 +88,7 @@ def main() -> int:
     goals.least(f"{best} / pymodbus, requests/s", ratio(single[best].rate, single["pymodbus"].rate), 1.6)
 
     print(f"{options.clients} clients at once (one C thread)\n")
-    crowd = compare(servers(None), [str(many), str(options.clients)], options.runs, options.seconds)
+    crowd = compare(servers(None), [str(many), str(options.clients)], runs, seconds)
     goals.least(f"{best} / pymodbus, {options.clients} clients", ratio(crowd[best].rate, crowd["pymodbus"].rate), 2.5)
     return goals.verdict()
 

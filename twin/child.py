@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import runpy
 import signal
 import sys
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+
+MOST_FILES = 65_536
 
 
 def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
@@ -43,6 +46,15 @@ def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
         os.kill(os.getpid(), signal.SIGHUP)
 
 
+def allow_open_files() -> None:
+    """Let this process open as many files as it may, `MOST_FILES` at most: 1,000 devices are 2,000 sockets, and where a
+    process begins with 1,024 it is for programs that use select(2), which we do not."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    allowed = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
+    if soft != resource.RLIM_INFINITY and soft < allowed:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
+
+
 def command(module: str, *args: str, linger_s: float = 0.0) -> list[str]:
     """The command line that runs `module` as a child of this process."""
     return [sys.executable, "-m", "twin.child", str(os.getpid()), str(linger_s), module, *args]
@@ -52,6 +64,7 @@ def main(argv: list[str]) -> None:
     """Become the module that is named."""
     parent, linger_s, module = int(argv[0]), float(argv[1]), argv[2]
     end_with_parent(parent, linger_s)
+    allow_open_files()
     sys.argv = [module, *argv[3:]]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
 

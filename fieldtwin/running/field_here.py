@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fieldtwin.cli.talk import talk
+from twin.child import allow_open_files
 from twin.field import FieldSide
 from twin.field_process import FieldConfig, FieldProcess
 from twin.instance import Instance
@@ -29,6 +30,7 @@ class FieldOptions:
 
 async def run_field(options: FieldOptions) -> int:
     """Serve until SIGINT or SIGTERM. Prints where everything listens, once it does."""
+    allow_open_files()
     name = load_system(str(options.system), options.profiles).name
     with Instance(options.instance or f"{name}-field") as instance:
         config = FieldConfig(

@@ -1,4 +1,4 @@
-"""The Modbus keys of a system file, resolved: the pace of a bus and of each device on it, with what profiles ask for."""
+"""The keys of a system file that say a pace, resolved: of a Modbus bus, and of each device, with what profiles ask for."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gateway.protocols.modbus.framings import framing_of, make_framer
 from twin.system_schema import BusForm, DeviceForm, SystemForm
 
 MODBUS_BUS_KEYS = ("spacing_ms", "turnaround_ms", "connect_pause_ms", "echo", "strict", "probe_percent")
-MODBUS_KEYS = ("timeout_ms", "retries", "spacing_ms", "backoff_first_ms", "backoff_limit_ms")
+MODBUS_KEYS = ("spacing_ms",)
 
 
 def modbus_bus(file: YamlFile, name: str, form: BusForm, endpoint: Endpoint) -> BusConfig:
@@ -42,13 +42,10 @@ def modbus_bus(file: YamlFile, name: str, form: BusForm, endpoint: Endpoint) -> 
     )
 
 
-def modbus_device(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, config: DeviceConfig) -> DeviceConfig:
+def device_pace(file: YamlFile, loc: tuple[Key, ...], form: DeviceForm, config: DeviceConfig) -> DeviceConfig:
     """A device with its pace: what the system file says, else what its profile says, else as the bus."""
     if config.profile.protocol != "modbus":
         _refuse(file, loc, form.model_fields_set.intersection(MODBUS_KEYS))
-        for group, poll in form.poll.items():
-            _refuse(file, (*loc, "poll", group), poll.model_fields_set.intersection(["phase_ms"]))
-        return config
     timing = config.profile.form.timing
     for group, poll in form.poll.items():
         if poll.phase_ms is not None and poll.phase_ms >= poll.every_ms:

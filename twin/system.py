@@ -19,7 +19,7 @@ from gateway.core.yaml_file import Key, YamlFile, load, validate
 from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from twin.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from twin.data_files import find
-from twin.modbus_keys import connect_pauses, modbus_bus, modbus_device
+from twin.modbus_keys import connect_pauses, device_pace, modbus_bus
 from twin.serving import Serving, resolve_serving
 from twin.system_schema import BusForm, DeviceForm, PlcForm, SystemForm
 
@@ -132,7 +132,7 @@ def _device(
     )
     _check_device(file, loc, d, config)
     check_rpdo1(file, loc, d, profile, bool(buses[d.bus].canopen.sync_ms))
-    return modbus_device(file, loc, d, config)
+    return device_pace(file, loc, d, config)
 
 
 def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:

@@ -99,13 +99,13 @@ class DeviceForm(Strict):
     node: int | None = Field(default=None, ge=1, le=127)
     expect: dict[Name, str] = {}
     poll: dict[Name, PollForm] = {}
-    timeout_ms: Milliseconds | None = Field(default=None, description="Modbus; default: the profile's, else the bus's")
-    retries: int | None = Field(default=None, ge=0, le=10, description="Modbus; default: the bus's")
+    timeout_ms: Milliseconds | None = Field(default=None, description="default: the profile's, else the bus's")
+    retries: int | None = Field(default=None, ge=0, le=10, description="default: the bus's")
     spacing_ms: Pause | None = Field(
         default=None, description="Modbus: pause between a reply and the next request for it"
     )
-    backoff_first_ms: Milliseconds = Field(default=250, description="Modbus: how long it is left alone when it is lost")
-    backoff_limit_ms: Milliseconds = Field(default=10_000, description="Modbus: that doubles up to this")
+    backoff_first_ms: Milliseconds = Field(default=250, description="how long it is left alone when it is lost")
+    backoff_limit_ms: Milliseconds = Field(default=10_000, description="that doubles up to this")
     stale_after_ms: Milliseconds = 5000
     writable: list[Name] = []
     safe: dict[Name, int | float] = {}

@@ -61,6 +61,7 @@ class NodeStatus:
     poll_errors: int = 0
     wanted: asyncio.Event = field(default_factory=asyncio.Event)
     up: asyncio.Event = field(default_factory=asyncio.Event)
+    booted: asyncio.Event = field(default_factory=asyncio.Event)
     backoff: Backoff = field(init=False)
 
     def __post_init__(self) -> None:
@@ -107,7 +108,10 @@ class CanopenBus:
         groups: list[tuple[Hashable, int]] = [
             ((d.node, group), every_ms) for d in drivers for group, every_ms in d.config.poll.items()
         ]
-        rates = spread(groups)
+        stated: dict[Hashable, int] = {
+            (d.node, group): phase_ms for d in drivers for group, phase_ms in d.config.phase.items()
+        }
+        rates = spread(groups, stated)
         schedule = PollSchedule({group: rates[driver.node, group] for group in driver.config.poll}, ())
         return NodeStatus(driver, NodeWrites(driver, clock, self.config.timeout_s), schedule)
 
@@ -259,19 +263,26 @@ class CanopenBus:
         while True:
             await status.wanted.wait()
             status.wanted.clear()
+            status.booted.clear()
             try:
                 await self._bring_up(status.driver)
             except ReplyTimeout as e:
                 self._failed(status, await self._assign(status.driver, e))
-                await self._pause(status.backoff.next_s())
+                await self._rest(status)
             except ConnectionLost:
                 raise
             except FieldtwinError as e:
                 self._failed(status, e)
-                await self._pause(status.backoff.next_s())
+                await self._rest(status)
             else:
                 if not status.wanted.is_set():  # else it restarted meanwhile
                     self._online(status)
+
+    async def _rest(self, status: NodeStatus) -> None:
+        """Leave a node alone that did not answer, until it says that it booted."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(status.backoff.next_s()):
+                await status.booted.wait()
 
     async def _poll(self, status: NodeStatus) -> None:
         """Read the node's groups in their turn while it is up. Periods that were missed are counted and skipped."""
@@ -360,6 +371,7 @@ class CanopenBus:
             status.emcy_log.restarted()
             self._offline(status, Unreachable("the node restarted"))
             status.wanted.set()
+            status.booted.set()
         elif event.kind == "heartbeat-lost":
             self._offline(status, Unreachable("heartbeat lost"))
             status.wanted.set()

@@ -8,7 +8,7 @@ import pytest
 from test_concise_dcf import TPDO1, var
 
 from gateway.core.errors import FileInvalid
-from gateway.devices.canopen_config import CanopenBusConfig
+from gateway.devices.canopen_config import CanopenBusConfig, RpdoConfig
 from gateway.protocols.canopen.boot import ExpectedIdentity
 from gateway.protocols.canopen.lss import LssAddress
 from twin.system import load_system
@@ -62,12 +62,58 @@ def test_what_the_keys_become(tmp_path: Path) -> None:
     assert plain.buses["can0"].canopen == CanopenBusConfig()
 
 
+RPDO1 = "writable: [controlword, target_velocity, mode], rpdo1: "
+
+
+def drive(tmp_path: Path, **keys: str) -> str:
+    """The system with a drive in the inclinometer's place."""
+    path = Path(write(tmp_path, **keys))
+    path.write_text(path.read_text(encoding="utf-8").replace("inclinometer-cia410", "drive-cia402"), encoding="utf-8")
+    return str(path)
+
+
+def test_what_the_keys_of_outputs_polls_and_pace_become(tmp_path: Path) -> None:
+    pace = "timeout_ms: 80, retries: 3, backoff_first_ms: 100, backoff_limit_ms: 900"
+    poll = "poll: {values: {every_ms: 500, phase_ms: 40}}"
+    node = RPDO1 + "{map: [controlword, target_velocity], transmission: sync, event_ms: 50}, rpdos: node"
+    found = load_system(drive(tmp_path, BUS="sync: {period_ms: 10}", NODE=f"{node}, {pace}, {poll}")).devices["incl"]
+    assert found.canopen.rpdo1 == RpdoConfig(("controlword", "target_velocity"), True, 50)
+    assert (found.canopen.adopt_rpdos, found.canopen.rpdos) == (True, None)
+    assert (found.timeout_s, found.retries, found.backoff_first_s, found.backoff_limit_s) == (0.08, 3, 0.1, 0.9)
+    assert (found.poll, found.phase) == ({"values": 500}, {"values": 40})
+    plain = load_system(drive(tmp_path, NODE=RPDO1 + "{map: [mode]}")).devices["incl"]
+    assert plain.canopen.rpdo1 == RpdoConfig(("mode",))
+    assert (plain.timeout_s, plain.retries) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("node", "says"),
+    [
+        ("rpdo1: {map: [controlword]}", "tags of this device's `writable`"),
+        (RPDO1 + "{map: [statusword]}", "tags of this device's `writable`"),
+        (RPDO1 + "{map: [mode, mode]}", "each once"),
+        (RPDO1 + "{map: [mode], transmission: sync}", "nobody says when its values count"),
+        (RPDO1 + "{map: [controlword, target_velocity, mode], event_ms: 0}", "greater than or equal to 1"),
+        ("writable: [target_velocity, target_position, mode], rpdo1: {map: [target_velocity, target_position, mode]}",
+         "64 bits; got 72"),
+        ("rpdos: dcf", "`dcf`, a DCF file"),
+        ("spacing_ms: 5", "a Modbus bus"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_outputs_is_said_with_its_line(tmp_path: Path, node: str, says: str) -> None:
+    with pytest.raises(FileInvalid, match=says) as caught:
+        load_system(drive(tmp_path, NODE=node))
+    assert "s.yaml:7:" in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("keys", "says"),
     [
         ({"BUS": "sync: {period_ms: 10, counter: 1}"}, "2 to 240"),
         ({"LAN": "sync: {period_ms: 10}"}, "a CAN bus"),
         ({"CTD": "dcf: node5.dcf"}, "a CANopen node"),
+        ({"CTD": "rpdos: node"}, "a CANopen node"),
+        ({"CTD": "rpdo1: {map: [sample_period_s]}"}, "a CANopen node"),
         ({"NODE": "lss: true"}, "`identity` with vendor to serial"),
         ({"NODE": "lss: true, identity: {vendor: 1}"}, "`identity` with vendor to serial"),
         ({"NODE": "identity: {vendor: 0x100000000}"}, "4294967295"),

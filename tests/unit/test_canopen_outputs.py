@@ -413,6 +413,21 @@ def test_a_node_without_a_heartbeat_is_lost_when_a_poll_is_not_answered(tmp_path
     run_virtually(main())
 
 
+def test_a_boot_up_ends_the_time_for_which_a_lost_node_is_left_alone(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path, replace(DRIVEN, backoff_first_s=60.0, backoff_limit_s=60.0, timeout_s=0.02)) as r:
+            await r.field.power_off()
+            await asyncio.sleep(5)
+            asked = len(r.field.sent)
+            await asyncio.sleep(20)
+            assert (len(r.field.sent), r.status.online) == (asked, False)  # it is left alone
+            r.field.power_on()
+            await asyncio.sleep(0.3)
+            assert r.status.online
+
+    run_virtually(main())
+
+
 def _rpdo(number: int, *objects: tuple[int, int, int], enabled: bool = True) -> PdoConfig:
     return PdoConfig(number, 0x200 + NODE, enabled, 255, None, PdoMapping.of(objects))
 

@@ -8,6 +8,7 @@ good idea: whoever sets one did.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isfinite
 
 from gateway.core.errors import EndpointBusy, UsageError
 from gateway.core.image import TagKind, TagSpec
@@ -64,13 +65,13 @@ class Forces:
 
 def checked(spec: TagSpec, value: Scalar) -> Scalar:
     """`value` as one of the tag's kind. Raises `UsageError`."""
-    whole = isinstance(value, int) or (isinstance(value, float) and value == int(value))
-    if spec.kind is TagKind.REAL and isinstance(value, int | float):
-        return float(value)
-    if spec.kind is TagKind.INT and isinstance(value, int | float) and whole and abs(value) < 2**63:
-        return int(value)
-    if spec.kind is TagKind.BOOL and value in (0, 1):
-        return bool(value)
+    if isinstance(value, int | float) and (isinstance(value, int) or isfinite(value)) and -(2**63) <= value < 2**63:
+        if spec.kind is TagKind.REAL:
+            return float(value)
+        if spec.kind is TagKind.INT and value == int(value):
+            return int(value)
+        if spec.kind is TagKind.BOOL and value in (0, 1):
+            return bool(value)
     raise UsageError(
         f"{spec.name} cannot be forced to that", expected=f"a value of kind {spec.kind.value}", got=repr(value)
     )

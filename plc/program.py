@@ -43,7 +43,8 @@ class ProgramFailed(FieldtwinError):
         self.program = program
         self.line = line
         self.variable = variable
-        spot = f"program {program}" + (f", {path}:{line}" if line else "") + (f", {variable}" if variable else "")
+        place = f"{path}:{line}" if line else path
+        spot = ", ".join(part for part in (f"program {program}", place, variable) if part)
         super().__init__(message, where=spot)
 
 
@@ -190,6 +191,18 @@ class Program(ABC):
     def retained(self) -> dict[str, Any]:
         """What a warm start needs: numbers, strings, lists and maps of those by variable."""
         return {v.name: self.__dict__[v.name] for v in self.variables.values() if v.retain}
+
+    def retain_layout(self) -> Any:
+        """What must be the same for a retained value to mean the same: JSON-able."""
+        return [[v.name, v.kind.value] for v in self.variables.values() if v.retain]
+
+    def retain_bytes(self) -> int:
+        """The most that `retained` takes as MessagePack, whatever the values."""
+        return sum(9 + 5 + len(v.name.encode()) for v in self.variables.values() if v.retain)
+
+    def check(self, name: str, value: Scalar) -> None:
+        """Raises `UsageError` where variable `name` cannot hold `value`, though its tag can. Any can, here."""
+        return
 
     def restore(self, kept: dict[str, Any]) -> None:
         """The inverse of `retained`; variables that are not in `kept` begin with their initial value."""

@@ -37,7 +37,7 @@ def layout_hash(programs: Sequence[BoundProgram]) -> bytes:
     described = [
         [
             p.name,
-            [[v.name, v.kind.value] for v in p.program.variables.values() if v.retain],
+            p.program.retain_layout(),
             _form(p.program.retained()),
         ]
         for p in programs
@@ -46,12 +46,12 @@ def layout_hash(programs: Sequence[BoundProgram]) -> bytes:
 
 
 def _form(value: Any) -> Any:
-    """The form of retained data without its values: names, and how many."""
+    """The form of retained data without its values: names, types, and how many."""
     if isinstance(value, dict):
         return {name: _form(v) for name, v in sorted(value.items())}
     if isinstance(value, list):
         return [len(value), _form(value[0]) if value else None]
-    return "" if isinstance(value, str) else 0
+    return type(value).__name__
 
 
 class RetainFile:
@@ -70,8 +70,8 @@ class RetainFile:
     def open(cls, path: Path, layout: bytes, size: int) -> tuple[RetainFile, Any, str]:
         """The file, what it holds (None: nothing, begin cold), and why it was put aside if it was.
 
-        `size` is what a save takes now, in bytes. A file of another layout, or that is damaged, is kept as ``.old``.
-        Raises `Unreachable` when there can be no file.
+        `size` is the most that a save takes, in bytes. A file of another layout, or that is damaged, is kept as ``.old``.
+        Raises `Unreachable` when there can be no file, `FileInvalid` for more than one takes.
         """
         aside = ""
         if path.exists():
@@ -82,7 +82,9 @@ class RetainFile:
             except FileInvalid as e:
                 aside = e.message
                 path.replace(path.with_suffix(path.suffix + ".old"))
-        return cls._make(path, layout, max(MIN_CAPACITY, 4 * size)), None, aside
+        if size > MAX_CAPACITY:
+            raise FileInvalid("too much is retained", expected=f"at most {MAX_CAPACITY} bytes", got=str(size))
+        return cls._make(path, layout, max(MIN_CAPACITY, size)), None, aside
 
     @classmethod
     def _attach(cls, path: Path, layout: bytes) -> RetainFile:
@@ -145,7 +147,10 @@ class RetainFile:
 
     def save(self, values: Any) -> bool:
         """Keep `values`; False when they are what was kept last. Raises `RetainFull` when they take too much."""
-        data = msgspec.msgpack.encode(values)
+        try:
+            data = msgspec.msgpack.encode(values)
+        except (TypeError, OverflowError, msgspec.MsgspecError) as e:
+            raise RetainFull(f"a retained variable holds what cannot be kept: {e}", where=str(self.path)) from e
         if data == self._last:
             return False
         if len(data) > self._capacity:
@@ -173,7 +178,7 @@ class RetainFile:
 
 
 class RetainFull(FieldtwinError):
-    """Retained variables (strings in arrays, say) grew beyond their file."""
+    """Retained variables that their file cannot hold."""
 
 
 def _check(counter: int, data: bytes) -> int:
@@ -193,8 +198,8 @@ class Retained:
         self.start = "no retained variables"
         if path is None or not self._programs:
             return
-        layout, now = layout_hash(self._programs), self._values()
-        self._file, kept, aside = RetainFile.open(path, layout, len(msgspec.msgpack.encode(now)))
+        size = sum(10 + len(p.name.encode()) + p.program.retain_bytes() for p in self._programs)
+        self._file, kept, aside = RetainFile.open(path, layout_hash(self._programs), size)
         if kept is None or cold:
             self.start = f"cold start: {aside}" if aside else "cold start"
         else:

@@ -21,7 +21,8 @@ from gateway.core.image import INPUTS, Image
 from gateway.core.values import Scalar, TagValue
 from plc.binding import BoundProgram
 from plc.config import PlcConfig, TaskSpec
-from plc.forces import Forces
+from plc.forces import Forces, checked
+from plc.program import Program
 from plc.publishing import OutputImage
 from plc.retain import Retained
 from plc.scan import Scan
@@ -69,13 +70,23 @@ class Runner:
         self._began = False
         self._stopped: Entry | None = None
         self._ended: StopReason | None = None
-        self._assemble(cold=config.cold)
+        self._assemble(self._made(), cold=config.cold)
 
     # -- assembly -----------------------------------------------------------------------------------------------------
 
-    def _assemble(self, cold: bool) -> None:
+    def _made(self) -> list[BoundProgram]:
+        """The programs, new. Raises `FileInvalid` also where they no longer fit the process image."""
+        programs = [p.bind(self.config.python_path) for p in self.config.programs]
+        for new, old in zip(programs, self.programs, strict=False):
+            if _interface(new) != _interface(old):
+                raise FileInvalid(
+                    f"program {new.name} has other variables than the one that runs", hint="stop the system and run it"
+                )
+        return programs
+
+    def _assemble(self, programs: list[BoundProgram], cold: bool) -> None:
         config = self.config
-        self.programs = [p.bind(config.python_path) for p in config.programs]
+        self.programs = programs
         path = Path(config.retain_path) if config.retain_path else None
         self.retained = Retained(self.programs, path, cold=cold)
         self.outputs = OutputImage(self._image, self.programs, self.forces)
@@ -141,7 +152,7 @@ class Runner:
         now_ns = self._now_ns()
         if self._stopped is not None:
             if now_ns >= self._restart_ns:
-                self.restart()
+                self._restart_by_itself(self._stopped)
             return
         due = [e for e in self.entries if e.task.deadline_ns <= now_ns]
         if not due:
@@ -180,15 +191,27 @@ class Runner:
         else:
             self._ended = entry.task.stop_reason
 
+    def _restart_by_itself(self, stopped: Entry) -> None:
+        try:
+            self.restart()
+        except FieldtwinError as e:  # no way to go on: it stays stopped, and says why
+            stopped.task.error = e
+            self._ended, self._restart_ns = StopReason.FAILED, _NEVER_NS
+
     def restart(self, *, cold: bool = False) -> None:
-        """Make the programs anew, with what is retained unless `cold`, and start. Forces stay."""
+        """Make the programs anew, with what is retained unless `cold`, and start, paused if they were. Forces stay.
+
+        Raises `FileInvalid`, and nothing has changed, where the programs cannot be made (their files may have been edited).
+        """
+        programs, paused = self._made(), self.paused
         for entry in self.entries:
             entry.task.stop()
         self.retained.close()
         self.outputs.release()
         for entry in self.entries:
             entry.scan.release()
-        self._assemble(cold)
+        self._assemble(programs, cold)
+        self.pause(paused)
         self.restarts += 1
         self._in_a_row += 1
         self._stopped = self._ended = None
@@ -238,9 +261,17 @@ class Runner:
         for region in sorted(self._image.layout.regions, key=lambda r: r.name == INPUTS):
             for spec in region.tags:
                 if spec.name == tag:
+                    for program, name in self._variables_of(tag, region.name == INPUTS):
+                        program.check(name, checked(spec, value))
                     self.forces.force(spec, value, region.name == INPUTS, self._now_ns(), by)
                     return
         raise UsageError(f"no tag {tag!r} in the process image", expected="one that status shows")
+
+    def _variables_of(self, tag: str, inputs: bool) -> list[tuple[Program, str]]:
+        """Which variables of programs a tag stands for."""
+        if inputs:
+            return [(b.program, v) for b in self.programs for v, binding in b.inputs.items() if binding.tag == tag]
+        return [(b.program, v.name) for b in self.programs for v, published in b.published() if published == tag]
 
     def why(self, tag: str) -> list[dict[str, Any]]:
         """The last changes of an output or local, the newest first. Raises `UsageError` for what no program writes."""
@@ -278,3 +309,8 @@ class Runner:
                 for e in self.entries
             },
         }
+
+
+def _interface(bound: BoundProgram) -> list[tuple[str, str, str, int, int]]:
+    """What the process image depends on."""
+    return [(v.name, v.role.value, v.kind.value, v.max_bytes, v.depth) for v in bound.program.variables.values()]

@@ -256,6 +256,8 @@ def _failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
         if here == own or not inside:
             path, line, inside = here, tb.tb_lineno, here == own
         tb = tb.tb_next
+    if made.source_path and not inside:  # on the way in or out, where no line of the engineer's runs
+        path, line = made.source_path, 0
     if isinstance(error, ScanStuck):
         return ProgramStuck(bound.name, f"the scan did not end: {error}", path=path, line=line)
     text = error.message if isinstance(error, FieldtwinError) else str(error)

@@ -163,13 +163,15 @@ class CyclicTask:
         if self._guard is None:
             self._scan.execute(now_ns)
             return
-        self._guard.arm()
         try:
-            self._scan.execute(now_ns)
+            self._guard.arm()
+            try:
+                self._scan.execute(now_ns)
+            finally:
+                self._guard.disarm()
         except ScanStuck as e:  # between two programs
+            self._guard.disarm()  # it may have come while the alarm was being taken back
             raise ProgramStuck("(all)", f"the scan did not end: {e}") from e
-        finally:
-            self._guard.disarm()
 
     def stop(self) -> None:
         """Stop on request: outputs safe. A task that has stopped already stays as it is."""

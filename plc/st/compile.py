@@ -248,6 +248,8 @@ class _Unit:
         kept = [s.code.removeprefix("self.") for s in symbols.values() if s.code.startswith("self.")]
         with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
             self.out.line(f"__slots__ = ({''.join(repr(name) + ', ' for name in kept)})")
+            in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
+            self.out.line(f"in_outs = {tuple(in_outs)}")
             with self.out.block("def __init__(self):"):
                 self._initialise(pou, symbols, ("VAR", "VAR_INPUT", "VAR_OUTPUT"))
                 for block in pou.blocks:

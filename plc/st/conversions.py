@@ -1,8 +1,8 @@
 """Type conversions by name: INT_TO_REAL, TO_DINT, TRUNC, REAL_TRUNC_INT... (IEC 61131-3, 6.6.2.5.2).
 
-Real to integer rounds to the nearest, ties to even; TRUNC cuts. A number that the target cannot hold is an error at run
-time, but from one integer or bit string type to another only the bits that fit are kept, as the standard says. TIME counts
-ms as a number, LTIME ns.
+Real to integer rounds to the nearest, ties to even; TRUNC cuts, and gives a DINT (REAL_TRUNC_LINT and its like give other
+types). A number that the target cannot hold is an error at run time, but from one integer or bit string type to another only
+the bits that fit are kept, as the standard says. TIME counts ms as a number, LTIME ns.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _DIGITS = {32: 7, 64: 15}
 def conversion(name: str) -> Callable[[Expressions, t.Call], Value] | None:
     """The conversion of that name (in capitals), None if there is none."""
     if name == "TRUNC":
-        return lambda x, call: _convert(x, call, None, ty.LINT, cut=True)
+        return lambda x, call: _convert(x, call, None, ty.DINT, cut=True)
     source, word, target = name.rpartition("_TRUNC_")
     if word and target in _NAMES:
         return _made(_NAMES.get(source), _NAMES[target], cut=True) if source in _NAMES else None

@@ -64,7 +64,7 @@ class Declarations:
             return None
         kind = self.type_of(v.type)
         compiler = self._expressions()
-        value = compiler.value(v.initial)
+        value = compiler.settled(compiler.value(v.initial), v.initial.pos)
         text = compiler.coerced(value, kind, v.initial.pos, "an initial value")
         if value.constant is None or len(text) > MAX_REPEATED or isinstance(kind, ty.String):
             return None

@@ -72,10 +72,21 @@ class Expressions:
         return value.code
 
     def constant_integer(self, expr: t.Expr, what: str) -> int:
-        value = self.value(expr)
+        value = self.settled(self.value(expr), expr.pos)
         if value.constant is None or not ty.is_kind(value.type, "int", "bits"):
             self.env.fail(expr.pos, what, expected="a constant whole number", got=str(value.type))
         return int(value.constant)
+
+    def settled(self, value: Value, pos: t.Pos) -> Value:
+        """`value` with what it is worth, where only constants may stand: ``N - 1`` of a typed constant N, too."""
+        of_a_scan = "_c." in value.code or bool(self.out.lines)
+        if value.constant is not None or of_a_scan or not isinstance(ty.plain(value.type), ty.Elementary):
+            return value
+        try:
+            worth = eval(value.code, {"_v": values})  # only what this compiler wrote: literals and calls of `values`
+        except values.LogicError as e:
+            self.env.fail(pos, e.message)
+        return Value(repr(worth), value.type, worth)
 
     # -- expressions ------------------------------------------------------------------------------------------------------
 
@@ -357,7 +368,8 @@ class Expressions:
             if self.only_constants:
                 self.env.fail(call.pos, f"{call.ref.name} is called", expected="a constant expression")
             return self._user_function(call, self.env.functions[name])
-        if not call.ref.selectors and name not in self.symbols:
+        own = self.symbols.get(name)
+        if not call.ref.selectors and (own is None or not isinstance(own.type, ty.Block)):
             standard = FUNCTIONS.find(name.upper())
             if standard is not None:
                 return standard(self, call)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gateway.core.errors import FileInvalid
+from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.image import Message, TagKind
 from gateway.core.values import Quality, Scalar, TagValue
 from plc.blocks import BLOCKS
@@ -35,7 +35,8 @@ class Context:
         self._lookup = lookup
 
     def is_good(self, name: str) -> bool:
-        return self._lookup(name).quality is Quality.GOOD
+        """A forced value too: whoever forces it wants it to be taken for one."""
+        return self._lookup(name).quality in (Quality.GOOD, Quality.SIMULATED)
 
     @staticmethod
     def message(messages: tuple[Message, ...], number: int) -> Message:
@@ -56,7 +57,7 @@ class StProgram(Program):
         self.st_body: Any = space[f"P_{self.st_declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
         self.st_inputs = [_Input(v) for v in self.st_declared.variables if v.role == "input"]
-        self.st_attributes = {v.name: _attribute(v) for v in self.st_declared.variables}
+        self.st_variables = {v.name: v for v in self.st_declared.variables}
         self.st_outputs: list[tuple[str, str, Callable[[Any], Any] | None]] = []
         for v in self.st_declared.variables:
             if v.role == "output" and isinstance(v.kind, ty.MessagesOut):
@@ -71,7 +72,7 @@ class StProgram(Program):
         for item in self.st_inputs:
             value = namespace[item.name]
             if value is not None:
-                setattr(body, item.attribute, item.convert(value) if item.convert else value)
+                setattr(body, item.attribute, item.taken(value) if item.convert else value)
         body.execute()
         self.st_show()
 
@@ -83,14 +84,38 @@ class StProgram(Program):
 
     def put(self, name: str, value: Scalar) -> None:
         super().put(name, value)
-        if name in self.st_attributes:
-            setattr(self.st_body, self.st_attributes[name], value)
+        found = self.st_variables.get(name)
+        if found is not None:
+            convert = _from_tag(found.kind)
+            setattr(self.st_body, _attribute(found), convert(value) if convert else value)
+
+    def check(self, name: str, value: Scalar) -> None:
+        found = self.st_variables.get(name)
+        convert = _from_tag(found.kind) if found is not None else None
+        if found is not None and isinstance(found.kind, ty.Enum) and value not in found.kind.values.values():
+            named = ", ".join(f"{number} ({word})" for word, number in found.kind.values.items())
+            raise UsageError(f"{name} is a {found.kind}", expected=named, got=repr(value))
+        try:
+            if convert is not None:
+                convert(value)
+        except values.LogicError as e:
+            raise UsageError(f"{name} cannot be forced to that", expected=e.expected, got=repr(value)) from e
 
     # -- what is kept over a restart --------------------------------------------------------------------------------------
 
     def retained(self) -> dict[str, Any]:
         """Every VAR RETAIN by name, as JSON-able data, also what is no tag."""
         return {v.name: _dump(getattr(self.st_body, _attribute(v))) for v in self.st_declared.variables if v.retain}
+
+    def retain_layout(self) -> Any:
+        return [[v.name, _described(v.kind)] for v in self.st_declared.variables if v.retain]
+
+    def retain_bytes(self) -> int:
+        return sum(
+            10 + len(v.name) + _most(v.kind, _dump(getattr(self.st_body, _attribute(v))))
+            for v in self.st_declared.variables
+            if v.retain
+        )
 
     def restore(self, kept: dict[str, Any]) -> None:
         """The inverse: variables that are in `kept` take its values."""
@@ -109,15 +134,15 @@ class _Input:
     def __init__(self, variable: ProgramVariable) -> None:
         self.name = variable.name
         self.attribute = _attribute(variable)
-        self.convert: Callable[[Any], Any] | None = None
-        kind = variable.kind
-        limits = ty.plain(kind)
-        if isinstance(kind, ty.Subrange):
-            self.convert = lambda x: values.inside(x, kind.low, kind.high)
-        elif isinstance(limits, ty.Elementary) and limits.kind in ("int", "bits") and limits.bits < 64:
-            self.convert = lambda x: values.inside(x, limits.low, limits.high)
-        elif kind == ty.REAL:
-            self.convert = values.real
+        self.convert = _from_tag(variable.kind)
+
+    def taken(self, value: Any) -> Any:
+        """`value` as the program computes with it. Raises `LogicError` for what the variable cannot hold."""
+        assert self.convert is not None
+        try:
+            return self.convert(value)
+        except values.LogicError as e:
+            raise values.LogicError(f"input {self.name}: {e.message}", expected=e.expected, got=e.got) from e
 
 
 def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
@@ -175,6 +200,46 @@ def _tag_kind(kind: ty.Type) -> TagKind | None:
     return {"bool": TagKind.BOOL, "real": TagKind.REAL}.get(kind.kind, TagKind.INT)
 
 
+def _from_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
+    """How what a tag holds becomes what the program computes with, where it is not the same."""
+    held = ty.plain(kind)
+    if isinstance(kind, ty.Subrange):
+        return lambda x: values.inside(x, kind.low, kind.high)
+    if isinstance(held, ty.Elementary) and held.kind in ("int", "bits"):
+        if held.bits == 64 and held.low == 0:
+            return lambda x: x & held.high
+        return lambda x: values.inside(x, held.low, held.high)
+    return values.real if kind == ty.REAL else None
+
+
+def _described(kind: ty.Type) -> Any:
+    """A type by what its values mean: names and elementary types, JSON-able."""
+    if isinstance(kind, ty.Array):
+        return [kind.ranges, _described(kind.of)]
+    if isinstance(kind, ty.Struct):
+        return [[name, _described(of)] for name, (_, of) in kind.fields.items()]
+    if isinstance(kind, ty.Block):
+        members = {**kind.inputs, **kind.outputs}
+        return [kind.name.lower(), [[name, _described(of)] for name, (_, of) in members.items()]]
+    if isinstance(kind, ty.Enum):
+        return [kind.name.lower(), sorted(kind.values.items())]
+    return str(kind)
+
+
+def _most(kind: ty.Type, now: Any) -> int:
+    """The most bytes of MessagePack that a value takes whose data are `now`."""
+    if isinstance(kind, ty.String):
+        return 5 + 3 * kind.length
+    if isinstance(now, list):
+        of = kind.of if isinstance(kind, ty.Array) else kind
+        return 5 + len(now) * max((_most(of, item) for item in now[:1]), default=0)
+    if isinstance(now, dict):
+        fields = kind.fields if isinstance(kind, ty.Struct) else {}
+        inside = sum(5 + len(n) + _most(fields[n[2:]][1] if n[2:] in fields else ty.LINT, v) for n, v in now.items())
+        return 5 + inside + (256 * kind.elements if isinstance(kind, ty.Block) else 0)
+    return 9
+
+
 def _to_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
     kind = ty.plain(kind)
     unsigned = isinstance(kind, ty.Elementary) and kind.bits == 64 and kind.low == 0 and kind.high > 0
@@ -182,13 +247,19 @@ def _to_tag(kind: ty.Type) -> Callable[[Any], Any] | None:
 
 
 def _dump(value: Any) -> Any:
-    """Plain data of a value: objects by their slots, but for moments, which mean nothing after a restart."""
+    """Plain data of a value: objects by their slots (`_own`)."""
     if isinstance(value, list):
         return [_dump(v) for v in value]
     slots = getattr(value, "__slots__", None)
     if slots is None or isinstance(value, str | int | float):
         return value
-    return {name: _dump(getattr(value, name)) for name in slots if not name.endswith("_ns")}
+    return {name: _dump(getattr(value, name)) for name in _own(value)}
+
+
+def _own(value: Any) -> list[str]:
+    """The slots that are kept: not a timer's moments, which mean nothing after a restart, nor what a VAR_IN_OUT stands for."""
+    others = getattr(value, "in_outs", ())
+    return [name for name in value.__slots__ if name not in others and not (name[0] == "_" and name.endswith("_ns"))]
 
 
 def _load(into: Any, kept: Any) -> Any:
@@ -197,7 +268,7 @@ def _load(into: Any, kept: Any) -> Any:
         return [_load(a, b) for a, b in zip(into, kept, strict=True)]
     slots = getattr(into, "__slots__", None)
     if slots is not None and isinstance(kept, dict):
-        for name in slots:
+        for name in _own(into):
             if name in kept:
                 setattr(into, name, _load(getattr(into, name), kept[name]))
         return into

@@ -6,7 +6,7 @@ import math
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from st_bench import run, value
 
@@ -94,6 +94,7 @@ def test_value(kind: str, expression: str, expected: object) -> None:
     assert type(got) is type(expected)
 
 
+@settings(deadline=None)  # the first example builds the parser
 @given(st.sampled_from(sorted(INTEGERS)), st.sampled_from("+-*"), st.integers(), st.integers())
 def test_integers_wrap_at_their_width(kind: str, op: str, a: int, b: int) -> None:
     bits = INTEGERS[kind]
@@ -106,6 +107,7 @@ def test_integers_wrap_at_their_width(kind: str, op: str, a: int, b: int) -> Non
     assert value(kind, f"a {op} b", f"a : {kind} := {a}; b : {kind} := {b};") == narrowed(exact)
 
 
+@settings(deadline=None)  # the first example builds the parser
 @given(st.integers(-128, 127), st.integers(-128, 127).filter(bool))
 def test_division_truncates_and_the_remainder_goes_with_it(a: int, b: int) -> None:
     v = f"a : DINT := {a}; b : DINT := {b};"
@@ -114,6 +116,7 @@ def test_division_truncates_and_the_remainder_goes_with_it(a: int, b: int) -> No
     assert q * b + r == a
 
 
+@settings(deadline=None)  # the first example builds the parser
 @given(st.floats(-1e30, 1e30), st.floats(-1e30, 1e30))
 def test_real_arithmetic_is_that_of_32_bits(a: float, b: float) -> None:
     def f(x: float) -> float:

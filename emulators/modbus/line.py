@@ -119,9 +119,9 @@ class LineSlave(ABC):
         if response is None:
             return Exchange(heard)
         if len(self.units) > 1:
-            for unit in self.units.values():
-                if (
-                    unit is not addressed
-                ):  # a reply is a message to its neighbours; the sender's receiver is off meanwhile
+            for (
+                unit
+            ) in self.units.values():  # a reply is a message to the neighbours; the sender's receiver is off meanwhile
+                if unit is not addressed:
                     unit.heard(messages=1)
         return Exchange(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)

@@ -15,11 +15,7 @@ from emulators.canopen.node import CanopenNode
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
 from emulators.emulator import EmulatedUnit
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import OnClient, SocketListener
-from emulators.endpoints.udp_end import UdpEnd
+from emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
 from emulators.journal import HeldJournal
 from emulators.modbus.ascii import AsciiSlave
 from emulators.modbus.bank import RegisterBank
@@ -85,7 +81,9 @@ class FieldSide:
     listens (free ports taken), and `far` where the far modems do.
     """
 
-    def __init__(self, system: System, prototype: Prototype, run_dir: Path, clock: Clock) -> None:
+    def __init__(
+        self, system: System, prototype: Prototype, run_dir: Path, clock: Clock, ports: Ports | None = None
+    ) -> None:
         self.system = system
         self.prototype = prototype
         self.devices: dict[str, FieldDevice] = {}
@@ -95,7 +93,9 @@ class FieldSide:
         self._run_dir = run_dir
         self._clock = clock
         self._nursery = Nursery()
-        self._listeners: list[SocketListener | SoftBusServer | UdpEnd] = []
+        self._ports = ports or OsPorts()
+        self._listeners: list[Listening] = []
+        self._buses: list[CanPort] = []
         self._connections: list[ByteConnection | CanConnection] = []
         self._pairs: dict[str, ModemPair] = {}
         self._tracks: dict[Path, SignalTrack] = {}
@@ -130,6 +130,7 @@ class FieldSide:
         for connection in self._connections:
             await connection.aclose()
         self._listeners.clear()
+        self._buses.clear()
         self._connections.clear()
 
     # -- wires ----------------------------------------------------------------------------------------------------------
@@ -147,14 +148,13 @@ class FieldSide:
             latency_s = as_recorded(plant.serial if listen.scheme == "pty" and bus.pace else None)
         if listen.scheme == "pty":
             pace = plant.serial if bus.pace else None
-            end = await PtyEnd.open(self._run_dir / listen.path, plant, pace)
+            end, self.listening[bus.name] = await self._ports.serial(self._run_dir / listen.path, plant, pace)
             self._connections.append(end)
-            self.listening[bus.name] = Endpoint("pty", path=str(end.link))
             self._nursery.start(
                 serve_rtu(end, line_of(plant, units), self._clock, latency_s, echo=echo), f"emulators on {bus.name}"
             )
         elif listen.scheme == "udp":
-            datagrams = await UdpEnd.open(listen)
+            datagrams = await self._ports.datagrams(listen)
             self._listeners.append(datagrams)
             self.listening[bus.name] = datagrams.bound
             slave = MbapSlave(units)
@@ -172,7 +172,7 @@ class FieldSide:
             await self._open_far(device, stated_s)
 
     async def _listen(self, endpoint: Endpoint, on_client: OnClient, max_clients: int = 32) -> Endpoint:
-        listener = await SocketListener.open(endpoint, on_client, max_clients)
+        listener = await self._ports.listen(endpoint, on_client, max_clients)
         self._listeners.append(listener)
         return listener.bound
 
@@ -192,14 +192,11 @@ class FieldSide:
     async def _open_can(self, bus: EmulatedBus, listen: Endpoint, on_it: list[DeviceConfig]) -> None:
         bitrate = self.system.buses[bus.name].bitrate
         nodes = [self._canopen_node(d) for d in on_it]
-        if listen.interface == "fieldtwin":
-            server = await SoftBusServer.open(listen, bitrate, paced=bus.pace)
-            self._listeners.append(server)
-            self.listening[bus.name] = server.bound
-            connections = [server.attach(d.name) for d in on_it]
-        else:
-            connections = [await open_can_end(listen, bitrate) for _ in on_it]
-            self.listening[bus.name] = listen
+        port = await self._ports.can_bus(listen, bitrate, paced=bus.pace)
+        self._listeners.append(port)
+        self._buses.append(port)
+        self.listening[bus.name] = port.bound
+        connections = [await port.join(d.name) for d in on_it]
         self._connections.extend(connections)
         for device, node, connection in zip(on_it, nodes, connections, strict=True):
             self._nursery.start(serve_node(connection, node, self._clock), f"node {device.name}")
@@ -310,11 +307,7 @@ class FieldSide:
                 }
                 for name, p in self._pairs.items()
             },
-            "buses": {
-                str(listener.bound): listener.bus_stats()
-                for listener in self._listeners
-                if isinstance(listener, SoftBusServer)
-            },
+            "buses": {str(bus.bound): stats for bus in self._buses if (stats := bus.stats())},
         }
 
     def held_since(self, numbers: dict[str, int]) -> dict[str, list[tuple[int, str, str, int]]]:

@@ -13,8 +13,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from gateway.connections.listeners import TcpListener
 from gateway.core.clock import Clock
-from gateway.core.connection import Connector
+from gateway.core.connection import Connector, Listen
 from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
 from gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
 from gateway.core.profile import Tag
@@ -218,10 +219,12 @@ class EmbeddedControlSystem:
         *,
         allow_writes: bool,
         free_ports: bool = False,
+        listen: Listen = TcpListener.open,
     ) -> Gateway:
-        """The gateway with its drivers. Which wires `connector` opens, nobody from here on knows."""
+        """The gateway with its drivers. Which wires `connector` opens, and where `listen` lets clients in, nobody from here
+        on knows."""
         config = gateway_config(self.system, allow_writes=allow_writes, free_ports=free_ports)
-        return Gateway(config, connector, clock, image, audit, log)
+        return Gateway(config, connector, clock, image, audit, log, listen)
 
     def command_lists(self, clock: Clock) -> dict[str, frozenset[str]]:
         """What the driver of each device can ask of it."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from emulators.emulator import EmulatedCommunication
+from emulators.endpoints.ports import Ports
 from gateway.core.clock import Clock
 from twin.field import FieldSide
 from twin.model import DigitalModel
@@ -38,6 +39,7 @@ class DigitalTwinPrototype:
         for communication in self.communications.values():
             communication.check()
 
-    def field(self, run_dir: Path) -> FieldSide:
-        """The emulators on their wires, not opened yet. Virtual serial ports get their links in `run_dir`."""
-        return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock)
+    def field(self, run_dir: Path, ports: Ports | None = None) -> FieldSide:
+        """The emulators on their wires, not opened yet: those of the operating system unless other `ports` are given.
+        Virtual serial ports get their links in `run_dir`."""
+        return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock, ports)

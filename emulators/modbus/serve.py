@@ -8,9 +8,9 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from emulators.endpoints.ports import Datagrams
 from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import SocketEnd
-from emulators.endpoints.udp_end import UdpEnd
 from emulators.modbus.line import Exchange, LineSlave
 from emulators.modbus.mbap import MbapSlave
 from gateway.core.clock import NS_PER_S, Clock
@@ -97,7 +97,7 @@ def _at_once(slave: MbapSlave, data: bytes, clock: Clock) -> tuple[bytes, bool]:
 
 
 async def serve_udp(
-    end: UdpEnd,
+    end: Datagrams,
     slave: MbapSlave,
     clock: Clock,
     latency_s: float | Latency = 0.0,

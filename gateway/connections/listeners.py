@@ -15,6 +15,7 @@ from collections.abc import Awaitable, Callable
 from gateway.connections.tcp import TcpConnection
 from gateway.connections.tls_listen import HANDSHAKE_LIMIT_S, server_context
 from gateway.connections.tls_role import role_in
+from gateway.core.connection import Client
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
 
@@ -27,7 +28,7 @@ ACCEPT_PAUSE_S = 0.1
 """How long to wait when the system has no descriptor left for another client."""
 
 
-class ClientConnection(TcpConnection):
+class ClientConnection(TcpConnection, Client):
     """One client. `peer` is its address, `last_used_s` the loop's time when it last said something, `role` what its
     certificate names (MBTLS 8.4), empty without one and without TLS."""
 
@@ -62,7 +63,7 @@ class ClientConnection(TcpConnection):
             self._wire.transport.abort()
 
 
-OnClient = Callable[[ClientConnection], Awaitable[None]]
+OnClient = Callable[[Client], Awaitable[None]]
 
 
 class TcpListener:

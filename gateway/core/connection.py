@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from enum import Enum
 from typing import ClassVar, Generic, Protocol, TypeVar
 
@@ -174,6 +174,42 @@ class ByteConnection(_End[bytes], ABC):
     @abstractmethod
     async def aclose(self) -> None:
         """Close; afterwards `read` raises. Closing twice does nothing."""
+
+
+class Client(ByteConnection):
+    """One that came to us. `peer` is its address, `role` what its certificate names (MBTLS 8.4), empty without one."""
+
+    peer: str
+    peer_port: int
+    role: str
+
+
+class Clients(Protocol):
+    """A listener and who it let in, oldest first, with what became of the others."""
+
+    accepted: int
+    evicted: int
+    refused: int
+    unshaken: int
+    retired: int
+
+    @property
+    def bound(self) -> Endpoint:
+        """The endpoint with the port that is really listened on."""
+        ...
+
+    @property
+    def clients(self) -> tuple[Client, ...]: ...
+
+    async def aclose(self) -> None:
+        """Stop listening and close every client."""
+        ...
+
+
+Listen = Callable[
+    [Endpoint, Callable[[Client], Awaitable[None]], int, Callable[[str], bool], float], Awaitable[Clients]
+]
+"""``listen(endpoint, on_client, max_clients, admits, idle_s)``. Raises `EndpointBusy` or `Unreachable`."""
 
 
 class CanConnection(_End[CanFrame], ABC):

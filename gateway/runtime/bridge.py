@@ -14,8 +14,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from gateway.connections.listeners import TcpListener
 from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector
+from gateway.core.connection import Connector, Listen
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import (
     EndpointBusy,
@@ -129,6 +130,7 @@ class Bridge:
         clock: Clock,
         audit: AuditLog,
         blocked: Callable[[str, int], str] = lambda bus, unit: "",
+        listen: Listen = TcpListener.open,
     ) -> None:
         missing = config.buses - set(buses)
         if missing:
@@ -160,6 +162,7 @@ class Bridge:
                 admits=config.policy.admits,
                 insist=config.insist,
                 idle_s=config.idle_s,
+                listen=listen,
             )
 
     async def run(self) -> None:

@@ -13,8 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.connections.listeners import ClientConnection, TcpListener
+from gateway.connections.listeners import TcpListener
 from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import Client, Clients, Listen
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import Unreachable
 from gateway.core.nursery import Nursery
@@ -74,10 +75,11 @@ class TcpFront:
         admits: Callable[[str], bool] = lambda address: True,
         insist: bool = True,
         idle_s: float = 0.0,
+        listen: Listen = TcpListener.open,
     ) -> None:
         self.endpoint = endpoint
         self.counters = FrontCounters()
-        self.listener: TcpListener | None = None
+        self.listener: Clients | None = None
         self.error = ""
         self._ask = ask
         self._clock = clock
@@ -86,6 +88,7 @@ class TcpFront:
         self._admits = admits
         self._insist = insist
         self._idle_s = idle_s
+        self._listen = listen
 
     @property
     def bound(self) -> Endpoint | None:
@@ -97,7 +100,7 @@ class TcpFront:
         backoff = Backoff(0.25, 5.0)
         while self.listener is None:
             try:
-                self.listener = await TcpListener.open(
+                self.listener = await self._listen(
                     self.endpoint, self._serve, self._max_clients, self._admits, self._idle_s
                 )
             except Unreachable as e:
@@ -130,7 +133,7 @@ class TcpFront:
             "desyncs": c.desyncs,
         }
 
-    async def _serve(self, connection: ClientConnection) -> None:
+    async def _serve(self, connection: Client) -> None:
         session = _Session(connection, self._ask, self._in_flight, self.counters)
         await session.run()
 
@@ -138,7 +141,7 @@ class TcpFront:
 class _Session:
     """One client."""
 
-    def __init__(self, connection: ClientConnection, ask: Ask, in_flight: int, counters: FrontCounters) -> None:
+    def __init__(self, connection: Client, ask: Ask, in_flight: int, counters: FrontCounters) -> None:
         self._connection = connection
         self._caller = Caller(f"{connection.peer}:{connection.peer_port}", connection.peer, connection.role)
         self._ask = ask

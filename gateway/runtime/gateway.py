@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from gateway.connections.listeners import TcpListener
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.connection import Connector
+from gateway.core.connection import Connector, Listen
 from gateway.core.events import Consumer
 from gateway.core.image import Image
 from gateway.core.nursery import Nursery
@@ -62,7 +63,14 @@ class Gateway:
     """Runs until cancelled; `shut_down` then brings the outputs to their safe values."""
 
     def __init__(
-        self, config: GatewayConfig, connector: Connector, clock: Clock, image: Image, audit: AuditLog, log: ExchangeLog
+        self,
+        config: GatewayConfig,
+        connector: Connector,
+        clock: Clock,
+        image: Image,
+        audit: AuditLog,
+        log: ExchangeLog,
+        listen: Listen = TcpListener.open,
     ) -> None:
         self.config = config
         self.clock = clock
@@ -82,14 +90,14 @@ class Gateway:
         for n, bus in enumerate(config.buses.values()):
             self._make_bus(bus, connector, n / len(config.buses))
         modbus = {name: bus for name, bus in self.buses.items() if isinstance(bus, ModbusBus)}
-        self.bridges = [Bridge(b, modbus, connector, clock, audit, self._blocked) for b in config.bridges]
+        self.bridges = [Bridge(b, modbus, connector, clock, audit, self._blocked, listen) for b in config.bridges]
         self.outputs = OutputWriter(self._make_outputs(), self.tags, audit, config.allow_writes)
         self.pumps = [
             MailboxPump(d, self._modbus(d), audit, allow_writes=config.allow_writes, remote=config.remote)
             for d in self.drivers.values()
             if isinstance(d, TransmitterDriver)
         ]
-        self.servers = [TagServer(s, self.tags, self.outputs, clock) for s in config.serve]
+        self.servers = [TagServer(s, self.tags, self.outputs, clock, listen) for s in config.serve]
         sources = self._message_sources()
         self.exchange = ImageExchange(image, self.tags, sources)
         self.plc_alive = False

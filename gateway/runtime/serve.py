@@ -13,7 +13,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, Protocol
 
+from gateway.connections.listeners import TcpListener
 from gateway.core.clock import Clock
+from gateway.core.connection import Listen
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import EndpointBusy, FieldtwinError, ModbusExceptionReply, NotAllowed
 from gateway.core.values import Quality, Reason, TagValue
@@ -118,7 +120,14 @@ class _Cell:
 class TagServer:
     """Serves tags on one port, until cancelled."""
 
-    def __init__(self, config: ServeConfig, tags: TagTable, writer: Writer, clock: Clock) -> None:
+    def __init__(
+        self,
+        config: ServeConfig,
+        tags: TagTable,
+        writer: Writer,
+        clock: Clock,
+        listen: Listen = TcpListener.open,
+    ) -> None:
         self.config = config
         self.counters = ServeCounters()
         self._tags = tags
@@ -137,6 +146,7 @@ class TagServer:
             max_clients=config.clients,
             admits=lambda address: within(address, config.networks),
             idle_s=config.idle_s,
+            listen=listen,
         )
 
     async def run(self) -> None:

@@ -1,0 +1,115 @@
+"""Where emulators are reached: whoever runs a field side asks here for serial ports, listeners and buses.
+
+`OsPorts` gives the operating system's; `emulators.virtual.ports` gives ones in memory. A device cannot tell which it has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.can_end import open_can_end
+from emulators.endpoints.pty import PtyEnd
+from emulators.endpoints.socket_end import SocketListener
+from emulators.endpoints.udp_end import UdpEnd
+from gateway.core.connection import ByteConnection, CanConnection
+from gateway.core.endpoint import Endpoint, SerialSettings
+
+OnClient = Callable[[ByteConnection], Awaitable[None]]
+
+
+class Listening(Protocol):
+    """Something that waits for clients. `bound` is the endpoint that it really has."""
+
+    @property
+    def bound(self) -> Endpoint: ...
+
+    async def aclose(self) -> None: ...
+
+
+class Datagrams(Listening, Protocol):
+    """A bound UDP socket: see `UdpEnd`."""
+
+    async def receive(self) -> tuple[bytes, tuple[str, int]]: ...
+
+    async def send(self, data: bytes, peer: tuple[str, int]) -> None: ...
+
+
+class CanPort(Listening, Protocol):
+    """A bus that nodes of this process join."""
+
+    async def join(self, name: str) -> CanConnection: ...
+
+    def stats(self) -> dict[str, Any]:
+        """What the bus counted; empty where it is not ours."""
+        ...
+
+
+class Ports(Protocol):
+    """Raises `EndpointBusy` or `Unreachable` where there is none to be had."""
+
+    async def serial(
+        self, link: Path, plant: Endpoint, pace: SerialSettings | None
+    ) -> tuple[ByteConnection, Endpoint]: ...
+
+    async def listen(self, endpoint: Endpoint, on_client: OnClient, max_clients: int) -> Listening: ...
+
+    async def datagrams(self, endpoint: Endpoint) -> Datagrams: ...
+
+    async def can_bus(self, endpoint: Endpoint, bitrate: int, *, paced: bool) -> CanPort: ...
+
+
+class OsPorts:
+    """Virtual serial ports, sockets, the software CAN bus as a TCP server, kernel CAN interfaces."""
+
+    async def serial(self, link: Path, plant: Endpoint, pace: SerialSettings | None) -> tuple[ByteConnection, Endpoint]:
+        """A pty with its link in the file system, and the endpoint to name it by."""
+        end = await PtyEnd.open(link, plant, pace)
+        return end, Endpoint("pty", path=str(end.link))
+
+    async def listen(self, endpoint: Endpoint, on_client: OnClient, max_clients: int) -> SocketListener:
+        return await SocketListener.open(endpoint, on_client, max_clients)
+
+    async def datagrams(self, endpoint: Endpoint) -> UdpEnd:
+        return await UdpEnd.open(endpoint)
+
+    async def can_bus(self, endpoint: Endpoint, bitrate: int, *, paced: bool) -> CanPort:
+        """A software bus is served here; an interface of the kernel is joined."""
+        if endpoint.interface == "fieldtwin":
+            return _ServedBus(await SoftBusServer.open(endpoint, bitrate, paced=paced))
+        return _KernelBus(endpoint, bitrate)
+
+
+class _ServedBus:
+    def __init__(self, server: SoftBusServer) -> None:
+        self._server = server
+
+    @property
+    def bound(self) -> Endpoint:
+        return self._server.bound
+
+    async def join(self, name: str) -> CanConnection:
+        return self._server.attach(name)
+
+    def stats(self) -> dict[str, Any]:
+        return self._server.bus_stats()
+
+    async def aclose(self) -> None:
+        await self._server.aclose()
+
+
+class _KernelBus:
+    def __init__(self, endpoint: Endpoint, bitrate: int) -> None:
+        self.bound = endpoint
+        self._bitrate = bitrate
+
+    async def join(self, name: str) -> CanConnection:
+        return await open_can_end(self.bound, self._bitrate)
+
+    def stats(self) -> dict[str, Any]:
+        return {}
+
+    async def aclose(self) -> None:
+        """The kernel's interface stays."""

@@ -1,0 +1,40 @@
+"""`gateway.core.clock.Clock` on a virtual loop."""
+
+from __future__ import annotations
+
+import asyncio
+
+from emulators.virtual.loop import VirtualLoop
+from gateway.core.clock import NS_PER_S
+
+EPOCH_UTC_NS = 1_767_225_600 * NS_PER_S
+"""2026-01-01T00:00:00Z: the day on which every virtual run begins, so that its trace names the same moments."""
+
+
+class VirtualClock:
+    """Monotonic time is the loop's; UTC runs beside it from `EPOCH_UTC_NS`."""
+
+    def __init__(self, loop: VirtualLoop, epoch_utc_ns: int = EPOCH_UTC_NS) -> None:
+        self._loop = loop
+        self._offset_ns = epoch_utc_ns - loop.now_ns
+
+    def monotonic_ns(self) -> int:
+        return self._loop.now_ns
+
+    def utc_ns(self) -> int:
+        return self._loop.now_ns + self._offset_ns
+
+    async def sleep_until_ns(self, deadline_ns: int) -> None:
+        if deadline_ns <= self._loop.now_ns:
+            return
+        waiter: asyncio.Future[None] = self._loop.create_future()
+        timer = self._loop.call_at_ns(deadline_ns, _wake, waiter)
+        try:
+            await waiter
+        finally:
+            timer.cancel()
+
+
+def _wake(waiter: asyncio.Future[None]) -> None:
+    if not waiter.done():
+        waiter.set_result(None)

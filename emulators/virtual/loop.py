@@ -1,0 +1,292 @@
+"""An event loop whose time is a number: nothing waits, and what is due next is due now.
+
+The unmodified gateway, PLC and emulators run on it. Whatever would leave it (a socket, a thread, a process, a signal) raises
+`Escape` with the culprit's name: a run that touched the world could not be repeated. Callbacks of one instant run in the order
+in which they were asked for, timers by (when, sequence); no set of tasks is ever iterated.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import heapq
+import sys
+from asyncio import events
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine, Generator
+from contextvars import Context
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn, TypeVar, TypeVarTuple
+
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import Bug
+
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
+
+START_NS = 1_000 * NS_PER_S
+"""Where monotonic time begins: not at 0, which reads as "never" in many places."""
+STUCK_AFTER = 1_000_000
+"""Callbacks at one instant before the loop says that time stands still."""
+_WAITING_SHOWN = 20
+_COMPACT_ABOVE = 1_000
+"""Timers in the heap before those that were cancelled are looked for."""
+
+
+class Escape(Bug):
+    """Something under virtual time reached for the world: a thread, a socket, a process or a wall clock."""
+
+
+class Deadlock(Bug):
+    """Nothing is ready and no timer is set, or callbacks call each other for ever at one instant."""
+
+
+class VirtualLoop(asyncio.AbstractEventLoop):
+    """`now_ns` is its time. Not thread-safe, and it says so."""
+
+    def __init__(self, start_ns: int = START_NS) -> None:
+        self.now_ns = start_ns
+        self.callbacks = 0
+        """How many were run."""
+        self._ready: deque[asyncio.Handle] = deque()
+        self._timers: list[tuple[int, int, asyncio.TimerHandle]] = []
+        self._sequence = 0
+        self._cancelled = 0
+        self._tasks = 0
+        self._running = self._stopping = self._closed = False
+        self._handler: Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object] | None = None
+        self.unhandled: list[dict[str, Any]] = []
+        """What nobody caught, in order: told when the loop's run ends."""
+
+    # -- time and callbacks -------------------------------------------------------------------------------------------
+
+    def time(self) -> float:
+        return self.now_ns / NS_PER_S
+
+    def call_soon(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
+        handle = asyncio.Handle(callback, args, self, context)
+        self._ready.append(handle)
+        return handle
+
+    def call_later(
+        self, delay: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        return self.call_at_ns(self.now_ns + round(delay * NS_PER_S), callback, *args, context=context)
+
+    def call_at(
+        self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        return self.call_at_ns(round(when * NS_PER_S), callback, *args, context=context)
+
+    def call_at_ns(
+        self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.TimerHandle:
+        """As `call_at`, to the nanosecond. What is past is due at this instant, behind what is ready."""
+        timer = asyncio.TimerHandle(when_ns / NS_PER_S, callback, args, self, context)
+        self._sequence += 1
+        heapq.heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, timer))
+        timer._scheduled = True  # type: ignore[attr-defined]  # as asyncio's own loops do: cancel() then tells us
+        return timer
+
+    def _timer_handle_cancelled(self, timer: asyncio.TimerHandle) -> None:
+        self._cancelled += 1
+        if self._cancelled > _COMPACT_ABOVE and 2 * self._cancelled > len(self._timers):
+            self._timers = [entry for entry in self._timers if not entry[2].cancelled()]
+            heapq.heapify(self._timers)
+            self._cancelled = 0
+
+    # -- futures and tasks --------------------------------------------------------------------------------------------
+
+    def create_future(self) -> asyncio.Future[Any]:
+        return asyncio.Future(loop=self)
+
+    def create_task(  # 3.14 passes more by keyword, all of it for Task
+        self, coro: Generator[Any, None, T] | Coroutine[Any, Any, T], *, name: object = None, **more: Any
+    ) -> asyncio.Task[T]:
+        self._tasks += 1
+        more.pop("eager_start", None)
+        return asyncio.Task(coro, loop=self, name=str(name) if name else f"task {self._tasks}", **more)
+
+    def get_debug(self) -> bool:
+        return False
+
+    def set_debug(self, enabled: bool) -> None:
+        """Nothing: asyncio's debugging measures on the wall clock."""
+
+    # -- running ------------------------------------------------------------------------------------------------------
+
+    def run_until_complete(self, future: Generator[Any, None, T] | Awaitable[T]) -> T:
+        """Run until `future` is done. Raises `Deadlock` when it never will be."""
+        main: asyncio.Future[T] = asyncio.ensure_future(future, loop=self)  # type: ignore[arg-type]  # a generator too
+        main.add_done_callback(self._on_done)
+        try:
+            self.run_forever()
+        finally:
+            main.remove_done_callback(self._on_done)
+        if not main.done():
+            raise Bug("the virtual loop was stopped before its main task was done")
+        return main.result()
+
+    def _on_done(self, future: asyncio.Future[Any]) -> None:
+        self._stopping = True
+
+    def run_forever(self) -> None:
+        """Run until `stop`. Raises `Deadlock` when nothing is left that could happen."""
+        if self._running or events._get_running_loop() is not None:
+            raise Bug("a virtual loop inside another loop")
+        self._running = True
+        events._set_running_loop(self)
+        try:
+            while not self._stopping:
+                self._run_instant()
+        finally:
+            self._stopping = self._running = False
+            events._set_running_loop(None)
+
+    def _run_instant(self) -> None:
+        """All that is ready, and what that makes ready, then on to the next timer's instant."""
+        ready, pop, budget = self._ready, self._ready.popleft, STUCK_AFTER
+        while ready:
+            handle = pop()
+            if not handle.cancelled():
+                handle._run()
+                budget -= 1
+            if self._stopping:
+                self.callbacks += STUCK_AFTER - budget
+                return
+            if budget <= 0:
+                raise Deadlock("time stands still: callbacks call each other at one instant", got=str(handle))
+        self.callbacks += STUCK_AFTER - budget
+        self._advance()
+
+    def _advance(self) -> None:
+        timers = self._timers
+        while timers and timers[0][2].cancelled():
+            heapq.heappop(timers)
+            self._cancelled -= 1
+        if not timers:
+            raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
+        self.now_ns = now_ns = timers[0][0]
+        while timers and timers[0][0] == now_ns:
+            timer = heapq.heappop(timers)[2]
+            timer._scheduled = False  # type: ignore[attr-defined]
+            if timer.cancelled():
+                self._cancelled -= 1
+            else:
+                self._ready.append(timer)
+
+    def _who_waits(self) -> str:
+        tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
+        told = [f"{task.get_name()} at {_waits_at(task)}" for task in tasks[:_WAITING_SHOWN]]
+        more = len(tasks) - len(told)
+        return "; ".join(told) + (f"; and {more} more" if more > 0 else "")
+
+    def stop(self) -> None:
+        self._stopping = True
+
+    def is_running(self) -> bool:
+        return self._running
+
+    def is_closed(self) -> bool:
+        return self._closed
+
+    def close(self) -> None:
+        """Drop what was scheduled."""
+        if self._running:
+            raise Bug("a running loop cannot be closed")
+        self._closed = True
+        self._ready.clear()
+        self._timers.clear()
+
+    async def shutdown_asyncgens(self) -> None:
+        """None are tracked."""
+
+    async def shutdown_default_executor(self, timeout: float | None = None) -> None:
+        """There is none."""
+
+    # -- what nobody caught -------------------------------------------------------------------------------------------
+
+    def get_exception_handler(self) -> Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object] | None:
+        return self._handler
+
+    def set_exception_handler(
+        self, handler: Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object] | None
+    ) -> None:
+        self._handler = handler
+
+    def default_exception_handler(self, context: dict[str, Any]) -> None:
+        self.unhandled.append(context)
+
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        (self._handler or type(self).default_exception_handler)(self, context)
+
+    # -- ways out -----------------------------------------------------------------------------------------------------
+
+    def call_soon_threadsafe(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
+        raise escape("a call from another thread")
+
+
+def _waits_at(task: asyncio.Task[Any]) -> str:
+    """Where in the code a task waits: the innermost line of ours, with what it awaits there."""
+    inner: Any = task.get_coro()
+    while (deeper := getattr(inner, "cr_await", None)) is not None and hasattr(deeper, "cr_frame"):
+        inner = deeper
+    frame = getattr(inner, "cr_frame", None)
+    awaited = getattr(inner, "cr_await", None)
+    name = getattr(inner, "__qualname__", repr(inner))
+    if frame is None:
+        return str(name)
+    for_what = f" for {type(awaited).__name__}" if awaited is not None else ""
+    return f"{name} ({Path(frame.f_code.co_filename).name}:{frame.f_lineno}){for_what}"
+
+
+def culprit() -> str:
+    """Who called: the innermost frame that is neither this package's nor the standard library's, and the task it runs in."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None and _is_plumbing(frame):
+        frame = frame.f_back
+    try:
+        task = asyncio.current_task()
+    except RuntimeError:
+        task = None
+    place = f"{frame.f_code.co_filename}:{frame.f_lineno} ({frame.f_code.co_qualname})" if frame is not None else "?"
+    return f"{place}, task {task.get_name()}" if task is not None else place
+
+
+_STANDARD_LIBRARY = str(Path(asyncio.__file__).parent.parent)
+_HERE = str(Path(__file__).parent)
+
+
+def _is_plumbing(frame: FrameType) -> bool:
+    name = frame.f_code.co_filename
+    ours = name.startswith(_HERE)
+    return ours or (name.startswith(_STANDARD_LIBRARY) and "site-packages" not in name) or name.startswith("<")
+
+
+def escape(what: str) -> Escape:
+    """The error that names who reached for `what`."""
+    return Escape(
+        f"{what} under virtual time", where=culprit(), hint="time and wires come from the clock and the connector"
+    )
+
+
+def _way_out(name: str) -> Callable[..., NoReturn]:
+    def refuse(self: VirtualLoop, *args: Any, **kwargs: Any) -> NoReturn:
+        raise escape(f"loop.{name}")
+
+    refuse.__name__ = name
+    return refuse
+
+
+_WAYS_OUT = """
+run_in_executor set_default_executor getaddrinfo getnameinfo create_connection create_server create_datagram_endpoint
+create_unix_connection create_unix_server connect_accepted_socket start_tls sendfile sock_sendfile sock_recv sock_recv_into
+sock_recvfrom sock_recvfrom_into sock_sendall sock_sendto sock_connect sock_accept connect_read_pipe connect_write_pipe
+subprocess_shell subprocess_exec add_reader remove_reader add_writer remove_writer add_signal_handler remove_signal_handler
+"""
+for _name in _WAYS_OUT.split():
+    setattr(VirtualLoop, _name, _way_out(_name))

@@ -1,0 +1,117 @@
+"""Wires in memory: two ends of a byte stream, with the time that bytes take on them.
+
+What is written on one end arrives at the other in order and whole, at once or after the line's character time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+
+from emulators.virtual.loop import VirtualLoop
+from emulators.wires.serial_line import SerialPacer
+from gateway.core.connection import Client, Connection, Direction, RS232Connection, TCPConnection, closed_here
+from gateway.core.endpoint import Endpoint, SerialSettings
+from gateway.core.errors import ConnectionLost, FieldtwinError
+
+MAX_PENDING = 1024
+
+
+class MemoryWire:
+    """A wire with two ends. `settings`: of a serial line, whose baud rate is kept; None: bytes take no time."""
+
+    def __init__(
+        self,
+        loop: VirtualLoop,
+        gateway_end: Endpoint,
+        field_end: Endpoint,
+        settings: SerialSettings | None,
+        *,
+        serial: bool,
+    ) -> None:
+        self.loop = loop
+        self.serial = serial
+        kind = RS232Connection if serial else TCPConnection
+        self.near = MemoryEnd(self, Direction.SENT, kind(), gateway_end)
+        self.far = MemoryEnd(self, Direction.RECEIVED, kind(), field_end)
+        self._pacers = {d: SerialPacer(settings) if settings is not None else None for d in Direction}
+
+    def write(self, direction: Direction, data: bytes) -> None:
+        """`data` is on the wire now, behind what is on it already."""
+        if not data:
+            return
+        receiver, pacer = self._receiver(direction), self._pacers[direction]
+        if pacer is None:
+            receiver.arrived(data)
+        else:
+            self.loop.call_at_ns(pacer.send(self.loop.now_ns, len(data)), receiver.arrived, data)
+
+    def ended(self, direction: Direction) -> None:
+        """The writer of `direction` hung up: behind what is on its way, the other side learns of it."""
+        receiver, pacer = self._receiver(direction), self._pacers[direction]
+        lost = ConnectionLost("the other side ended the connection", where=str(receiver.endpoint))
+        if pacer is None:
+            receiver.feed_lost(lost)
+        else:
+            self.loop.call_at_ns(max(self.loop.now_ns, pacer.busy_until_ns), receiver.feed_lost, lost)
+
+    def cut(self, error: FieldtwinError) -> None:
+        """The wire is gone for both."""
+        self.near.cut(error)
+        self.far.cut(error)
+
+    def _receiver(self, direction: Direction) -> MemoryEnd:
+        return self.far if direction is Direction.SENT else self.near
+
+    def sender(self, direction: Direction) -> MemoryEnd:
+        return self.near if direction is Direction.SENT else self.far
+
+
+class MemoryEnd(Client):
+    """One end. `direction` is that of its writes, as the gateway sees it."""
+
+    def __init__(self, wire: MemoryWire, direction: Direction, kind: Connection[bytes], endpoint: Endpoint) -> None:
+        super().__init__(kind, endpoint, MAX_PENDING)
+        self.wire = wire
+        self.direction = direction
+        self.peer = "127.0.0.1"
+        self.peer_port = 0
+        self.role = ""
+        self._room: asyncio.Future[None] | None = None
+
+    @classmethod
+    def again(cls, old: MemoryEnd) -> MemoryEnd:
+        """A new end in the place of one that was closed, as when a port is opened again."""
+        return cls(old.wire, old.direction, type(old.inbound)(), old.endpoint)
+
+    @property
+    def other(self) -> MemoryEnd:
+        return self.wire.sender(Direction.RECEIVED if self.direction is Direction.SENT else Direction.SENT)
+
+    def arrived(self, data: bytes) -> None:
+        """Bytes from the other side; those that come to a closed end are nobody's."""
+        if self.lost is None:
+            self.feed(data)
+
+    async def write(self, data: bytes) -> None:
+        if self.lost is not None:
+            raise self._loss()
+        self.wire.write(self.direction, data)
+        other = self.other
+        while len(other.inbound.data_stream) >= other.max_pending and other.lost is None and self.lost is None:
+            other._room = asyncio.get_running_loop().create_future()
+            await other._room
+
+    def on_room(self) -> None:
+        if self._room is not None and not self._room.done():
+            self._room.set_result(None)
+
+    def cut(self, error: FieldtwinError) -> None:
+        self.feed_lost(error)
+        self.on_room()
+
+    async def aclose(self) -> None:
+        """Close. A serial line does not tell the other side."""
+        if self.lost is None and not self.wire.serial:
+            self.wire.ended(self.direction)
+        self.cut(closed_here(self.endpoint))
+        self.inbound.data_stream.clear()

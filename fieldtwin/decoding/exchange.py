@@ -1,0 +1,109 @@
+"""What decoding gives: a request with its answer, or a message that has none, as frozen values.
+
+One form for both protocols, so that scenarios and reports count and compare without knowing either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from gateway.core.profile import RegisterRange, Table
+from gateway.core.values import Scalar
+
+Access = Literal["read", "write"]
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A piece of a device that an exchange touched: `count` registers or bits of `table` from `address`, or (table
+    ``object``) one CANopen object, `address` its index."""
+
+    access: Access
+    table: Table | Literal["object", "file"]
+    address: int
+    count: int = 1
+    subindex: int = 0
+
+    def covers(self, table: str, address: int) -> bool:
+        """Whether a register (or bit) is inside."""
+        return self.table == table and self.address <= address < self.address + self.count
+
+    def __str__(self) -> str:
+        """Both ways for registers, ``30001 (input:0) x 2``; ``6010h:01`` for an object."""
+        if self.table == "object":
+            return f"{self.address:04X}h:{self.subindex:02X}"
+        if self.table == "file":
+            return f"file {self.subindex} record {self.address} x {self.count}"
+        return str(RegisterRange(self.table, self.address, self.count))
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """A request and its answer on a bus, or a message that nobody answers (broadcast, heartbeat, PDO).
+
+    `unit` is the Modbus unit or CANopen node id (0: all), `device` the system's name of it, "" where it has none.
+    `function` is the Modbus function code, 0 on CANopen; `service` is what is done, in words, and the same for all of a
+    kind: ``read holding registers``, ``SDO upload``, ``TPDO1``. `tags` are the values that the exchange carried, in
+    engineering units, None for those that were only asked for; `registers` the words, or for bits 0 and 1.
+
+    `problem` says why there is no good answer, "" where there is: ``no reply``, ``check sum``, ``exception``, ``abort``,
+    ``stray`` (a frame that answers nothing), ``malformed``. `latency_ns` is from the request to the last byte of the
+    answer, None without one. `t_ns` is when the request was seen, `end_ns` when the last byte of all was.
+    """
+
+    t_ns: int
+    end_ns: int
+    bus: str
+    device: str
+    unit: int
+    function: int
+    service: str
+    spans: tuple[Span, ...] = ()
+    registers: tuple[int, ...] = ()
+    tags: dict[str, Scalar | None] = field(default_factory=dict)
+    exception: int | None = None
+    abort: int | None = None
+    latency_ns: int | None = None
+    request: bytes = b""
+    reply: bytes = b""
+    problem: str = ""
+    text: str = ""
+    reply_text: str = ""
+
+    @property
+    def access(self) -> str:
+        """read, write, read and write, or "" where neither is done."""
+        return " and ".join(a for a in ("read", "write") if any(s.access == a for s in self.spans))
+
+    @property
+    def address(self) -> int | None:
+        """The first address (CANopen: index) that it touches."""
+        return self.spans[0].address if self.spans else None
+
+    @property
+    def count(self) -> int:
+        """Registers, bits or objects of the first span."""
+        return self.spans[0].count if self.spans else 0
+
+    @property
+    def ok(self) -> bool:
+        """Answered as asked, or a message that wants no answer."""
+        return not self.problem
+
+    def reads(self, tag: str = "") -> bool:
+        """Whether it reads, and `tag` (a name without its device) among others."""
+        return any(s.access == "read" for s in self.spans) and (not tag or tag in self.tags)
+
+    def writes(self, tag: str = "") -> bool:
+        """As `reads`."""
+        return any(s.access == "write" for s in self.spans) and (not tag or tag in self.tags)
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """One event of a trace in words. `fields` are the parts (plain data); `exchanges` those that it completed."""
+
+    text: str
+    fields: dict[str, Any] = field(default_factory=dict)
+    exchanges: tuple[Exchange, ...] = ()

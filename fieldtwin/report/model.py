@@ -1,0 +1,118 @@
+"""What a report is made of: results of scenarios with their traces, and what they were run against. Plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+from fieldtwin.scenarios.trace import Event
+from twin.system import System
+
+
+class Verdict(Enum):
+    """How something ended. Only the first one is a pass. The values are the words that users see."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    ERROR = "error"
+    INCONCLUSIVE = "inconclusive"
+    SKIPPED = "skipped"
+
+    @property
+    def bad(self) -> bool:
+        """Whether somebody has to look: FAILED and ERROR."""
+        return self in (Verdict.FAILED, Verdict.ERROR)
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """A step, an expectation or an always-on check of a scenario.
+
+    `number` is how people find it again (``3``, ``always 1``), `where` its place (file:line). `since_ns` to `t_ns` is the
+    time that it looked at, ns since the run's start, `t_ns` when it was decided; None where it was not reached. `names` are the tags,
+    variables and devices that it is about: the diagram shows these.
+    """
+
+    number: str
+    text: str
+    verdict: Verdict
+    t_ns: int | None = None
+    since_ns: int | None = None
+    expected: str = ""
+    got: str = ""
+    reason: str = ""
+    where: str = ""
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ScenarioResult:
+    """One scenario against one target with one seed.
+
+    `reproduce` is the one line that runs it again. `simulated_s` is the run's own time, `took_s` the host's. `trace` are
+    the events that are still in memory, `dropped` how many are not; `trace_hash` is over all.
+    """
+
+    name: str
+    verdict: Verdict
+    checks: Sequence[CheckResult] = ()
+    requirements: tuple[str, ...] = ()
+    file: str = ""
+    line: int = 0
+    target: str = ""
+    seed: int | None = None
+    reason: str = ""
+    reproduce: str = ""
+    simulated_s: float = 0.0
+    took_s: float = 0.0
+    trace: Sequence[Event] = ()
+    trace_hash: str = ""
+    dropped: int = 0
+
+    @property
+    def title(self) -> str:
+        """The name, with the seed where several runs of a scenario need telling apart."""
+        return f"{self.name} [seed {self.seed}]" if self.seed is not None else self.name
+
+
+@dataclass(frozen=True)
+class Machine:
+    """A program's state variable (``PROGRAM.VARIABLE``): its states in the order of their codes, and what can follow what."""
+
+    variable: str
+    states: tuple[str, ...]
+    transitions: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """A run: one or many scenarios. `requirements` are those that are to be covered, id to text; ids that only scenarios name are
+    added. `versions` is anything worth knowing: fieldtwin, Python, platform. `started` is ISO 8601."""
+
+    title: str
+    scenarios: Sequence[ScenarioResult]
+    system: System | None = None
+    target: str = ""
+    seed: int | None = None
+    started: str = ""
+    reproduce: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    requirements: Mapping[str, str] = field(default_factory=dict)
+    machines: Sequence[Machine] = ()
+    faults: Sequence[str] = ()
+    """The faults that there are to be injected, by name; those that ran are added."""
+
+    @property
+    def counts(self) -> dict[Verdict, int]:
+        """How many scenarios ended how."""
+        return {v: sum(s.verdict is v for s in self.scenarios) for v in Verdict}
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of all scenarios; a run of none is inconclusive."""
+        found = {s.verdict for s in self.scenarios}
+        for verdict in (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.SKIPPED):
+            if verdict in found:
+                return verdict
+        return Verdict.PASSED if found else Verdict.INCONCLUSIVE

@@ -10,8 +10,9 @@ from collections.abc import Callable
 
 from emulators.canopen.node import CanopenNode
 from gateway.core.canframe import CanFrame
-from gateway.core.clock import Clock
+from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import CanConnection
+from gateway.core.nursery import Nursery
 
 Poke = Callable[[int], list[CanFrame]]
 """Something that happens in the device: called with the time, returns what the node then sends."""
@@ -26,44 +27,62 @@ async def serve_node(
     caller's.
     """
     connection.accept = node.accepts
-    receiving: asyncio.Task[CanFrame] = asyncio.create_task(connection.recv())
-    poked: asyncio.Task[Poke] | None = asyncio.create_task(pokes.get()) if pokes else None
-    sleeping: asyncio.Task[None] | None = None
-    slept_until_ns: int | None = None
-    try:
-        await _send(connection, node.start(clock.monotonic_ns()))
+    shell = _Shell(connection, node, clock)
+    async with Nursery() as nursery:
+        nursery.start(shell.receive(), "node: frames")
+        nursery.start(shell.tick(), "node: time")
+        if pokes is not None:
+            nursery.start(shell.poked(pokes), "node: pokes")
+        await nursery.wait()
+
+
+class _Shell:
+    """A node between frames and time. One thing at a time: what follows from it is sent before the next is looked at."""
+
+    def __init__(self, connection: CanConnection, node: CanopenNode, clock: Clock) -> None:
+        self._connection = connection
+        self._node = node
+        self._clock = clock
+        self._turn = asyncio.Lock()
+        self._woken = asyncio.Event()
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_ns: int | None = None
+
+    async def receive(self) -> None:
+        await self._do(self._node.start)
         while True:
-            wake_ns = node.wake_at_ns()
-            if wake_ns != slept_until_ns or (sleeping is not None and sleeping.done()):
-                await _cancel(sleeping)
-                sleeping = None if wake_ns is None else asyncio.create_task(clock.sleep_until_ns(wake_ns))
-                slept_until_ns = wake_ns
-            await asyncio.wait([t for t in (receiving, sleeping, poked) if t], return_when=asyncio.FIRST_COMPLETED)
-            if receiving.done():
-                frame = receiving.result()
-                receiving = asyncio.create_task(connection.recv())
-                await _send(connection, node.feed(frame, clock.monotonic_ns()))
-            elif poked is not None and pokes is not None and poked.done():
-                poke = poked.result()
-                poked = asyncio.create_task(pokes.get())
-                await _send(connection, poke(clock.monotonic_ns()))
-            else:
-                if sleeping is not None:
-                    sleeping.result()  # a clock that fails is told, not retried for ever
-                await _send(connection, node.tick(clock.monotonic_ns()))
-    finally:
-        await _cancel(receiving)
-        await _cancel(poked)
-        await _cancel(sleeping)
+            frame = await self._connection.recv()
+            await self._do(lambda now_ns, frame=frame: self._node.feed(frame, now_ns))  # type: ignore[misc]
 
+    async def tick(self) -> None:
+        try:
+            while True:
+                await self._woken.wait()
+                self._woken.clear()
+                self._timer = self._timer_ns = None
+                await self._do(self._node.tick)
+        finally:
+            if self._timer is not None:
+                self._timer.cancel()
 
-async def _send(connection: CanConnection, frames: list[CanFrame]) -> None:
-    for frame in frames:
-        await connection.send(frame)
+    async def poked(self, pokes: asyncio.Queue[Poke]) -> None:
+        while True:
+            await self._do(await pokes.get())
 
+    async def _do(self, what: Poke) -> None:
+        async with self._turn:
+            for frame in what(self._clock.monotonic_ns()):
+                await self._connection.send(frame)
+            self._set_timer()
 
-async def _cancel(task: asyncio.Task[CanFrame] | asyncio.Task[None] | asyncio.Task[Poke] | None) -> None:
-    """End a task of ours and take its outcome, so that none is reported as never retrieved."""
-    if task is not None:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+    def _set_timer(self) -> None:
+        wake_ns = self._node.wake_at_ns()
+        if wake_ns == self._timer_ns:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._timer_ns = wake_ns
+        if wake_ns is not None:
+            left_s = (wake_ns - self._clock.monotonic_ns()) / NS_PER_S
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, left_s), self._woken.set)

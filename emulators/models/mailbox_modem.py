@@ -34,6 +34,8 @@ class MailboxModem(RegisterBank):
         self._outgoing, self._incoming = outgoing, incoming
         self._tags = profile.tags
         self._cells = MapBank(_spans(profile), self._on_write)
+        self._told: dict[str, int] = {}
+        """The counters of the link as its registers show them."""
         self._received: deque[bytes] = deque(maxlen=RECEIVED)
         self._sequence = 0
         self._accepted = 0
@@ -69,7 +71,8 @@ class MailboxModem(RegisterBank):
             ("link_resent", self._outgoing.resent),
         ):
             tag = self._tags.get(name)
-            if tag is not None:
+            if tag is not None and self._told.get(name) != number:
+                self._told[name] = number
                 words = encode(number, tag.type, tag.order)
                 self._cells.poke(tag.registers.table, tag.registers.address, *words)
                 self.journal.note(name, b"".join(w.to_bytes(2) for w in words), now_ns)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-
 from emulators.virtual.loop import VirtualLoop
 from gateway.core.clock import NS_PER_S
 
@@ -27,14 +25,4 @@ class VirtualClock:
     async def sleep_until_ns(self, deadline_ns: int) -> None:
         if deadline_ns <= self._loop.now_ns:
             return
-        waiter: asyncio.Future[None] = self._loop.create_future()
-        timer = self._loop.call_at_ns(deadline_ns, _wake, waiter)
-        try:
-            await waiter
-        finally:
-            timer.cancel()
-
-
-def _wake(waiter: asyncio.Future[None]) -> None:
-    if not waiter.done():
-        waiter.set_result(None)
+        await self._loop.sleeper(deadline_ns)

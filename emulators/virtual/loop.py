@@ -49,7 +49,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.callbacks = 0
         """How many were run."""
         self._ready: deque[asyncio.Handle] = deque()
-        self._timers: list[tuple[int, int, asyncio.TimerHandle]] = []
+        self._timers: list[tuple[int, int, asyncio.TimerHandle | asyncio.Future[None]]] = []
         self._sequence = 0
         self._cancelled = 0
         self._tasks = 0
@@ -89,6 +89,13 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         heapq.heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, timer))
         timer._scheduled = True  # type: ignore[attr-defined]  # as asyncio's own loops do: cancel() then tells us
         return timer
+
+    def sleeper(self, when_ns: int) -> asyncio.Future[None]:
+        """A future that is done at `when_ns`: what a clock's sleep awaits, in fewer steps than by `call_at_ns`."""
+        future: asyncio.Future[None] = asyncio.Future(loop=self)
+        self._sequence += 1
+        heapq.heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, future))
+        return future
 
     def _timer_handle_cancelled(self, timer: asyncio.TimerHandle) -> None:
         self._cancelled += 1
@@ -164,18 +171,22 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def _advance(self) -> None:
         timers = self._timers
         while timers and timers[0][2].cancelled():
-            heapq.heappop(timers)
-            self._cancelled -= 1
+            if isinstance(heapq.heappop(timers)[2], asyncio.TimerHandle):
+                self._cancelled -= 1
         if not timers:
             raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
         self.now_ns = now_ns = timers[0][0]
         while timers and timers[0][0] == now_ns:
-            timer = heapq.heappop(timers)[2]
-            timer._scheduled = False  # type: ignore[attr-defined]
-            if timer.cancelled():
+            due = heapq.heappop(timers)[2]
+            if isinstance(due, asyncio.Future):
+                if not due.done():
+                    due.set_result(None)
+                continue
+            due._scheduled = False  # type: ignore[attr-defined]
+            if due.cancelled():
                 self._cancelled -= 1
             else:
-                self._ready.append(timer)
+                self._ready.append(due)
 
     def _who_waits(self) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())

@@ -7,6 +7,7 @@ took the last.
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,8 @@ from gateway.runtime.tags import TagTable
 from twin.system import System
 
 TICK_NS = 20 * NS_PER_MS
+"""How often an exchange that is under way is looked after."""
+IDLE_S = 60.0
 KEPT_RESPONSES = 1000
 DEFAULT_SCRIPT = (1, 2, 0, -1)
 SCRIPT_TIMES = (0.1, 0.35, 0.65, 0.82)
@@ -63,6 +66,18 @@ def parse_periods(text: str) -> tuple[int, ...]:
     return periods
 
 
+class _Inbox(Consumer[DATA]):
+    """What the far modem received; says so."""
+
+    def __init__(self, event: str, news: asyncio.Event) -> None:
+        super().__init__(event, capacity=256)
+        self._news = news
+
+    def observe(self, item: DATA) -> None:
+        super().observe(item)
+        self._news.set()
+
+
 class Shore:
     """The far end of one transmitter of `system`, reached at `endpoint`."""
 
@@ -79,7 +94,8 @@ class Shore:
         )
         self._clock = clock
         self._driver = TransmitterDriver(far, TagTable(clock), incoming=RESPONSE)
-        self._inbox: Consumer[DATA] = Consumer(self._driver.emitter.event, capacity=256)
+        self._news = asyncio.Event()
+        self._inbox = _Inbox(self._driver.emitter.event, self._news)
         self._driver.emitter.subscribe(self._inbox)
         bus = BusConfig("far", endpoint, system.buses[config.bus].timeout_s, 1)
         self._bus = ModbusBus(bus, [self._driver], connector or OsConnector(), clock, TagTable(clock), lambda d: None)
@@ -112,11 +128,23 @@ class Shore:
                 self.responses.append(response.data)
             if not self._busy and self._bus.online(self._driver):
                 self._exchange()
-            await self._clock.sleep_until_ns(now_ns + TICK_NS)
+            if self._busy or self._driver.to_acknowledge or self._driver.consumer.queue:
+                await self._clock.sleep_until_ns(now_ns + TICK_NS)
+            else:
+                await self._wait_for_news(commands[0].at_s - (now_ns - start_ns) / NS_PER_S if commands else IDLE_S)
+
+    async def _wait_for_news(self, at_most_s: float) -> None:
+        self._news.clear()
+        try:
+            async with asyncio.timeout(min(max(at_most_s, 0.0), IDLE_S)):
+                await self._news.wait()
+        except TimeoutError:
+            pass
 
     def send(self, period_s: int) -> None:
         """Command a period."""
         self._driver.consumer.observe(encode_period(period_s))
+        self._news.set()
         self.commands_sent.append(period_s)
 
     def _exchange(self) -> None:

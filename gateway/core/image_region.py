@@ -24,6 +24,8 @@ from gateway.core.values import Quality, Reason, Scalar, TagValue
 MAX_LOOKS = 16
 """How often a reader looks before it gives up for now. Trying four slots gave 0.0015 retries a read (DESIGN.md)."""
 
+_QUALITIES = {int(quality): quality for quality in Quality}
+_REASONS = {int(reason): reason for reason in Reason}
 _NO_VALUE = 0x80  # in the quality byte: the tag has a quality and no value
 
 
@@ -74,7 +76,7 @@ class Snapshot:
     def value(self, tag: str | int) -> TagValue:
         """The value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
         i = self.shape.index[tag] if isinstance(tag, str) else tag
-        return TagValue(self.values[i], Quality(self.qualities[i]), Reason(self.reasons[i]), self.times_ns[i])
+        return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.times_ns[i])
 
     def all(self) -> dict[str, TagValue]:
         """Every tag by name."""
@@ -82,7 +84,7 @@ class Snapshot:
 
     @property
     def stopped(self) -> bool:
-        return bool(self.flags & RegionFlag.STOPPED)
+        return self.flags is not RegionFlag.NONE and bool(self.flags & RegionFlag.STOPPED)
 
     def age_ns(self, now_ns: int) -> float:
         """How long ago the writer published this: its heartbeat. Infinite when it never did."""
@@ -154,6 +156,21 @@ class RegionWriter(_Region):
         return self._publish(
             plain, marks, bytes([v.reason for v in values]), [v.t_ns for v in values], now_ns, messages, flags
         )
+
+    def publish_mixed(
+        self,
+        values: list[Scalar | None],
+        qualities: bytes | bytearray,
+        reasons: bytes | bytearray,
+        times_ns: list[int],
+        now_ns: int,
+        messages: Mapping[str, Sequence[tuple[int, bytes]]] | None = None,
+    ) -> int:
+        """`publish` for a writer that keeps columns, one entry a tag in the layout's order."""
+        marks = bytes(qualities)
+        if None in values:
+            marks = bytes([q if v is not None else q | _NO_VALUE for q, v in zip(qualities, values, strict=True)])
+        return self._publish(list(values), marks, bytes(reasons), times_ns, now_ns, messages, RegionFlag.NONE)
 
     def publish_columns(
         self,
@@ -343,7 +360,7 @@ class RegionReader(_Region):
             self.shape,
             fields[0],
             fields[1],
-            RegionFlag(fields[2]),
+            RegionFlag(fields[2]) if fields[2] else RegionFlag.NONE,
             values,
             marks,
             fields[-1],

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 
 from gateway.core.clock import NS_PER_MS
 from gateway.core.events import Consumer
-from gateway.core.image import INPUTS, OUTPUTS, Image, Message, TagKind, consumed_name, taken_name
-from gateway.core.values import DATA, Quality, Reason, TagValue
-from gateway.runtime.tags import TagTable
+from gateway.core.image import INPUTS, OUTPUTS, Image, Message, TagKind, TagSpec, consumed_name, taken_name
+from gateway.core.values import DATA, NEVER, Quality, Reason, Scalar, TagValue
+from gateway.runtime.tags import FOREVER_NS, TagTable
 
 
 class ImageExchange:
@@ -36,6 +36,12 @@ class ImageExchange:
         self.untaken: dict[str, int] = {}
         """By output message tag: how many messages that were read have not been dealt with yet."""
         self.outputs: dict[str, TagValue] = {}
+        """Made anew when a value or quality changed: times are those of that change."""
+        self._seen: tuple[object, ...] = ()
+        self._taken = [
+            (at, tag) for at, t in enumerate(inputs.tags) for tag in self._message_outputs if t.name == taken_name(tag)
+        ]
+        self._columns = _Columns(inputs.tags, tags, {at for at, _ in self._taken})
         self.new_messages: Mapping[str, tuple[Message, ...]] = {}
         self.plc_counter = 0
         self.plc_stopped = False
@@ -58,7 +64,9 @@ class ImageExchange:
             self._plc_heard_ns = snapshot.t_ns
         self.plc_stopped = snapshot.stopped
         self.new_messages = snapshot.messages
-        if snapshot.counter:
+        seen = snapshot.values, snapshot.qualities, snapshot.reasons
+        if snapshot.counter and seen != self._seen:
+            self._seen = seen
             self.outputs = {name: snapshot.value(name) for name in self._output_names}
             for tag in self._depth:
                 value = self.outputs[consumed_name(tag)].value
@@ -83,13 +91,50 @@ class ImageExchange:
             batch = [(now_ns, source.consume().data) for _ in range(min(max(room, 0), len(source.queue)))]
             if batch:
                 messages[tag] = batch
-        values = [self._value(spec.name, spec.kind, now_ns) for spec in self._inputs]
-        self._writer.publish(values, now_ns, messages)
+        columns = self._columns
+        columns.refresh(now_ns)
+        for at, tag in self._taken:
+            columns.put(at, self._reader.seen(tag) - self.untaken.get(tag, 0), now_ns)
+        self._writer.publish_mixed(
+            columns.values, columns.qualities, columns.reasons, columns.times_ns, now_ns, messages
+        )
 
-    def _value(self, name: str, kind: TagKind, now_ns: int) -> TagValue:
-        if kind is TagKind.MESSAGE:
-            return TagValue(0, Quality.GOOD, Reason.NONE, now_ns)
-        tag, dot, suffix = name.rpartition(".")
-        if dot and suffix == "taken" and tag in self._message_outputs:
-            return TagValue(self._reader.seen(tag) - self.untaken.get(tag, 0), Quality.GOOD, Reason.NONE, now_ns)
-        return self._tags.current(name, now_ns)
+
+class _Columns:
+    """INPUTS as the tag table has them: only what changed, or may have grown stale, is looked up again."""
+
+    def __init__(self, specs: Sequence[TagSpec], tags: TagTable, others: Container[int]) -> None:
+        """`others`: the places of what the exchange itself puts."""
+        self._tags = tags
+        self._index = {s.name: at for at, s in enumerate(specs) if s.kind is not TagKind.MESSAGE and at not in others}
+        self.values: list[Scalar | None] = [0 if s.kind is TagKind.MESSAGE else None for s in specs]
+        self.qualities = bytearray([Quality.GOOD if s.kind is TagKind.MESSAGE else Quality.BAD for s in specs])
+        self.reasons = bytearray([Reason.NONE if s.kind is TagKind.MESSAGE else NEVER.reason for s in specs])
+        self.times_ns = [0] * len(specs)
+        self._until_ns = [FOREVER_NS] * len(specs)
+        self._earliest_ns = -1
+
+    def refresh(self, now_ns: int) -> None:
+        """What is new in the table, and what grew stale by `now_ns`."""
+        names: Iterable[str] = self._tags.take_news()
+        if now_ns > self._earliest_ns:
+            names = self._index
+        elif not names:
+            return
+        for name in names:
+            at = self._index.get(name)
+            if at is None:
+                continue
+            value = self._tags.current(name, now_ns)
+            self.values[at] = value.value
+            self.qualities[at] = value.quality
+            self.reasons[at] = value.reason
+            self.times_ns[at] = value.t_ns
+            until_ns = self._tags.fresh_until_ns(name)
+            self._until_ns[at] = FOREVER_NS if value.quality is Quality.BAD else until_ns
+        self._earliest_ns = min(self._until_ns, default=FOREVER_NS)
+
+    def put(self, at: int, value: int, now_ns: int) -> None:
+        """A number of the exchange's own."""
+        self.values[at], self.times_ns[at] = value, now_ns
+        self.qualities[at], self.reasons[at] = Quality.GOOD, Reason.NONE

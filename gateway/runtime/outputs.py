@@ -15,7 +15,7 @@ from functools import partial
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
-from gateway.core.values import COMMAND, Quality
+from gateway.core.values import COMMAND, Quality, TagValue
 from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
@@ -42,6 +42,8 @@ class Output:
     by: str = ""
     held: float | None = None
     held_since_ns: int = 0
+    compared: TagValue | None = None
+    """What the device was last heard to hold, found to be what it was told."""
     pending: bool = False
     refused: tuple[float, str] | None = None
     next_try_ns: int = 0
@@ -184,6 +186,8 @@ class OutputWriter:
         Compared as sent: a device may hold a rounded value, and that is no other one.
         """
         current = self._tags.current(output.tag, now_ns)
+        if current is output.compared:
+            return  # nobody heard anything new of it
         if (
             output.held is None
             or current.t_ns <= output.held_since_ns + output.settle_ns
@@ -194,6 +198,8 @@ class OutputWriter:
         if int.from_bytes(current.raw) != int.from_bytes(sent):
             output.held = None
             self.rewrites += 1
+        else:
+            output.compared = current
 
     def _start(self, output: Output, value: float) -> None:
         name = output.driver.config.name

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 
+FOREVER_NS = 2**63 - 1
 JOURNAL = 100_000
 """Published values that are kept until somebody fetches them; the oldest are dropped and counted."""
 
@@ -34,6 +35,7 @@ class TagTable:
         self._values: dict[str, TagValue] = {}
         self._refreshed_ns: dict[str, int] = {}
         self._stale_ns: dict[str, int] = {}
+        self._news: dict[str, None] = {}
         self._journal: deque[Published] = deque(maxlen=JOURNAL)
         self.published = 0
         self.journal_dropped = 0
@@ -42,6 +44,7 @@ class TagTable:
         """Make tags known. A value not refreshed for `stale_after_ms` is bad; None for what does not age (an identity)."""
         for name in names:
             self._values.setdefault(name, NEVER)
+            self._news[name] = None
             if stale_after_ms is not None:
                 self._stale_ns[name] = stale_after_ms * NS_PER_MS
             else:
@@ -56,6 +59,7 @@ class TagTable:
         before = self._values.get(name, NEVER)
         self._values[name] = value
         self._refreshed_ns[name] = self._clock.monotonic_ns()
+        self._news[name] = None
         if value.quality is Quality.GOOD and (value.t_ns != before.t_ns or value.raw != before.raw or not before.good):
             self.published += 1
             self.journal_dropped += len(self._journal) == JOURNAL
@@ -67,6 +71,7 @@ class TagTable:
             before = self._values.get(name, NEVER)
             if before.quality is not Quality.BAD or before.reason is not reason:
                 self._values[name] = replace(before, quality=Quality.BAD, reason=reason)
+                self._news[name] = None
 
     def current(self, name: str, now_ns: int) -> TagValue:
         """The value of a tag as of `now_ns`: bad with reason STALE when it was not refreshed in time.
@@ -78,6 +83,19 @@ class TagTable:
         if limit is None or value.quality is Quality.BAD or now_ns - self._refreshed_ns.get(name, 0) <= limit:
             return value
         return replace(value, quality=Quality.BAD, reason=Reason.STALE)
+
+    def fresh_until_ns(self, name: str) -> int:
+        """From when on `current` says STALE unless the tag is refreshed; beyond all time where it never does."""
+        limit = self._stale_ns.get(name)
+        return FOREVER_NS if limit is None else self._refreshed_ns.get(name, 0) + limit
+
+    def take_news(self) -> list[str]:
+        """The tags that were put since the last call, for the one who mirrors the table."""
+        if not self._news:
+            return []
+        news = list(self._news)
+        self._news.clear()
+        return news
 
     def journal_since(self, number: int) -> list[Published]:
         """What was published as good after entry `number`, as far as it is still kept."""

@@ -114,7 +114,7 @@ def image_for(
     outputs: dict[str, TagSpec] = {}
     writers: dict[str, str] = {}
     own = {
-        tag: TagSpec(tag, v.kind, v.unit)
+        tag: TagSpec(tag, v.kind, v.unit, limits=v.limits)
         for bound in programs
         for v, tag in bound.published()
         if tag not in plant and v.kind is not TagKind.MESSAGE
@@ -135,12 +135,16 @@ def image_for(
             if variable.name in bound.outputs:
                 outputs[tag] = _plant_tag(bound, variable, tag, plant)
             else:
-                outputs[tag] = TagSpec(tag, variable.kind, variable.unit, variable.max_bytes, variable.depth)
+                outputs[tag] = _own_spec(tag, variable)
     for tag in watched:
         if tag in own:
             continue
         inputs.setdefault(tag, plant[tag])
     return process_image(list(inputs.values()), list(outputs.values()))
+
+
+def _own_spec(tag: str, v: Variable) -> TagSpec:
+    return TagSpec(tag, v.kind, v.unit, v.max_bytes, v.depth, v.limits)
 
 
 def _check_names(bound: BoundProgram) -> None:

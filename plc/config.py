@@ -53,7 +53,7 @@ class PlcConfig:
     with `cycle_ms`. A scan of more than `stuck_ms` is ended by force (0: never). After that, or a stop by the watchdog, the
     programs begin again `restart_after_ms` later, at most `max_restarts` times in a row. `retain_path`: where retained
     variables are kept, ``""`` nowhere; with `cold` they begin with their initial values. `outputs_first`: outputs are
-    published at the cycle's start.
+    published at the cycle's start. `audit_path`: where it is written down what people do to it, ``""`` nowhere.
     """
 
     image_path: str
@@ -73,6 +73,7 @@ class PlcConfig:
     retain_path: str = ""
     cold: bool = False
     outputs_first: bool = False
+    audit_path: str = ""
 
     def image_layout(self) -> ImageLayout:
         return ImageLayout.from_description(self.layout)

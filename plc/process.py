@@ -4,11 +4,14 @@ Control verbs (gateway.core.control, on the configured Unix socket):
 
     ready     {"ready": true, "state": ...}: the image is attached and the tasks were started
     get       everything a display shows: state, error, statistics, inputs with quality and age, outputs, variables, forces
+    image     {"tags": ["ctd.*"]} (all, without): of each value, quality, time, age, unit, limits, force, what programs see
     force     {"tag": ..., "value": ..., "by": ...}: until `unforce` {"tag": ...}, or all with {"all": true}
     pause     execute nothing more, outputs stay; `go` goes on; `step` {"count": n} executes n scans while paused
     why       {"tag": ...}: which program last changed it, when, and what it saw
     restart   make the programs anew: {"cold": true} without what is retained
     stop      outputs safe, then the process ends
+
+What people do (force to restart) goes on record before it is done; each of these verbs takes "by".
 
 SIGTERM and SIGINT do what stop does. The process ends within a second, with its outputs region flagged stopped. A task
 that stopped by itself for good (a program that raised, an input that tripped, restarts used up) leaves the process up,
@@ -27,9 +30,11 @@ from typing import Any
 from gateway.core.control import ControlServer
 from gateway.core.errors import FileInvalid, Unreachable, UsageError
 from gateway.core.image import Image
+from plc.acts import Acts
 from plc.config import PlcConfig
-from plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task
+from plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
 from plc.runner import Runner
+from plc.tag_view import TagView
 from plc.task import StopReason
 
 MAX_STEPS = 10_000
@@ -42,11 +47,14 @@ class PlcProcess:
         self._config = config
         self._alarm = StuckAlarm(config.stuck_ms) if config.stuck_ms and hasattr(signal, "setitimer") else None
         self._runner = Runner(config, image, monotonic_ns, self._alarm)
+        self._view = TagView(image, self._runner)
+        self._acts = Acts(config.audit_path)
         self._loop = asyncio.new_event_loop()
         self._server = ControlServer(
             {
                 "ready": self._ready,
                 "get": self._get,
+                "image": self._tags,
                 "stop": self._stop,
                 "force": self._force,
                 "unforce": self._unforce,
@@ -71,6 +79,7 @@ class PlcProcess:
             self._loop.run_until_complete(self._close())
             self._loop.close()
             self._runner.close()
+            self._acts.close()
             if self._alarm is not None:
                 self._alarm.close()
             for number, handler in before.items():
@@ -111,30 +120,45 @@ class PlcProcess:
             "gateway_alive": runner.gateway_alive,
             "counters": runner.counters(),
             "realtime": self._realtime.describe(),
+            "acts": dict(self._acts.counts),
             "programs": {p.name: type(p.program).__name__ for p in runner.programs},
             "inputs": {tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
             "outputs": outputs,
             "variables": {f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
         }
 
+    async def _tags(self, args: dict[str, Any]) -> dict[str, Any]:
+        patterns = args.get("tags", [])
+        if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
+            raise UsageError("which tags", expected='a list such as ["ctd.*"]', got=repr(patterns))
+        return {"tags": self._view.describe(patterns, monotonic_ns(), utc_ns())}
+
+    def _note(self, action: str, args: dict[str, Any], **details: Any) -> None:
+        self._acts.note(action, _by(args), utc_ns(), **details)
+
     async def _force(self, args: dict[str, Any]) -> dict[str, Any]:
-        self._runner.force(_text(args, "tag"), args.get("value", ""), str(args.get("by", "")))
+        tag, value, by = _text(args, "tag"), args.get("value", ""), _by(args)
+        self._runner.force(tag, value, by, record=lambda old, new: self._note("force", args, tag=tag, old=old, new=new))
         return {"forces": self._runner.forces.describe(monotonic_ns())}
 
     async def _unforce(self, args: dict[str, Any]) -> dict[str, Any]:
         forces = self._runner.forces
-        if args.get("all") is True:
-            return {"removed": forces.clear()}
-        tag = _text(args, "tag")
-        if not forces.unforce(tag):
-            raise UsageError(f"{tag} is not forced", expected=", ".join(forces.describe(0)) or "a force; there is none")
-        return {"removed": 1, "forces": forces.describe(monotonic_ns())}
+        there = forces.describe(monotonic_ns())
+        tags = list(there) if args.get("all") is True else [_text(args, "tag")]
+        for tag in tags:
+            if tag not in there:
+                raise UsageError(f"{tag} is not forced", expected=", ".join(there) or "a force; there is none")
+            self._note("unforce", args, tag=tag, old=there[tag]["value"], new=None)
+            forces.unforce(tag)
+        return {"removed": len(tags), "forces": forces.describe(monotonic_ns())}
 
     async def _pause(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._note("pause", args)
         self._runner.pause(True)
         return {"paused": True}
 
     async def _go(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._note("go", args)
         self._runner.pause(False)
         return {"paused": False}
 
@@ -142,6 +166,8 @@ class PlcProcess:
         count = args.get("count", 1)
         if type(count) is not int or not 1 <= count <= MAX_STEPS:
             raise UsageError("how many scans", expected=f"1 to {MAX_STEPS}", got=repr(count))
+        self._runner.check_step()
+        self._note("step", args, count=count)
         self._runner.step(count)
         return {"steps": count}
 
@@ -149,8 +175,14 @@ class PlcProcess:
         return {"changes": self._runner.why(_text(args, "tag"))}
 
     async def _restart(self, args: dict[str, Any]) -> dict[str, Any]:
-        self._runner.restart(cold=args.get("cold") is True)
+        cold = args.get("cold") is True
+        self._note("restart", args, cold=cold)
+        self._runner.restart(cold=cold)
         return {"start": self._runner.retained.start}
+
+
+def _by(args: dict[str, Any]) -> str:
+    return str(args.get("by", ""))[:64]
 
 
 def _text(args: dict[str, Any], name: str) -> str:

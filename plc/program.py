@@ -71,7 +71,7 @@ class Role(Enum):
 @dataclass(frozen=True, slots=True)
 class Variable:
     """A declared variable. `initial` is what it is before the first scan; `max_bytes` and `depth` are a message output's;
-    `retain`: its value outlives the process."""
+    `retain`: its value outlives the process; `limits`: shown to watchers, and what a force has to keep to."""
 
     name: str
     role: Role
@@ -81,6 +81,7 @@ class Variable:
     max_bytes: int = 0
     depth: int = 0
     retain: bool = False
+    limits: tuple[float, float] | None = None
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:
@@ -88,19 +89,22 @@ def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:
     return Variable("", Role.INPUT, kind, initial)
 
 
-def var_output(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> Any:
-    """Declare an output. While it is None nothing is written to the plant."""
-    return Variable("", Role.OUTPUT, kind, initial, unit)
+Limits = tuple[float, float] | None
 
 
-def var_local(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> Any:
+def var_output(kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None) -> Any:
+    """Declare an output. While it is None nothing is written to the plant. Bound to a tag it has that one's unit and limits."""
+    return Variable("", Role.OUTPUT, kind, initial, unit, limits=limits)
+
+
+def var_local(kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None) -> Any:
     """Declare a local variable that watchers see as ``<program>.<name>``."""
-    return Variable("", Role.LOCAL, kind, initial, unit)
+    return Variable("", Role.LOCAL, kind, initial, unit, limits=limits)
 
 
-def var_retain(kind: TagKind, initial: Scalar | None = None, unit: str = "") -> Any:
+def var_retain(kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None) -> Any:
     """Declare a local variable (VAR RETAIN) that a warm start finds as the last scan before left it."""
-    return Variable("", Role.LOCAL, kind, initial, unit, retain=True)
+    return Variable("", Role.LOCAL, kind, initial, unit, retain=True, limits=limits)
 
 
 def message_input() -> Any:

@@ -93,6 +93,8 @@ class OutputImage:
         self.outboxes: list[tuple[Output, Outbox]] = []
         self.consumed: list[str] = []
         self.changes: dict[str, deque[Change]] = {}
+        self.on_change: Callable[[Change], None] | None = None
+        """Told of each change. It may not raise."""
         self._readers: dict[str, RegionReader] = {}
         self._bind(programs, image.reader(INPUTS).shape)
         layout = self.writer.shape.layout
@@ -178,9 +180,10 @@ class OutputImage:
                     value = None
                 if value != before:
                     kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
-                    kept.append(
-                        Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None)
-                    )
+                    change = Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None)
+                    kept.append(change)
+                    if self.on_change is not None:
+                        self.on_change(change)
                 values[output.index] = value
 
     def publish(self, now_ns: int) -> None:

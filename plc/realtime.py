@@ -67,6 +67,11 @@ def monotonic_ns() -> int:
     return time.monotonic_ns()
 
 
+def utc_ns() -> int:
+    """The host's UTC in ns since 1970, for records and displays; nothing is timed by it."""
+    return time.time_ns()
+
+
 def sleep_until_ns(deadline_ns: int) -> None:
     """Return at `deadline_ns` of `monotonic_ns` or after it; earlier only when a signal came in."""
     if _libc is None:

@@ -17,13 +17,13 @@ from typing import Any
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
-from gateway.core.image import INPUTS, Image
+from gateway.core.image import INPUTS, Image, TagSpec
 from gateway.core.values import Scalar, TagValue
 from plc.binding import BoundProgram
 from plc.config import PlcConfig, TaskSpec
 from plc.forces import Forces, checked
 from plc.program import Program
-from plc.publishing import OutputImage
+from plc.publishing import Change, OutputImage
 from plc.retain import Retained
 from plc.scan import Scan
 from plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
@@ -53,7 +53,15 @@ class Runner:
     """All tasks over an attached image. Raises `FileInvalid` for a configuration that cannot run, `Unreachable` where what
     is retained cannot be kept."""
 
-    def __init__(self, config: PlcConfig, image: Image, now_ns: Callable[[], int], guard: Guard | None = None) -> None:
+    def __init__(
+        self,
+        config: PlcConfig,
+        image: Image,
+        now_ns: Callable[[], int],
+        guard: Guard | None = None,
+        on_change: Callable[[Change], None] | None = None,
+    ) -> None:
+        """`on_change` is told whenever a program changes an output or a local."""
         self.config = config
         self.forces = Forces()
         self.restarts = 0
@@ -61,6 +69,7 @@ class Runner:
         self.programs: list[BoundProgram] = []
         self.outputs: OutputImage
         self.retained: Retained
+        self._on_change = on_change
         self._image = image
         self._now_ns = now_ns
         self._guard = guard
@@ -90,6 +99,7 @@ class Runner:
         path = Path(config.retain_path) if config.retain_path else None
         self.retained = Retained(self.programs, path, cold=cold)
         self.outputs = OutputImage(self._image, self.programs, self.forces)
+        self.outputs.on_change = self._on_change
         specs = config.tasks or (TaskSpec("main", config.cycle_ms),)
         self._check(specs)
         self.entries = []
@@ -154,10 +164,7 @@ class Runner:
             if now_ns >= self._restart_ns:
                 self._restart_by_itself(self._stopped)
             return
-        due = [e for e in self.entries if e.task.deadline_ns <= now_ns]
-        if not due:
-            due = [min(self.entries, key=lambda e: e.task.deadline_ns)]
-        entry = min(due, key=lambda e: (e.spec.priority, e.task.deadline_ns))
+        entry = self.entries[0] if len(self.entries) == 1 else self._next(now_ns)
         entry.task.run_once()
         if entry.task.state is TaskState.STOPPED:
             self._on_stopped(entry)
@@ -173,6 +180,13 @@ class Runner:
             entry.task.error = e
             entry.task.stop()
             self._on_stopped(entry)
+
+    def _next(self, now_ns: int) -> Entry:
+        """Of the tasks that are due the one of the highest priority; where none is, the one that will be first."""
+        due = [e for e in self.entries if e.task.deadline_ns <= now_ns]
+        if not due:
+            return min(self.entries, key=lambda e: e.task.deadline_ns)
+        return min(due, key=lambda e: (e.spec.priority, e.task.deadline_ns))
 
     def _look_at_triggers(self, scan: Scan) -> None:
         for entry in self.entries:
@@ -248,24 +262,41 @@ class Runner:
         for entry in self.entries:
             entry.task.paused, entry.task.steps = on, 0
 
-    def step(self, count: int) -> None:
-        """While paused, execute `count` scans of each cyclic task. Raises `UsageError` while it is not paused."""
+    def check_step(self) -> None:
+        """Raises `UsageError` while it is not paused."""
         if not self.paused:
             raise UsageError("a PLC is stepped while it is paused", hint="pause it first")
+
+    def step(self, count: int) -> None:
+        """While paused, execute `count` scans of each cyclic task. Raises `UsageError` while it is not paused."""
+        self.check_step()
         for entry in self.entries:
             entry.task.steps += 0 if entry.single else count
 
-    def force(self, tag: str, value: Scalar, by: str = "") -> None:
-        """Raises `UsageError` for an unknown tag or a value that it cannot hold."""
+    def force(
+        self, tag: str, value: Scalar, by: str = "", record: Callable[[Scalar | None, Scalar], None] | None = None
+    ) -> None:
+        """Raises `UsageError` for an unknown tag, a value that it cannot hold, or one outside an output's limits.
+
+        Inputs may be forced beyond theirs: logic is to be seen with what a broken sensor says. `record` is told the old and
+        the new value before anything changes.
+        """
         # A tag of both regions is an output that is read back: the command is what is forced.
         for region in sorted(self._image.layout.regions, key=lambda r: r.name == INPUTS):
             for spec in region.tags:
                 if spec.name == tag:
+                    if region.name != INPUTS:
+                        _inside(spec, value)
                     for program, name in self._variables_of(tag, region.name == INPUTS):
                         program.check(name, checked(spec, value))
+                    if record is not None:
+                        record(self._is_now(tag, region.name == INPUTS), value)
                     self.forces.force(spec, value, region.name == INPUTS, self._now_ns(), by)
                     return
         raise UsageError(f"no tag {tag!r} in the process image", expected="one that status shows")
+
+    def _is_now(self, tag: str, inputs: bool) -> Scalar | None:
+        return self.entries[0].scan.inputs()[tag].value if inputs else self.outputs.last()[tag]
 
     def _variables_of(self, tag: str, inputs: bool) -> list[tuple[Program, str]]:
         """Which variables of programs a tag stands for."""
@@ -282,6 +313,14 @@ class Runner:
 
     def inputs(self) -> dict[str, TagValue]:
         return self.entries[0].scan.inputs()
+
+    def seen_otherwise(self) -> dict[str, dict[str, TagValue]]:
+        """Of all tasks: `Scan.seen_otherwise`."""
+        found: dict[str, dict[str, TagValue]] = {}
+        for entry in self.entries:
+            for tag, by_variable in entry.scan.seen_otherwise().items():
+                found.setdefault(tag, {}).update(by_variable)
+        return found
 
     @property
     def gateway_alive(self) -> bool:
@@ -309,6 +348,16 @@ class Runner:
                 for e in self.entries
             },
         }
+
+
+def _inside(spec: TagSpec, value: Scalar) -> None:
+    if spec.limits is not None and not spec.limits[0] <= checked(spec, value) <= spec.limits[1]:  # type: ignore[operator]
+        low, high = spec.limits
+        raise UsageError(
+            f"{spec.name} cannot be forced to that",
+            expected=f"{low:g} to {high:g} {spec.unit}".strip(),
+            got=repr(value),
+        )
 
 
 def _interface(bound: BoundProgram) -> list[tuple[str, str, str, int, int]]:

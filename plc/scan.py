@@ -231,6 +231,16 @@ class Scan:
         """Every tag of INPUTS as the last scan found it, before substitution and forces: all BAD while the gateway is dead."""
         return {name: self._seen_at(i) for name, i in self._reader.shape.index.items()}
 
+    def seen_otherwise(self) -> dict[str, dict[str, TagValue]]:
+        """Inputs that are bad and that an input's policy stands in for: by tag, ``program.variable`` and what it sees."""
+        found: dict[str, dict[str, TagValue]] = {}
+        for item in self._plain:
+            there = self._looked_up(item)
+            seen = item.apply(there)
+            if seen is not there:
+                found.setdefault(item.tag, {})[f"{item.owner}.{item.name}"] = seen
+        return found
+
     def outputs(self) -> dict[str, Scalar | None]:
         """Every tag of OUTPUTS as last published by a scan that succeeded; a message tag's last sequence."""
         return self.output_image.last()

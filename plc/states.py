@@ -23,8 +23,9 @@ from types import CodeType
 from typing import Any, ClassVar
 
 from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import Bug
+from gateway.core.errors import Bug, UsageError
 from gateway.core.image import TagKind
+from gateway.core.values import Scalar
 from plc.program import Program, ScanInfo, var_local
 
 ANY = "*"
@@ -130,6 +131,11 @@ class StateMachine(Program):
     @property
     def state_name(self) -> str:
         return self.table.states[self.state]
+
+    def check(self, name: str, value: Scalar) -> None:
+        if name == "state" and value not in range(len(self.table.states)):
+            named = ", ".join(f"{code} ({state})" for code, state in enumerate(self.table.states))
+            raise UsageError("no such state", expected=named, got=repr(value))
 
     def execute(self, scan: ScanInfo) -> None:
         if self.since_ns is None:

@@ -61,7 +61,7 @@ def plant_tags(system: System) -> dict[str, TagSpec]:
         profile = device.profile
         for tag in profile.tags.values():
             if not tag.is_text:
-                add(TagSpec(f"{device.name}.{tag.name}", _kind(tag), tag.unit))
+                add(TagSpec(f"{device.name}.{tag.name}", _kind(tag), tag.unit, limits=tag.limits))
         for message in profile.messages.values():
             add(message_tag(f"{device.name}.{message.name}", 2 * message.at.count, MESSAGE_DEPTH))
         if profile.inbox is not None and profile.outbox is not None:
@@ -148,6 +148,7 @@ def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfi
         image_path=str(run_dir / "image"),
         layout=image_layout(system).describe(),
         control_path=str(run_dir / "plc.sock"),
+        audit_path=str(run_dir / "audit.jsonl"),
         programs=programs_of(system),
         cycle_ms=float(fastest_ms(system)),
         late_ms=float(watchdog.late_ms),

@@ -95,7 +95,8 @@ def main() -> None:
         if os.environ.get("FIELDTWIN_TRACEBACK"):
             raise
         click.echo(f"fieldtwin: {e}", err=True)
-        sys.exit(getattr(e, "child_exit_code", e.exit_code) or e.exit_code)
+        theirs = getattr(e, "child_exit_code", 0) or getattr(e, "remote_exit_code", 0)
+        sys.exit(theirs or e.exit_code)
     except Exception as e:  # the last border: our bug, reported as such
         if os.environ.get("FIELDTWIN_TRACEBACK"):
             raise

@@ -51,10 +51,24 @@ def _status(instance: str) -> dict[str, Any]:
     return found
 
 
+def _tags(instance: str, patterns: tuple[str, ...]) -> list[dict[str, Any]]:
+    from fieldtwin.cli.plc_views import ask_tags
+    from fieldtwin.running.plc_client import talk_to
+
+    return talk_to(instance, lambda client: ask_tags(client, patterns))
+
+
 def _call(instance: str, verb: str, **args: Any) -> Any:
     from fieldtwin.running.plc_client import talk_to
 
     return talk_to(instance, lambda client: client.call(verb, **args))
+
+
+def _act(instance: str, verb: str, **args: Any) -> Any:
+    """A verb that changes something: on record with the user's name."""
+    import getpass
+
+    return _call(instance, verb, by=getpass.getuser(), **args)
 
 
 @command.command("status")
@@ -62,11 +76,11 @@ def _call(instance: str, verb: str, **args: Any) -> Any:
 @json_option
 def status(instance: str, as_json: bool) -> int:
     """State, cycle statistics of each task, forces, retained variables, counters."""
-    from fieldtwin.cli.plc_views import print_status
+    from fieldtwin.cli.plc_views import print_status, tags_as_data
 
     found = _status(instance)
     if as_json:
-        return _emit(found)
+        return _emit({**found, "tags": tags_as_data(_tags(instance, ()))})
     print_status(found)
     return 0
 
@@ -80,13 +94,13 @@ def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> in
     """Live values of TAGS (all, if none is named; a trailing * stands for any rest): quality, age, forces. Ctrl-C ends it."""
     import asyncio
 
-    from fieldtwin.cli.plc_views import print_tags, tag_rows, watch_live
+    from fieldtwin.cli.plc_views import print_tags, tags_as_data, watch_live
     from fieldtwin.running.plc_client import choose
 
     if once or as_json or not sys.stdout.isatty():
-        rows = tag_rows(_status(instance), tags)
+        rows = _tags(instance, tags)
         if as_json:
-            return _emit({row.tag: row.describe() for row in rows})
+            return _emit(tags_as_data(rows))
         print_tags(rows)
         return 0
     asyncio.run(watch_live(choose(instance), tags))
@@ -100,15 +114,13 @@ def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> in
 @instance_option
 def force(tag: str, value: str, yes: bool, instance: str) -> int:
     """Put VALUE (true, false, a number) in the place of TAG until it is unforced: an input, an output or a local."""
-    import getpass
-
+    from fieldtwin.cli.plc_views import is_now
     from fieldtwin.running.plc_client import parse_value
 
     wanted = parse_value(value)
-    now = _status(instance)
-    is_now = now["outputs"].get(tag, now["inputs"].get(tag, {}).get("value") if tag in now["inputs"] else "(unknown)")
-    _sure(f"force {tag}: {is_now} now, {wanted} from then on", yes)
-    _call(instance, "force", tag=tag, value=wanted, by=getpass.getuser())
+    now = is_now([row for row in _tags(instance, (tag,)) if row["tag"] == tag], tag)
+    _sure(f"force {tag}: {now} now, {wanted} from then on", yes)
+    _act(instance, "force", tag=tag, value=wanted)
     talk.print(f"{tag} is forced to {wanted}", markup=False)
     return 0
 
@@ -121,7 +133,7 @@ def unforce(tag: str | None, every: bool, instance: str) -> int:
     """Take the force of TAG away. The safe direction: it does not ask."""
     if bool(tag) == every:
         raise UsageError("what is to be unforced", expected="a TAG, or --all")
-    done = _call(instance, "unforce", all=True) if every else _call(instance, "unforce", tag=tag)
+    done = _act(instance, "unforce", all=True) if every else _act(instance, "unforce", tag=tag)
     talk.print(f"{done['removed']} taken away", markup=False)
     return 0
 
@@ -132,7 +144,7 @@ def unforce(tag: str | None, every: bool, instance: str) -> int:
 def pause(yes: bool, instance: str) -> int:
     """Execute nothing more; outputs stay as they are, and the plant keeps them."""
     _sure("pause the PLC: its outputs stay as they are, whatever the plant does", yes)
-    _call(instance, "pause")
+    _act(instance, "pause")
     talk.print("paused; fieldtwin plc step, fieldtwin plc go")
     return 0
 
@@ -141,7 +153,7 @@ def pause(yes: bool, instance: str) -> int:
 @instance_option
 def go(instance: str) -> int:
     """Go on after a pause."""
-    _call(instance, "go")
+    _act(instance, "go")
     talk.print("running")
     return 0
 
@@ -151,8 +163,8 @@ def go(instance: str) -> int:
 @instance_option
 def step(count: int, instance: str) -> int:
     """While paused, execute COUNT scans (1)."""
-    _call(instance, "step", count=count)
-    talk.print(f"{count} scans")
+    _act(instance, "step", count=count)
+    talk.print(f"{count} scan{'s' if count > 1 else ''}")
     return 0
 
 
@@ -163,7 +175,7 @@ def step(count: int, instance: str) -> int:
 def restart(cold: bool, yes: bool, instance: str) -> int:
     """Make the programs anew: first scan, initial values, and (unless --cold) what is retained."""
     _sure(f"restart the PLC {'cold' if cold else 'warm'}: its outputs are made safe in between", yes)
-    talk.print(_call(instance, "restart", cold=cold)["start"], markup=False)
+    talk.print(_act(instance, "restart", cold=cold)["start"], markup=False)
     return 0
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from fieldtwin.cli.talk import data, talk
 from gateway.core.control import ControlClient
@@ -17,60 +17,75 @@ from gateway.core.errors import UsageError
 from plc.prove import Proof, Result
 
 REFRESH_S = 0.25
+_WHOLE_TYPES = {
+    span
+    for bits in (8, 16, 32, 64)
+    for span in ((0, 2**bits - 1), (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1), (0, 2.0**bits))
+}
+
+Row = dict[str, Any]
+"""One tag as the PLC's `image` verb describes it."""
 
 
-@dataclass(frozen=True, slots=True)
-class TagRow:
-    """One tag as it is shown. `age_ms` None where a tag has none (outputs)."""
-
-    tag: str
-    value: Any
-    quality: str
-    age_ms: float | None
-    side: str
-    forced: bool
-
-    def describe(self) -> dict[str, Any]:
-        return {
-            "value": self.value,
-            "quality": self.quality,
-            "age_ms": self.age_ms,
-            "side": self.side,
-            "forced": self.forced,
-        }
-
-
-def tag_rows(status: dict[str, Any], patterns: tuple[str, ...]) -> list[TagRow]:
+async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row]:
     """The tags that match, outputs after inputs. Raises `UsageError` for a pattern that nothing matches."""
-    forced = status["forces"]
-    rows = []
-    for tag, seen in status["inputs"].items():
-        quality = f"{seen['quality']}{': ' + seen['reason'] if seen.get('reason') not in (None, '', 'none') else ''}"
-        value = forced[tag]["value"] if tag in forced and tag not in status["outputs"] else seen.get("value")
-        rows.append(
-            TagRow(tag, value, quality, seen.get("age_ms"), "input", tag in forced and tag not in status["outputs"])
-        )
-    rows += [TagRow(tag, value, "", None, "output", tag in forced) for tag, value in status["outputs"].items()]
-    if not patterns:
-        return rows
+    rows: list[Row] = (await client.call("image", tags=list(patterns)))["tags"]
     for pattern in patterns:
-        if not any(fnmatchcase(row.tag, pattern) for row in rows):
-            raise UsageError(f"no tag {pattern!r}", expected=", ".join(r.tag for r in rows[:12]))
-    return [row for row in rows if any(fnmatchcase(row.tag, p) for p in patterns)]
+        if not any(fnmatchcase(row["tag"], pattern) for row in rows):
+            known = [row["tag"] for row in (await client.call("image"))["tags"]]
+            raise UsageError(f"no tag {pattern!r}", expected=", ".join(known[:12]) + (", ..." if known[12:] else ""))
+    return rows
 
 
-def tag_table(rows: list[TagRow]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for name, justify in (("tag", "left"), ("value", "right"), ("quality", "left"), ("age", "right"), ("", "left")):
-        table.add_column(name, justify=justify, no_wrap=name != "quality")  # type: ignore[arg-type]
+def tags_as_data(rows: list[Row]) -> dict[str, Row]:
+    """For JSON: by tag. One that is read back stands in both regions: what is commanded, with what was read as `input`."""
+    found: dict[str, Row] = {}
     for row in rows:
-        style = "yellow" if row.forced else "red" if row.quality.startswith("bad") else ""
-        age = "" if row.age_ms is None else _age(row.age_ms)
-        table.add_row(row.tag, _value(row.value), row.quality, age, "FORCED" if row.forced else row.side, style=style)
+        before = found.get(row["tag"])
+        found[row["tag"]] = row if before is None else {**row, "input": before}
+    return found
+
+
+def tag_table(rows: list[Row]) -> Table:
+    table = Table(box=None, pad_edge=False)
+    names = ["tag", "value", "unit", "limits", "quality", "age", ""]
+    if not any(_limits(row["limits"]) for row in rows):
+        names.remove("limits")
+    for name in names:
+        justify: Any = "right" if name in ("value", "age") else "left"
+        table.add_column(name, justify=justify, no_wrap=name not in ("quality", "limits"))
+    for row in rows:
+        forced = row["forced"]
+        style = "yellow" if forced else "red" if row["quality"] == "bad" else ""
+        cells = {
+            "tag": row["tag"],
+            "value": _value(row["value"]),
+            "unit": row["unit"],
+            "limits": _limits(row["limits"]),
+            "quality": _quality(row),
+            "age": "-" if row["age_s"] is None else _age(row["age_s"] * 1000),
+            "": f"FORCED {row['side']}" if forced else row["side"],
+        }
+        table.add_row(*(Text(cells[name]) for name in names), style=style)
     return table
 
 
-def print_tags(rows: list[TagRow]) -> None:
+def _limits(limits: list[float] | None) -> str:
+    """Nothing for those that only say how many bits an integer has."""
+    if limits is None or tuple(limits) in _WHOLE_TYPES:
+        return ""
+    return f"{limits[0]:.6g}..{limits[1]:.6g}"
+
+
+def _quality(row: Row) -> str:
+    """With its reason, and what programs see in place of it."""
+    text = str(row["quality"]) + ("" if row["reason"] == "none" else f": {row['reason']}")
+    for variable, seen in row["seen"].items():
+        text += f"; {variable} sees {_value(seen['value'])} ({seen['quality']})"
+    return text
+
+
+def print_tags(rows: list[Row]) -> None:
     data.print(tag_table(rows))
 
 
@@ -79,7 +94,7 @@ async def watch_live(path: Path, patterns: tuple[str, ...]) -> None:
     try:
         with Live(console=data, auto_refresh=False, transient=True) as live:
             while True:
-                live.update(tag_table(tag_rows(await client.call("get"), patterns)), refresh=True)
+                live.update(tag_table(await ask_tags(client, patterns)), refresh=True)
                 await asyncio.sleep(REFRESH_S)
     finally:
         await client.aclose()
@@ -96,7 +111,19 @@ def print_status(status: dict[str, Any]) -> None:
         data.print(f"  {status['error']}", markup=False, soft_wrap=True)
     data.print(f"gateway: {'alive' if status['gateway_alive'] else 'DEAD: every input is bad'}", markup=False)
     table = Table(box=None, pad_edge=False)
-    for name in ("task", "every", "scans", "missed", "overrun", "late p50", "p99", "max", "takes p50", "p99", "max"):
+    for name in (
+        "task",
+        "every",
+        "scans",
+        "missed",
+        "overrun",
+        "late\np50",
+        "\np99",
+        "\nmax",
+        "takes\np50",
+        "\np99",
+        "\nmax",
+    ):
         table.add_column(name, justify="left" if name == "task" else "right", no_wrap=True)
     for name, task in status["tasks"].items():
         late, took = task["lateness_us"], task["duration_us"]
@@ -114,6 +141,8 @@ def print_status(status: dict[str, Any]) -> None:
     counters = {name: count for name, count in status["counters"].items() if count}
     if counters:
         data.print("counted: " + ", ".join(f"{n} {c}" for n, c in counters.items()), markup=False)
+    if status["acts"]:
+        data.print("done to it: " + acts_text(status["acts"]), markup=False)
     if status["forces"]:
         data.print(f"FORCED: {len(status['forces'])}", style="yellow")
         for tag, force in status["forces"].items():
@@ -121,6 +150,20 @@ def print_status(status: dict[str, Any]) -> None:
             data.print(f"  {tag} = {force['value']}{by}, {_age(force['age_ms'])} ago", style="yellow", markup=False)
     else:
         data.print("nothing is forced")
+
+
+def is_now(rows: list[Row], tag: str) -> str:
+    """What a tag is before it is forced, with unit and limits; the command where it is read back, too."""
+    if not rows:
+        raise UsageError(f"no tag {tag!r}", expected="a tag without *")
+    row = rows[-1]
+    limits = f" ({_limits(row['limits'])})" if _limits(row["limits"]) else ""
+    return f"{row['side']} {_value(row['value'])} {row['unit']}".strip() + f"{limits}, {_quality(row)},"
+
+
+def acts_text(acts: dict[str, int]) -> str:
+    """What people did to a PLC, and how often: ``2 x force, 1 x pause``."""
+    return ", ".join(f"{count} x {what}" for what, count in acts.items())
 
 
 def print_why(tag: str, changes: list[dict[str, Any]]) -> None:

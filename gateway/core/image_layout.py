@@ -47,7 +47,8 @@ class TagKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TagSpec:
-    """One tag: its name (``device.tag`` or ``program.variable``), kind and unit.
+    """One tag: its name (``device.tag`` or ``program.variable``), kind, unit, and the smallest and largest value that it
+    is meant to have (None: whatever its kind holds).
 
     A MESSAGE has payloads of at most `max_bytes` and keeps the last `depth` of them. Raises `FileInvalid` for a size
     that makes no sense.
@@ -58,10 +59,13 @@ class TagSpec:
     unit: str = ""
     max_bytes: int = 0
     depth: int = 0
+    limits: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.name:
             raise FileInvalid("a tag without a name", expected="device.tag or program.variable")
+        if self.limits is not None and not self.limits[0] <= self.limits[1]:
+            raise FileInvalid(f"limits of tag {self.name}", expected="low, high", got=str(self.limits))
         if self.kind is TagKind.MESSAGE:
             if not (1 <= self.max_bytes <= MAX_MESSAGE_BYTES and 1 <= self.depth <= MAX_DEPTH):
                 raise FileInvalid(
@@ -77,6 +81,8 @@ class TagSpec:
         text: dict[str, Any] = {"name": self.name, "kind": self.kind.value, "unit": self.unit}
         if self.kind is TagKind.MESSAGE:
             text |= {"max_bytes": self.max_bytes, "depth": self.depth}
+        if self.limits is not None:
+            text["limits"] = list(self.limits)
         return text
 
     @classmethod
@@ -89,9 +95,14 @@ class TagSpec:
                 str(text.get("unit", "")),
                 int(text.get("max_bytes", 0)),
                 int(text.get("depth", 0)),
+                None if text.get("limits") is None else _pair(*text["limits"]),
             )
         except (KeyError, ValueError, TypeError, AttributeError) as e:
             raise FileInvalid("not the description of a tag", expected="name, kind, unit", got=str(text)) from e
+
+
+def _pair(low: float, high: float) -> tuple[float, float]:
+    return float(low), float(high)
 
 
 def message_tag(name: str, max_bytes: int, depth: int) -> TagSpec:

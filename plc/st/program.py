@@ -167,7 +167,8 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
             body[v.name] = message_output(v.kind.max_bytes, v.kind.depth)
         elif kind is not None:
             unit_of = "ns" if ty.is_kind(v.kind, "duration") else ""
-            body[v.name] = Variable(v.name, _ROLES[v.role], kind, unit=unit_of, retain=v.retain)
+            limits = (float(v.kind.low), float(v.kind.high)) if isinstance(v.kind, ty.Subrange) else None
+            body[v.name] = Variable(v.name, _ROLES[v.role], kind, unit=unit_of, retain=v.retain, limits=limits)
     return type(found.name, (StProgram,), body)
 
 

@@ -1,0 +1,54 @@
+"""What people do to a PLC (force, unforce, pause, go, step, restart), on record: one JSON line each in the audit log.
+
+The file and the form are those of the gateway's audit log, appended line by line: who, what, the old and the new value. An act
+that cannot be written down is not done. It must never know what an act means.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+from gateway.core.errors import Unreachable
+
+
+class Acts:
+    """Appends to the file at `path`, made if need be, which only its owner may read; nowhere with ``""``."""
+
+    def __init__(self, path: str) -> None:
+        self.counts: dict[str, int] = {}
+        """How often each was done since the process began."""
+        self._path = path
+        self._descriptor = -1
+        if path:
+            try:
+                self._descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            except OSError as e:
+                raise self._failed("open", e) from e
+
+    def note(self, action: str, by: str, utc_ns: int, **details: Any) -> None:
+        """One entry. Raises `Unreachable`, and the act must not be done, where it cannot be written."""
+        self.counts[action] = self.counts.get(action, 0) + 1
+        if self._descriptor < 0:
+            return
+        entry = {
+            "utc_ns": utc_ns,
+            "action": action,
+            "device": "plc",
+            "by": by or "unknown",
+            "result": "asked",
+            **details,
+        }
+        try:  # in one write, since the gateway appends to the same file
+            os.write(self._descriptor, json.dumps(entry, separators=(",", ":"), default=str).encode() + b"\n")
+        except OSError as e:
+            raise self._failed("write", e) from e
+
+    def close(self) -> None:
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _failed(self, what: str, e: OSError) -> Unreachable:
+        return Unreachable(f"cannot {what} the audit log: {e.strerror or e}", where=self._path)

@@ -41,6 +41,14 @@ class Deadlock(Bug):
     """Nothing is ready and no timer is set, or callbacks call each other for ever at one instant."""
 
 
+def _way_out(name: str) -> Callable[..., NoReturn]:
+    def refuse(self: VirtualLoop, *args: Any, **kwargs: Any) -> NoReturn:
+        raise escape(f"loop.{name}")
+
+    refuse.__name__ = name
+    return refuse
+
+
 class VirtualLoop(asyncio.AbstractEventLoop):
     """`now_ns` is its time. Not thread-safe, and it says so."""
 
@@ -115,6 +123,13 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._tasks += 1
         more.pop("eager_start", None)
         return asyncio.Task(coro, loop=self, name=str(name) if name else f"task {self._tasks}", **more)
+
+    def set_task_factory(self, factory: Any) -> None:
+        """Raises `Bug`: tasks are made in one way."""
+        raise Bug("a task factory on a virtual loop")
+
+    def get_task_factory(self) -> None:
+        return None
 
     def get_debug(self) -> bool:
         return False
@@ -240,6 +255,38 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     ) -> asyncio.Handle:
         raise escape("a call from another thread")
 
+    run_in_executor: Any = _way_out("run_in_executor")
+    set_default_executor: Any = _way_out("set_default_executor")
+    getaddrinfo: Any = _way_out("getaddrinfo")
+    getnameinfo: Any = _way_out("getnameinfo")
+    create_connection: Any = _way_out("create_connection")
+    create_server: Any = _way_out("create_server")
+    create_datagram_endpoint: Any = _way_out("create_datagram_endpoint")
+    create_unix_connection: Any = _way_out("create_unix_connection")
+    create_unix_server: Any = _way_out("create_unix_server")
+    connect_accepted_socket: Any = _way_out("connect_accepted_socket")
+    start_tls: Any = _way_out("start_tls")
+    sendfile: Any = _way_out("sendfile")
+    sock_sendfile: Any = _way_out("sock_sendfile")
+    sock_recv: Any = _way_out("sock_recv")
+    sock_recv_into: Any = _way_out("sock_recv_into")
+    sock_recvfrom: Any = _way_out("sock_recvfrom")
+    sock_recvfrom_into: Any = _way_out("sock_recvfrom_into")
+    sock_sendall: Any = _way_out("sock_sendall")
+    sock_sendto: Any = _way_out("sock_sendto")
+    sock_connect: Any = _way_out("sock_connect")
+    sock_accept: Any = _way_out("sock_accept")
+    connect_read_pipe: Any = _way_out("connect_read_pipe")
+    connect_write_pipe: Any = _way_out("connect_write_pipe")
+    subprocess_shell: Any = _way_out("subprocess_shell")
+    subprocess_exec: Any = _way_out("subprocess_exec")
+    add_reader: Any = _way_out("add_reader")
+    remove_reader: Any = _way_out("remove_reader")
+    add_writer: Any = _way_out("add_writer")
+    remove_writer: Any = _way_out("remove_writer")
+    add_signal_handler: Any = _way_out("add_signal_handler")
+    remove_signal_handler: Any = _way_out("remove_signal_handler")
+
 
 def _waits_at(task: asyncio.Task[Any]) -> str:
     """Where in the code a task waits: the innermost line of ours, with what it awaits there."""
@@ -283,21 +330,3 @@ def escape(what: str) -> Escape:
     return Escape(
         f"{what} under virtual time", where=culprit(), hint="time and wires come from the clock and the connector"
     )
-
-
-def _way_out(name: str) -> Callable[..., NoReturn]:
-    def refuse(self: VirtualLoop, *args: Any, **kwargs: Any) -> NoReturn:
-        raise escape(f"loop.{name}")
-
-    refuse.__name__ = name
-    return refuse
-
-
-_WAYS_OUT = """
-run_in_executor set_default_executor getaddrinfo getnameinfo create_connection create_server create_datagram_endpoint
-create_unix_connection create_unix_server connect_accepted_socket start_tls sendfile sock_sendfile sock_recv sock_recv_into
-sock_recvfrom sock_recvfrom_into sock_sendall sock_sendto sock_connect sock_accept connect_read_pipe connect_write_pipe
-subprocess_shell subprocess_exec add_reader remove_reader add_writer remove_writer add_signal_handler remove_signal_handler
-"""
-for _name in _WAYS_OUT.split():
-    setattr(VirtualLoop, _name, _way_out(_name))

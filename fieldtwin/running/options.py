@@ -26,3 +26,4 @@ class RunOptions:
     commands: tuple[int, ...] = ()
     capture: Path | None = None
     cold: bool = False
+    faults: Path | None = None

@@ -80,6 +80,11 @@ class RunSession:
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
 
+    @property
+    def disturbed(self) -> bool:
+        """Whether faults were put in."""
+        return self.options.faults is not None
+
     # -- starting -------------------------------------------------------------------------------------------------------
 
     async def __aenter__(self) -> RunSession:

@@ -54,16 +54,17 @@ class StateWatch:
         snapshot = self._reader.snapshot()
         if not snapshot.counter:
             return
-        self._first_ns = self._first_ns or now_ns
         for program in self._programs:
             name = f"{program}.state"
             if name not in snapshot.shape.index:
                 continue
             value = snapshot.value(name).value
             if isinstance(value, int) and 0 <= value < len(NAMES):
-                self._note(program, NAMES[value], now_ns)
+                self.note(program, NAMES[value], now_ns)
 
-    def _note(self, program: str, state: str, now_ns: int) -> None:
+    def note(self, program: str, state: str, now_ns: int) -> None:
+        """A program is in `state` now."""
+        self._first_ns = self._first_ns or now_ns
         if self.current.get(program) == state:
             return
         self.current[program] = state

@@ -40,10 +40,17 @@ class Nursery:
             self._raise_first()
         self._raise_first()
 
-    def _raise_first(self) -> None:
+    def failure(self) -> BaseException | None:
+        """What the first child that failed raised, in order of creation; None while none has."""
         for child in self._children:
             if child.done() and not child.cancelled() and (error := child.exception()) is not None:
-                raise error
+                return error
+        return None
+
+    def _raise_first(self) -> None:
+        error = self.failure()
+        if error is not None:
+            raise error
 
     async def __aenter__(self) -> Nursery:
         return self

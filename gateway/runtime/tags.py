@@ -6,6 +6,7 @@ A value that nobody refreshed for its device's `stale_after_ms` is bad when it i
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from gateway.core.clock import NS_PER_MS, Clock
@@ -37,6 +38,8 @@ class TagTable:
         self._stale_ns: dict[str, int] = {}
         self._news: dict[str, None] = {}
         self._journal: deque[Published] = deque(maxlen=JOURNAL)
+        self.on_put: Callable[[str, TagValue], None] | None = None
+        """Told of every value that is another sample, other bytes or of another quality than the last. It may not raise."""
         self.published = 0
         self.journal_dropped = 0
 
@@ -64,14 +67,20 @@ class TagTable:
             self.published += 1
             self.journal_dropped += len(self._journal) == JOURNAL
             self._journal.append(Published(self.published, name, value.raw, value.value, value.t_ns))
+            if self.on_put is not None:
+                self.on_put(name, value)
+        elif self.on_put is not None and value.quality is not before.quality:
+            self.on_put(name, value)
 
     def put_bad(self, names: list[str], reason: Reason) -> None:
         """The tags are bad from now on; their last value and its time stay readable."""
         for name in names:
             before = self._values.get(name, NEVER)
             if before.quality is not Quality.BAD or before.reason is not reason:
-                self._values[name] = replace(before, quality=Quality.BAD, reason=reason)
+                value = self._values[name] = replace(before, quality=Quality.BAD, reason=reason)
                 self._news[name] = None
+                if self.on_put is not None:
+                    self.on_put(name, value)
 
     def current(self, name: str, now_ns: int) -> TagValue:
         """The value of a tag as of `now_ns`: bad with reason STALE when it was not refreshed in time.

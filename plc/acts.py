@@ -29,9 +29,11 @@ class Acts:
 
     def note(self, action: str, by: str, utc_ns: int, **details: Any) -> None:
         """One entry. Raises `Unreachable`, and the act must not be done, where it cannot be written."""
+        if self._descriptor >= 0:
+            self._write(action, by, utc_ns, details)
         self.counts[action] = self.counts.get(action, 0) + 1
-        if self._descriptor < 0:
-            return
+
+    def _write(self, action: str, by: str, utc_ns: int, details: dict[str, Any]) -> None:
         entry = {
             "utc_ns": utc_ns,
             "action": action,

@@ -17,6 +17,8 @@ from gateway.core.errors import UsageError
 from plc.prove import Proof, Result
 
 REFRESH_S = 0.25
+ROOM_FOR_LIMITS = 100
+"""Columns of a terminal from which limits are shown, too."""
 _WHOLE_TYPES = {
     span
     for bits in (8, 16, 32, 64)
@@ -49,7 +51,7 @@ def tags_as_data(rows: list[Row]) -> dict[str, Row]:
 def tag_table(rows: list[Row]) -> Table:
     table = Table(box=None, pad_edge=False)
     names = ["tag", "value", "unit", "limits", "quality", "age", ""]
-    if not any(_limits(row["limits"]) for row in rows):
+    if data.width < ROOM_FOR_LIMITS or not any(_limits(row["limits"]) for row in rows):
         names.remove("limits")
     for name in names:
         justify: Any = "right" if name in ("value", "age") else "left"

@@ -82,7 +82,7 @@ class TagSpec:
         if self.kind is TagKind.MESSAGE:
             text |= {"max_bytes": self.max_bytes, "depth": self.depth}
         if self.limits is not None:
-            text["limits"] = list(self.limits)
+            text["limits"] = [float(limit) for limit in self.limits]  # 0 and 0.0 are one layout
         return text
 
     @classmethod

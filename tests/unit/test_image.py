@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -223,10 +224,14 @@ def test_another_layout_or_no_image_is_refused() -> None:
 
 
 def test_descriptions_survive_json_and_impossible_ones_are_refused() -> None:
-    layout = process_image([message_tag("modem.inbox", 250, 16)], [message_tag("modem.outbox", 250, 8)])
+    limited = TagSpec("pump.speed", TagKind.INT, "rpm", limits=(0, 1500))
+    layout = process_image([message_tag("modem.inbox", 250, 16)], [message_tag("modem.outbox", 250, 8), limited])
+    again = ImageLayout.from_description(json.loads(json.dumps(layout.describe())))
+    assert again.digest == layout.digest  # for two processes that read one description
     assert ImageLayout.from_description(layout.describe()) == layout
     assert [t.name for t in layout.regions[0].tags] == ["modem.inbox", taken_name("modem.outbox")]
-    assert [t.name for t in layout.regions[1].tags] == ["modem.outbox", consumed_name("modem.inbox")]
+    assert [t.name for t in layout.regions[1].tags] == ["modem.outbox", "pump.speed", consumed_name("modem.inbox")]
+    assert again.regions[1].tags[1].limits == (0, 1500)
     assert [r.name for r in layout.regions] == [INPUTS, OUTPUTS]
     for bad in ({}, {"regions": [{}]}, {"regions": [{"name": "r", "tags": [{"name": "x", "kind": "REEL"}]}]}):
         with pytest.raises(FileInvalid):
@@ -235,6 +240,8 @@ def test_descriptions_survive_json_and_impossible_ones_are_refused() -> None:
         RegionLayout("r", (TagSpec("x", TagKind.INT), TagSpec("x", TagKind.REAL)))
     with pytest.raises(FileInvalid, match="impossible size"):
         message_tag("m", 0, 1)
+    with pytest.raises(FileInvalid, match="limits"):
+        TagSpec("x", TagKind.INT, limits=(2, 1))
 
 
 def test_flags_and_columns() -> None:

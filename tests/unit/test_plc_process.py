@@ -292,7 +292,8 @@ def test_a_scan_that_does_not_end_is_ended_with_outputs_safe_and_the_programs_be
 
 def test_forces_pause_steps_and_reasons_over_the_control_channel(tmp_path: Path) -> None:
     async def main() -> None:
-        async with plc_running(config_in(tmp_path, RELAY, cycle_ms=2)) as (_, gateway, client):
+        config = config_in(tmp_path, RELAY, cycle_ms=2, audit_path=str(tmp_path / "audit"))
+        async with plc_running(config) as (_, gateway, client):
             gateway.publish(modem_inbox=encode_period(4).data)
             await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 4)
             [why] = (await client.call("why", tag="ctd.sample_period_s"))["changes"][:1]
@@ -301,6 +302,10 @@ def test_forces_pause_steps_and_reasons_over_the_control_channel(tmp_path: Path)
             await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 9)
             assert gateway.reader.snapshot().value("ctd.sample_period_s").quality is Quality.SIMULATED
             assert (await client.call("get"))["forces"]["ctd.sample_period_s"]["by"] == "test"
+            [commanded] = (await client.call("image", tags=["ctd.sample_period_s", "no.*"]))["tags"]
+            assert (commanded["quality"], commanded["forced"]["by"]) == ("simulated", "test")
+            with pytest.raises(RemoteError, match="which tags"):
+                await client.call("image", tags="ctd.*")
             for args in ({"tag": "no.such", "value": 1}, {"value": 1}, {"tag": "ctd.sample_period_s", "value": "x"}):
                 with pytest.raises(RemoteError):
                     await client.call("force", **args)
@@ -321,8 +326,12 @@ def test_forces_pause_steps_and_reasons_over_the_control_channel(tmp_path: Path)
             await got(client, lambda s: s["scans"] > scans + 3)
             assert (await client.call("restart", cold=True))["start"]
             await got(client, lambda s: s["restarts"] == 1 and s["variables"]["relay.commands"] == 0)
+            assert (await client.call("get"))["acts"]["force"] == 1
 
     run(main())
+    noted = [json.loads(line) for line in (tmp_path / "audit").read_text().splitlines()]
+    assert [n["action"] for n in noted] == ["force", "unforce", "pause", "step", "go", "restart"]
+    assert (noted[0]["by"], noted[0]["old"], noted[0]["new"], noted[1]["old"]) == ("test", 4, 9, 9)
 
 
 def test_the_configuration_survives_json_and_a_wrong_one_is_refused(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from fieldtwin.cli.plc_views import acts_text
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.running.session import RunSession
 
@@ -22,6 +23,7 @@ REFRESH_S = 0.25
 LINE_S = 1.0
 MAX_TAGS = 40
 MAX_TROUBLES = 5
+MAX_FORCES = 6
 
 
 def print_mapping(session: RunSession) -> None:
@@ -121,6 +123,25 @@ def troubles(session: RunSession) -> list[str]:
     return found
 
 
+def interference(session: RunSession) -> list[str]:
+    """What a person has taken out of the PLC's hands: that it is paused, and what is forced."""
+    plc = session.plc_status or {}
+    found = ["PAUSED: the PLC executes nothing, its outputs stay as they are"] if plc.get("state") == "paused" else []
+    if forces := plc.get("forces"):
+        found.append(f"FORCED: {forces_text(forces)}")
+    return found
+
+
+def forces_text(forces: dict[str, Any]) -> str:
+    """``ctd.pressure = 5 by ada, ...``, of many the first few and how many more."""
+    shown = [
+        f"{tag} = {value_text(force['value'])}" + (f" by {force['by']}" if force["by"] else "")
+        for tag, force in list(forces.items())[:MAX_FORCES]
+    ]
+    more = len(forces) - len(shown)
+    return ", ".join(shown) + (f" and {more} more" if more else "")
+
+
 def line(session: RunSession) -> str:
     """The run in one line."""
     gateway, plc = session.gateway_status or {}, session.plc_status or {}
@@ -135,6 +156,10 @@ def line(session: RunSession) -> str:
     if plc:
         parts.append(f"scans={plc.get('scans')} late_p99_us={_p99(plc)}")
     parts.append(f"errors={len(session.errors)}")
+    if plc.get("state") == "paused":
+        parts.append("PLC PAUSED")
+    if plc.get("forces"):
+        parts.append(f"FORCED={','.join(plc['forces'])}")
     if not gateway.get("plc", {}).get("alive", True):
         parts.append("PLC LOST")
     return " ".join(parts)
@@ -156,6 +181,7 @@ def render(session: RunSession) -> RenderableType:
     clock = f"{session.elapsed_s:5.1f} s" + (f" of {left:.0f} s" if left else "")
     head = Text.assemble((f" {session.system.name} ", "bold reverse"), f" {kind}  {clock}  ", _states(session))
     parts: list[RenderableType] = [head, _devices(session), _foot(session)]
+    parts += [Text(text, style="bold yellow") for text in interference(session)]
     parts += [Text(f"! {trouble}", style="red") for trouble in troubles(session)[-MAX_TROUBLES:]]
     parts.append(_tags(session))  # last: a low terminal cuts off the end of them and nothing else
     return Group(*parts)
@@ -276,6 +302,11 @@ def print_summary(summary: dict[str, Any]) -> None:
     data.print(f"  logged         {summary['logged']} exchanges")
     for name, learnt in summary["learnt"].items():
         data.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
+    if acts := summary["plc"].get("acts"):
+        left = summary["plc"].get("forces")
+        data.print(f"  [yellow]by hand[/yellow]        the PLC: {acts_text(acts)}", soft_wrap=True)
+        if left:
+            data.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
     for error in summary["errors"]:
         data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")

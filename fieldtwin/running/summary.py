@@ -125,6 +125,8 @@ def summarise(run: Run) -> dict[str, Any]:
                 "duration_us",
                 "realtime",
                 "error",
+                "acts",
+                "forces",
             )
             if k in plc
         },

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from fieldtwin.cli.live_view import age_text, line, render, troubles, value_text
+from fieldtwin.cli.live_view import age_text, interference, line, render, troubles, value_text
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 
@@ -85,6 +85,20 @@ def test_without_a_terminal_there_is_no_escape_and_one_line(session: RunSession)
     assert "\x1b" not in text + "".join(shown(session, 80))
     for wanted in ("ctd=bad", "inclinometer=good", "tags_good=0/15", "requests=123474", "PLC LOST"):
         assert wanted in text
+
+
+def test_a_paused_plc_and_forces_are_in_sight(session: RunSession) -> None:
+    assert session.plc_status is not None
+    assert interference(session) == []
+    session.plc_status |= {
+        "state": "paused",
+        "forces": {f"ctd.tag{n}": {"value": n / 3, "by": "ada" if n else "", "age_ms": 5.0} for n in range(8)},
+    }
+    assert line(session).endswith("PLC PAUSED FORCED=" + ",".join(f"ctd.tag{n}" for n in range(8)) + " PLC LOST")
+    top = " ".join(" ".join(shown(session, 80)[:20]).split())
+    assert "PAUSED: the PLC executes nothing, its outputs stay as they are" in top
+    assert "FORCED: ctd.tag0 = 0, ctd.tag1 = 0.333333 by ada, " in top
+    assert "and 2 more" in top
 
 
 def test_every_trouble_is_named_once(session: RunSession) -> None:

@@ -23,7 +23,7 @@ _EVENTS = {
     "socket.connect": "a connection",
     "socket.bind": "a socket",
     "_thread.start_new_thread": "a thread",
-    "_thread.start_joinable_thread": "a thread",
+    "_thread.start_joinable_thread": "a thread",  # these two from Python 3.12 and 3.13 on
     "subprocess.Popen": "a process",
     "os.fork": "a process",
     "os.posix_spawn": "a process",
@@ -50,6 +50,15 @@ def _guarded(real: Callable[..., Any]) -> Callable[..., Any]:
     return guard
 
 
+def _unstartable(real: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
+    def start(self: threading.Thread) -> None:
+        if threading.get_ident() in _sealed:
+            raise escape("a thread")
+        real(self)
+
+    return start
+
+
 @contextmanager
 def sealed() -> Iterator[None]:
     """In this thread, until the end: any escape raises `Escape`. May not be nested."""
@@ -60,10 +69,13 @@ def sealed() -> Iterator[None]:
     kept = {name: getattr(time, name) for name in _CLOCKS}
     for name, real in kept.items():
         setattr(time, name, _guarded(real))
+    start = threading.Thread.start
+    threading.Thread.start = _unstartable(start)  # type: ignore[method-assign, assignment]
     _sealed.add(threading.get_ident())
     try:
         yield
     finally:
         _sealed.discard(threading.get_ident())
+        threading.Thread.start = start  # type: ignore[method-assign]
         for name, real in kept.items():
             setattr(time, name, real)

@@ -1,0 +1,247 @@
+"""The virtual loop: time is a number, order is fixed, nobody gets out."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.loop import START_NS, Deadlock, Escape, VirtualLoop
+from emulators.virtual.seal import sealed
+from gateway.core.errors import Bug
+
+
+def run(main: Callable[[VirtualLoop], Coroutine[Any, Any, Any]]) -> Any:
+    loop = VirtualLoop()
+    try:
+        with sealed():
+            return loop.run_until_complete(main(loop))
+    finally:
+        loop.close()
+
+
+def test_a_day_takes_no_time_and_ends_to_the_nanosecond() -> None:
+    async def main(loop: VirtualLoop) -> None:
+        await VirtualClock(loop).sleep_until_ns(START_NS + 86_400 * 10**9 + 1)
+        assert loop.now_ns == START_NS + 86_400 * 10**9 + 1
+        assert loop.time() == pytest.approx(loop.now_ns / 1e9)
+
+    run(main)
+
+
+@given(st.lists(st.integers(0, 5), max_size=30))
+@settings(max_examples=60, deadline=None)
+def test_timers_run_in_order_of_time_and_then_of_asking(delays_ms: list[int]) -> None:
+    ran: list[tuple[int, int]] = []
+
+    async def main(loop: VirtualLoop) -> None:
+        for number, delay_ms in enumerate(delays_ms):
+            loop.call_later(delay_ms / 1000, ran.append, (delay_ms, number))
+        await asyncio.sleep(0.01)
+
+    run(main)
+    assert ran == sorted(ran)
+    assert len(ran) == len(delays_ms)
+
+
+def test_what_is_ready_runs_before_time_goes_on() -> None:
+    seen: list[str] = []
+
+    async def main(loop: VirtualLoop) -> None:
+        loop.call_later(0.001, seen.append, "timer")
+        for n in range(3):
+            loop.call_soon(seen.append, str(n))
+            await asyncio.sleep(0)
+        await asyncio.sleep(0.001)
+
+    run(main)
+    assert seen == ["0", "1", "2", "timer"]
+
+
+def test_cancelled_timers_never_run_and_take_no_room() -> None:
+    ran: list[int] = []
+
+    async def main(loop: VirtualLoop) -> int:
+        timers = [loop.call_later(1 + n / 1000, ran.append, n) for n in range(5_000)]
+        for timer in timers[:-1]:
+            timer.cancel()
+        left = len(loop._timers)
+        await asyncio.sleep(10)
+        return left
+
+    assert run(main) < 2_500
+    assert ran == [4_999]
+
+
+def test_timeouts_and_waits_of_asyncio_work() -> None:
+    async def main(loop: VirtualLoop) -> tuple[bool, int]:
+        timed_out = False
+        try:
+            async with asyncio.timeout(2.5):
+                await asyncio.Event().wait()
+        except TimeoutError:
+            timed_out = True
+        task = loop.create_task(asyncio.sleep(7, "done"))
+        assert await asyncio.wait_for(task, 8) == "done"
+        return timed_out, loop.now_ns - START_NS
+
+    assert run(main) == (True, 9_500_000_000)
+
+
+def test_a_deadlock_says_who_waits_for_what() -> None:
+    async def stuck(event: asyncio.Event) -> None:
+        await event.wait()
+
+    async def main(loop: VirtualLoop) -> None:
+        task = loop.create_task(stuck(asyncio.Event()), name="the reader")
+        await task
+
+    with pytest.raises(Deadlock, match=r"the reader at .*wait.*\(locks.py:\d+\) for Future"):
+        run(main)
+
+
+def test_time_that_stands_still_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("emulators.virtual.loop.STUCK_AFTER", 1_000)
+
+    async def main(loop: VirtualLoop) -> None:
+        def again() -> None:
+            loop.call_soon(again)
+
+        again()
+        await asyncio.sleep(1)
+
+    with pytest.raises(Deadlock, match="time stands still"):
+        run(main)
+
+
+async def _executor(loop: VirtualLoop) -> None:
+    await loop.run_in_executor(None, lambda: 1)
+
+
+async def _to_thread(loop: VirtualLoop) -> None:
+    await asyncio.to_thread(lambda: 1)
+
+
+async def _connect(loop: VirtualLoop) -> None:
+    await asyncio.open_connection("127.0.0.1", 1)
+
+
+async def _subprocess(loop: VirtualLoop) -> None:
+    await asyncio.create_subprocess_exec("true")
+
+
+async def _popen(loop: VirtualLoop) -> None:
+    subprocess.run([sys.executable, "-c", ""], check=True)  # noqa: ASYNC221  it must be refused
+
+
+async def _socket(loop: VirtualLoop) -> None:
+    socket.socket()
+
+
+async def _thread(loop: VirtualLoop) -> None:
+    threading.Thread(target=lambda: None).start()
+
+
+async def _clock(loop: VirtualLoop) -> None:
+    time.monotonic_ns()
+
+
+async def _wall_clock(loop: VirtualLoop) -> None:
+    time.time()
+
+
+async def _sleep(loop: VirtualLoop) -> None:
+    time.sleep(0)  # noqa: ASYNC251  it must be refused
+
+
+async def _threadsafe(loop: VirtualLoop) -> None:
+    loop.call_soon_threadsafe(lambda: None)
+
+
+async def _reader(loop: VirtualLoop) -> None:
+    loop.add_reader(0, lambda: None)
+
+
+WAYS_OUT = [
+    (_executor, "loop.run_in_executor"),
+    (_to_thread, "loop.run_in_executor"),
+    (_connect, "loop.(getaddrinfo|create_connection)"),
+    (_subprocess, "loop.subprocess_exec|a process|child watcher"),
+    (_popen, "a process"),
+    (_socket, "a socket"),
+    (_thread, "a thread"),
+    (_clock, "time.monotonic_ns"),
+    (_wall_clock, "time.time"),
+    (_sleep, "time.sleep"),
+    (_threadsafe, "a call from another thread"),
+    (_reader, "loop.add_reader"),
+]
+
+
+@pytest.mark.parametrize(("way", "told"), WAYS_OUT, ids=lambda x: getattr(x, "__name__", ""))
+def test_every_way_out_names_the_culprit(way: Callable[[VirtualLoop], Coroutine[Any, Any, None]], told: str) -> None:
+    with pytest.raises(Escape, match=told) as e:
+        run(way)
+    assert f"({way.__name__})" in e.value.where
+    assert "test_virtual_loop.py" in e.value.where
+
+
+def test_other_threads_and_later_code_keep_their_clocks() -> None:
+    took: list[float] = []
+
+    async def main(loop: VirtualLoop) -> None:
+        release.set()
+        while not took:
+            pass  # the other thread reads the clock while this one is sealed
+
+    release = threading.Event()
+
+    def read_the_clock() -> None:
+        release.wait(5)
+        took.append(time.monotonic())
+
+    thread = threading.Thread(target=read_the_clock)
+    thread.start()
+    run(main)
+    thread.join()
+    assert took
+    assert time.monotonic() > 0
+    assert isinstance(time.time(), float)
+
+
+def test_what_nobody_caught_is_kept() -> None:
+    async def fails() -> None:
+        raise ValueError("lost")
+
+    async def main(loop: VirtualLoop) -> list[str]:
+        def bad() -> None:
+            raise ValueError("in a callback")
+
+        loop.call_soon(bad)
+        await asyncio.sleep(0)
+        return [str(context["exception"]) for context in loop.unhandled]
+
+    assert run(main) == ["in a callback"]
+
+
+def test_it_is_closed_once_and_runs_alone() -> None:
+    loop = VirtualLoop()
+
+    async def inner() -> None:
+        with pytest.raises(Bug, match="inside another loop"):
+            VirtualLoop().run_forever()
+
+    loop.run_until_complete(inner())
+    assert not loop.is_running()
+    loop.close()
+    assert loop.is_closed()

@@ -62,7 +62,7 @@ class VirtualPrototype:
         self.clock = VirtualClock(loop)
         self.net = MemoryNet(loop)
         self.twin = DigitalTwinPrototype(system, self.prototype, self.clock)
-        self.field: FieldSide = self.twin.field(run_dir, self.net)
+        self.field: FieldSide = self.twin.field(Path("virtual"), self.net)
         self.gateway: Gateway
         self.plc: Runner
         self.mapping: dict[Endpoint, Endpoint] = {}

@@ -49,7 +49,9 @@ class Exchange:
 
     `problem` says why there is no good answer, "" where there is: ``no reply``, ``check sum``, ``exception``, ``abort``,
     ``stray`` (a frame that answers nothing), ``malformed``. `latency_ns` is from the request to the last byte of the
-    answer, None without one. `t_ns` is when the request was seen, `end_ns` when the last byte of all was.
+    answer, None without one. `t_ns` is when the request was seen, `end_ns` when the last byte of all was. `text` says what was
+    asked, `reply_text` what was answered. `value` is what an SDO transfer moved (engineering units where it is a tag, hex where
+    its type is not known), an EMCY's code, a heartbeat's state.
     """
 
     t_ns: int
@@ -70,6 +72,7 @@ class Exchange:
     problem: str = ""
     text: str = ""
     reply_text: str = ""
+    value: Scalar | None = None
 
     @property
     def access(self) -> str:
@@ -94,6 +97,23 @@ class Exchange:
     def reads(self, tag: str = "") -> bool:
         """Whether it reads, and `tag` (a name without its device) among others."""
         return any(s.access == "read" for s in self.spans) and (not tag or tag in self.tags)
+
+    def describe(self) -> dict[str, Any]:
+        """As plain data, for JSON."""
+        return {
+            "device": self.device,
+            "unit": self.unit,
+            "function": self.function,
+            "service": self.service,
+            "spans": [f"{s.access} {s}" for s in self.spans],
+            "registers": list(self.registers),
+            "tags": self.tags,
+            "value": self.value,
+            "exception": self.exception,
+            "abort": self.abort,
+            "latency_ms": None if self.latency_ns is None else self.latency_ns / 1e6,
+            "problem": self.problem,
+        }
 
     def writes(self, tag: str = "") -> bool:
         """As `reads`."""

@@ -30,8 +30,8 @@ class CheckResult:
     """A step, an expectation or an always-on check of a scenario.
 
     `number` is how people find it again (``3``, ``always 1``), `where` its place (file:line). `since_ns` to `t_ns` is the
-    time that it looked at, ns since the run's start, `t_ns` when it was decided; None where it was not reached. `names` are the tags,
-    variables and devices that it is about: the diagram shows these.
+    time that it looked at, ns since the run's start, `t_ns` when it was decided; None where it was not reached. `names` are the
+    tags, variables and devices that it is about: the diagram shows these.
     """
 
     number: str

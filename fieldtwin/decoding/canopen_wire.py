@@ -1,0 +1,213 @@
+"""One CAN bus of a trace as CANopen: frames in, words and exchanges out (CiA 301, CiA 305).
+
+Identifiers are those of the pre-defined connection set, but for PDOs, whose are learnt (see `node_map`). No clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from fieldtwin.decoding.exchange import Exchange, Span
+from fieldtwin.decoding.lss_watch import LssWatch
+from fieldtwin.decoding.node_map import NodeMap, Pdo
+from fieldtwin.decoding.sdo_watch import SdoWatch, Seen, Transfer
+from fieldtwin.decoding.tags import TagMap, show_value
+from gateway.core.canframe import CanFrame
+from gateway.core.errors import FieldtwinError
+from gateway.core.values import Scalar
+from gateway.devices.config import DeviceConfig
+from gateway.protocols.canopen import cob_id
+from gateway.protocols.canopen.abort_codes import meaning
+from gateway.protocols.canopen.emcy import parse_emcy
+from gateway.protocols.canopen.nmt import NmtCommand, NmtState, heartbeat_state
+
+_COMMANDS = {int(c): c.name.lower().replace("_", " ").replace("pre operational", "pre-operational") for c in NmtCommand}
+_STATES = {s: s.name.replace("_", "-") for s in NmtState}
+_PDO_AREA = range(0x180, 0x580)
+
+
+class CanopenWire:
+    """The nodes of one bus and what is open between them and their master."""
+
+    def __init__(self, bus: str, devices: Iterable[DeviceConfig]) -> None:
+        self.bus = bus
+        self._nodes = {d.address: NodeMap(d) for d in devices}
+        self._sdo: dict[int, SdoWatch] = {}
+        self._lss = LssWatch(bus)
+        self._pdos: dict[int, Pdo] = {}
+        self._find_pdos()
+
+    def feed(self, frame: CanFrame, t_ns: int) -> tuple[str, list[Exchange]]:
+        """A frame, in the order of the trace."""
+        if frame.error:
+            return "error frame", []
+        if frame.extended:
+            return f"{frame}: no CANopen (29-bit identifier)", []
+        if frame.remote:
+            return f"asks for {frame.can_id:03X}h", []
+        number, node = frame.can_id, frame.can_id & 0x7F
+        if number in self._pdos:
+            return self._pdo(self._pdos[number], frame.data, t_ns)
+        if number == cob_id.NMT:
+            return self._nmt(frame.data, t_ns)
+        if number == cob_id.SYNC:
+            counter = f" {frame.data[0]}" if frame.data else ""
+            return self._message(t_ns, 0, "SYNC", f"SYNC{counter}", frame.data)
+        if number == cob_id.TIME:
+            return self._message(t_ns, 0, "TIME", f"TIME {frame.data.hex(' ')}", frame.data)
+        if number in (cob_id.LSS_REQUEST, cob_id.LSS_REPLY):
+            return self._lss.feed(frame.data, number == cob_id.LSS_REPLY, t_ns)
+        match number & 0x780:
+            case cob_id.EMCY_BASE:
+                return self._emcy(node, frame.data, t_ns)
+            case cob_id.SDO_REQUEST_BASE | cob_id.SDO_RESPONSE_BASE if node:
+                return self._on_sdo(node, number < cob_id.SDO_REQUEST_BASE, frame.data, t_ns)
+            case cob_id.HEARTBEAT_BASE if node:
+                return self._heartbeat(node, frame.data, t_ns)
+        if number in _PDO_AREA and node:
+            sends, at = bool(number & 0x80), number // 0x100
+            return self._pdo(
+                Pdo(node, f"{'TPDO' if sends else 'RPDO'}{at - (not sends)}", sends, None), frame.data, t_ns
+            )
+        return f"{frame}: no identifier of CANopen", []
+
+    def finish(self) -> list[Exchange]:
+        """Nothing follows: what is still awaited has no answer."""
+        dropped = [(node, watch.drop()) for node, watch in self._sdo.items()]
+        return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
+
+    # -- what nobody answers --------------------------------------------------------------------------------------------
+
+    def _message(
+        self,
+        t_ns: int,
+        node: int,
+        service: str,
+        text: str,
+        data: bytes,
+        *,
+        spans: tuple[Span, ...] = (),
+        tags: dict[str, Scalar | None] | None = None,
+        value: Scalar | None = None,
+        problem: str = "",
+    ) -> tuple[str, list[Exchange]]:
+        return text, [
+            Exchange(
+                t_ns, t_ns, self.bus, self._device(node), node, 0, service, spans, tags=tags or {}, request=data,
+                problem=problem, text=text, value=value,
+            )
+        ]  # fmt: skip
+
+    def _device(self, node: int) -> str:
+        return self._nodes[node].name if node in self._nodes else ""
+
+    def _called(self, node: int) -> str:
+        return self._device(node) or f"node {node}"
+
+    def _nmt(self, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+        if len(data) != 2:
+            return self._message(t_ns, 0, "NMT", f"NMT of {len(data)} bytes", data, problem="malformed")
+        command = _COMMANDS.get(data[0], f"command {data[0]:02X}h")
+        whom = self._called(data[1]) if data[1] else "all nodes"
+        return self._message(t_ns, data[1], f"NMT {command}", f"{whom}: NMT {command}", data)
+
+    def _emcy(self, node: int, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+        try:
+            emcy = parse_emcy(data)
+        except FieldtwinError as e:
+            return self._message(t_ns, node, "EMCY", f"{self._called(node)}: {e.message}", data, problem="malformed")
+        text = f"{self._called(node)}: EMCY {emcy.code:04X}h {emcy.meaning}"
+        return self._message(t_ns, node, "EMCY", text, data, value=emcy.code)
+
+    def _heartbeat(self, node: int, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+        state = heartbeat_state(data)
+        if state is None:
+            text = f"{self._called(node)}: error control {data.hex(' ')}"
+            return self._message(t_ns, node, "error control", text, data)
+        booted = state is NmtState.INITIALISING
+        text = f"{self._called(node)}: {'boot-up' if booted else _STATES[state]}"
+        return self._message(t_ns, node, "boot-up" if booted else "heartbeat", text, data, value=_STATES[state])
+
+    def _pdo(self, pdo: Pdo, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+        head, node = f"{self._called(pdo.node)}: {pdo.name}", self._nodes.get(pdo.node)
+        if pdo.mapping is None or node is None:
+            return self._message(t_ns, pdo.node, pdo.name, f"{head} {data.hex(' ')}", data)
+        try:
+            values = pdo.mapping.unpack(data)
+        except FieldtwinError:
+            text = f"{head} {data.hex(' ')}, {pdo.mapping.length} bytes were mapped"
+            return self._message(t_ns, pdo.node, pdo.name, text, data, problem="malformed")
+        access = "read" if pdo.sends else "write"
+        tags: dict[str, Scalar | None] = {}
+        others, spans = [], []
+        for entry, raw in zip(pdo.mapping.entries, values, strict=True):
+            spans.append(Span("read" if access == "read" else "write", "object", entry.index, 1, entry.subindex))
+            found, value = node.value(entry.index, entry.subindex, raw, t_ns)
+            tags |= found
+            if not found:
+                others.append(f"{entry.index:04X}h:{entry.subindex:02X} {show_value(value)}")
+        said = ", ".join(filter(None, [node.tags.show(tags), *others]))
+        return self._message(t_ns, pdo.node, pdo.name, f"{head} {said}", data, spans=tuple(spans), tags=tags)
+
+    # -- SDO --------------------------------------------------------------------------------------------------------
+
+    def _on_sdo(self, node: int, reply: bool, data: bytes, t_ns: int) -> tuple[str, list[Exchange]]:
+        watch = self._sdo.setdefault(node, SdoWatch())
+        seen: Seen = watch.reply(data, t_ns) if reply else watch.request(data, t_ns)
+        done = []
+        if seen.dropped is not None:
+            done.append(self._transferred(node, seen.dropped, t_ns, "no reply"))
+        text = seen.text
+        if seen.done is not None:
+            done.append(self._transferred(node, seen.done, t_ns, "abort" if seen.done.abort is not None else ""))
+            text = done[-1].reply_text
+        elif not reply and watch.open is not None and watch.open.request is data and not watch.open.upload:
+            text += self._to_write(node, watch.open, t_ns)
+        return f"{self._called(node)}: {text}", done
+
+    def _to_write(self, node: int, transfer: Transfer, t_ns: int) -> str:
+        return f" = {self._value(node, transfer, t_ns)[2]}" if transfer.data else ""
+
+    def _transferred(self, node: int, transfer: Transfer, t_ns: int, problem: str) -> Exchange:
+        tags, value, said = self._value(node, transfer, t_ns)
+        text = f"{transfer.service} {transfer.name}"
+        if not transfer.upload and transfer.data:
+            text += f" = {said}"
+        failed = transfer.abort is not None or bool(problem)
+        known_node = None if failed else self._nodes.get(node)
+        if known_node is not None and known_node.learn(transfer.index, transfer.subindex, bytes(transfer.data)):
+            self._find_pdos()
+        if transfer.abort is not None:
+            reply_text = f"{transfer.name}: abort {transfer.abort:08X}h {meaning(transfer.abort)}"
+            reply_text += " (by the master)" if transfer.aborted_by == "client" else ""
+        elif problem:
+            reply_text = problem
+        else:
+            reply_text = f"{transfer.name} = {said}" if transfer.upload else f"{transfer.name}: written"
+        known = value is not None and not (failed and transfer.upload)
+        return Exchange(
+            transfer.t_ns, t_ns, self.bus, self._device(node), node, 0, transfer.service,
+            (Span("read" if transfer.upload else "write", "object", transfer.index, 1, transfer.subindex),),
+            tags=tags if known else dict.fromkeys(tags), abort=transfer.abort,
+            latency_ns=None if problem == "no reply" else t_ns - transfer.t_ns, request=transfer.request,
+            reply=transfer.reply, problem=problem, text=f"{self._called(node)}: {text}", reply_text=reply_text,
+            value=value if known else None,
+        )  # fmt: skip
+
+    def _value(self, node: int, transfer: Transfer, t_ns: int) -> tuple[dict[str, Scalar | None], Scalar | None, str]:
+        """Tags, value, and both in words, of what a transfer has moved so far."""
+        data, known = bytes(transfer.data), self._nodes.get(node)
+        if known is None:
+            return {}, data.hex(), data.hex(" ")
+        if not data and transfer.upload:
+            named = known.tags.names(Span("read", "object", transfer.index, 1, transfer.subindex))
+            return dict.fromkeys(named), None, "nothing"
+        tags, value = known.value(transfer.index, transfer.subindex, data, t_ns)
+        return tags, value, _said(known.tags, tags, value)
+
+    def _find_pdos(self) -> None:
+        self._pdos = {cob: pdo for node in self._nodes.values() for cob, pdo in node.pdos.items()}
+
+
+def _said(tag_map: TagMap, tags: dict[str, Scalar | None], value: Scalar | None) -> str:
+    return tag_map.show(tags) if tags else show_value(value)

@@ -1,0 +1,148 @@
+"""The door of decoding: events of a trace in, words and exchanges out, event by event or all at once.
+
+    decoder = Decoder(system)
+    for event in trace.events:
+        for exchange in decoder.feed(event): ...
+    rest = decoder.finish()
+
+Bounded: one request a line, 64 on a Modbus TCP wire, one transfer a node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from typing import Any
+
+from fieldtwin.decoding.canopen_wire import CanopenWire
+from fieldtwin.decoding.exchange import Decoded, Exchange
+from fieldtwin.decoding.modbus_wire import ModbusWire, Unit
+from fieldtwin.decoding.tags import TagMap, show_value
+from fieldtwin.scenarios.trace import Event, Kind
+from gateway.connections.tap import Captured
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import Direction
+from gateway.core.errors import FieldtwinError
+from gateway.protocols.modbus.framings import framing_of
+from twin.system import System
+
+
+class Decoder:
+    """Decodes one trace, whose events are fed in order. `served` are buses on which the gateway is the one that is asked."""
+
+    def __init__(self, system: System, served: Collection[str] = ()) -> None:
+        self._system = system
+        self._served = served
+        self._modbus: dict[str, ModbusWire] = {}
+        self._canopen: dict[str, CanopenWire] = {}
+        self._maps: dict[str, TagMap] = {}
+
+    def decode(self, event: Event) -> Decoded:
+        """An event in words. Every event of a trace has some; an unknown bus's bytes are shown as they are."""
+        if event.kind is not Kind.FRAME:
+            return Decoded(self._words(event), dict(event.data))
+        text, done = self._frame(event)
+        fields: dict[str, Any] = {"bus": event.where, **event.data}
+        if done:
+            fields |= done[-1].describe()
+        return Decoded(text, fields, tuple(done))
+
+    def feed(self, event: Event) -> list[Exchange]:
+        """The exchanges that an event ended: an answer, the request after one that had none, a message."""
+        return self._frame(event)[1] if event.kind is Kind.FRAME else []
+
+    def finish(self) -> list[Exchange]:
+        """Nothing follows: what is still awaited has no answer."""
+        wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
+        return sorted((e for wire in wires for e in wire.finish()), key=lambda e: e.t_ns)
+
+    def _frame(self, event: Event) -> tuple[str, list[Exchange]]:
+        data = event.data
+        try:
+            raw = bytes.fromhex(data.get("bytes", ""))
+            if "id" in data:
+                frame = CanFrame(
+                    data["id"], raw, extended=bool(data.get("ext")), remote=bool(data.get("rtr")),
+                    error=bool(data.get("err")),
+                )  # fmt: skip
+                return self._can(event.where).feed(frame, event.t_ns)
+        except (ValueError, TypeError, FieldtwinError):
+            return f"unreadable: {data}", []
+        wire = self._line(event.where)
+        if wire is None:
+            return raw.hex(" "), []
+        texts, done = wire.feed(data.get("dir") == "sent", raw, event.t_ns)
+        return "; ".join(texts), done
+
+    def _line(self, bus: str) -> ModbusWire | None:
+        if bus not in self._modbus:
+            config = self._system.buses.get(bus)
+            if config is None or config.endpoint.is_can:
+                return None
+            units = {d.address: Unit(d.name, TagMap(d.profile)) for d in self._system.devices_on(bus)}
+            self._modbus[bus] = ModbusWire(
+                bus, framing_of(config.endpoint), units, echo=config.echo, served=bus in self._served
+            )
+        return self._modbus[bus]
+
+    def _can(self, bus: str) -> CanopenWire:
+        if bus not in self._canopen:
+            self._canopen[bus] = CanopenWire(bus, self._system.devices_on(bus))
+        return self._canopen[bus]
+
+    def _words(self, event: Event) -> str:
+        data, where = event.data, event.where
+        match event.kind:
+            case Kind.TAG:
+                quality = data.get("quality", "")
+                reason = "" if data.get("reason") in (None, "", "none") else f": {data['reason']}"
+                return f"{where} {self._tag_value(where, data.get('value'))}, {quality}{reason}"
+            case Kind.STATE:
+                return f"{where} = {show_value(data.get('value'))}"
+            case Kind.FAULT:
+                state = "on" if data.get("on") else "off"
+                return f"fault {where}: {data.get('name', '')} {state} {data.get('target') or ''}".rstrip()
+            case Kind.STEP:
+                verdict = f": {data['verdict']}" if data.get("verdict") else ""
+                return f"step {where}: {data.get('text', '')}{verdict}"
+        return f"{where}: {data.get('text', '')}"
+
+    def _tag_value(self, where: str, value: Any) -> str:
+        device, _, name = where.partition(".")
+        config = self._system.devices.get(device)
+        if config is None or not isinstance(value, bool | int | float | str | None):
+            return show_value(value)
+        if device not in self._maps:
+            self._maps[device] = TagMap(config.profile)
+        return self._maps[device].show({name: value}).removeprefix(f"{name} ")
+
+
+def exchanges(system: System, events: Iterable[Event], served: Collection[str] = ()) -> list[Exchange]:
+    """All exchanges of a trace, in the order of their requests."""
+    decoder = Decoder(system, served)
+    found = [exchange for event in events for exchange in decoder.feed(event)]
+    return sorted(found + decoder.finish(), key=lambda e: (e.t_ns, e.end_ns))
+
+
+def frame_events(captured: Iterable[Captured], system: System, start_ns: int = 0) -> list[Event]:
+    """What a tap saw (`fieldtwin run --capture`) as FRAME events; `start_ns` is the tap's time of the run's start.
+
+    Endpoints that are no bus's of the system are left out.
+    """
+    buses = {str(bus.endpoint): name for name, bus in system.buses.items()}
+    found = []
+    for seen in captured:
+        bus = buses.get(str(seen.endpoint))
+        if bus is None:
+            continue
+        data: dict[str, Any] = {"dir": "sent" if seen.direction is Direction.SENT else "received"}
+        if isinstance(seen.item, CanFrame):
+            data |= {"bytes": seen.item.data.hex(), "id": seen.item.can_id}
+            data |= {k: True for k, on in _flags(seen.item) if on}
+        else:
+            data["bytes"] = seen.item.hex()
+        found.append(Event(seen.t_ns - start_ns, Kind.FRAME, bus, data))
+    return found
+
+
+def _flags(frame: CanFrame) -> list[tuple[str, bool]]:
+    return [("ext", frame.extended), ("rtr", frame.remote), ("err", frame.error)]

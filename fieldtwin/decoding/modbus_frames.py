@@ -1,0 +1,202 @@
+"""Bytes as the medium cut them, put together to Modbus frames again: RTU, ASCII and MBAP, one direction of a wire each.
+
+Told apart by length and check sum, as a bus analyser does; what is neither is noise and given back as such. Independent of
+the gateway's framers on purpose: it judges them. Holds at most one frame; times come with the bytes.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from dataclasses import dataclass
+
+from gateway.protocols.modbus.crc import crc16
+from gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
+
+MAX_ADU = 260
+MAX_ASCII = 513
+_LAST_UNIT = 247
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """A frame of unit `unit` (-1: none to be seen), its last byte at `t_ns`. `bad` says why it is none, "" where it is good.
+
+    `transaction` is MBAP's, -1 elsewhere.
+    """
+
+    t_ns: int
+    unit: int
+    pdu: bytes
+    raw: bytes
+    bad: str = ""
+    transaction: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """The reply that a serial line waits for: of `unit` to `function`, with `pdu_bytes` (0: the reply tells)."""
+
+    unit: int
+    function: int
+    pdu_bytes: int
+
+
+class Splitter(ABC):
+    """One direction. `feed` gives what is complete, `flush` what will never be."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._arrivals: deque[tuple[int, int]] = deque()  # how many bytes had come, and when
+        self._came = self._gone = 0
+
+    @property
+    def pending(self) -> int:
+        """Bytes of a frame that is not complete."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes, t_ns: int, expected: Expected | None = None) -> list[Frame]:
+        """Take what arrived."""
+        self._buffer += data
+        if data:
+            self._came += len(data)
+            self._arrivals.append((self._came, t_ns))
+        return self._split(expected, False)
+
+    def flush(self, expected: Expected | None = None) -> list[Frame]:
+        """Nothing that belongs to this will follow: what is left is a frame, or noise."""
+        return self._split(expected, True) if self._buffer else []
+
+    @abstractmethod
+    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
+        """Take frames off the front."""
+
+    def _cut(self, size: int) -> tuple[int, bytes]:
+        """The first `size` bytes, and when the last of them came."""
+        raw = bytes(self._buffer[:size])
+        del self._buffer[:size]
+        self._gone += size
+        while self._arrivals[0][0] < self._gone:
+            self._arrivals.popleft()
+        upto, t_ns = self._arrivals[0]
+        if upto == self._gone:
+            self._arrivals.popleft()
+        return t_ns, raw
+
+    def _noise(self, size: int, why: str) -> Frame:
+        t_ns, raw = self._cut(size)
+        return Frame(t_ns, -1, b"", raw, why)
+
+
+class RtuSplitter(Splitter):
+    """RTU (SL 2.5.1)."""
+
+    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
+        found: list[Frame] = []
+        skipped = 0
+        while skipped < len(self._buffer):
+            size, bad = self._frame_at(skipped, expected, settled)
+            if size < 0:
+                break
+            if size == 0:
+                skipped += 1
+                continue
+            if skipped:
+                found.append(self._noise(skipped, "noise"))
+                skipped = 0
+            t_ns, raw = self._cut(size)
+            found.append(Frame(t_ns, raw[0], raw[1:-2], raw, bad))
+        if settled and self._buffer:
+            found.append(self._noise(len(self._buffer), "no frame"))
+        elif skipped and len(self._buffer) > MAX_FRAME:
+            found.append(self._noise(skipped, "noise"))
+        return found
+
+    def _frame_at(self, at: int, expected: Expected | None, settled: bool) -> tuple[int, str]:
+        """The size of the frame at `at` and what is wrong with it; 0: there is none; -1: more has to come."""
+        head = self._buffer[at:]
+        if head[0] > _LAST_UNIT:
+            return 0, ""
+        size = self._expected_size(head, expected)
+        if size > len(head):
+            return (0, "") if settled else (-1, "")
+        if size > 0:
+            good = crc16(head[:size]) == 0
+            return size, "" if good else "check sum"
+        if len(head) < 2:
+            return (0, "") if settled else (-1, "")
+        lengths, more = frame_lengths(head)
+        for size in lengths:
+            if MIN_FRAME <= size <= min(len(head), MAX_FRAME) and crc16(head[:size]) == 0:
+                return size, ""
+        whole = MIN_FRAME <= len(head) <= MAX_FRAME and crc16(head) == 0
+        if whole and (settled or not (lengths or more)):  # a function that nobody knows has no length
+            return len(head), ""
+        grows = len(head) < MAX_FRAME and (more or not lengths or any(n > len(head) for n in lengths))
+        return (-1, "") if grows and not settled else (0, "")
+
+    def _expected_size(self, head: bytearray, expected: Expected | None) -> int:
+        """How long the awaited reply is if this is its beginning, else 0; more than there is where that is not known yet."""
+        if expected is None or head[0] != expected.unit:
+            return 0
+        if len(head) < 2:
+            return 2
+        if head[1] == expected.function | 0x80:
+            return 5
+        return expected.pdu_bytes + 3 if head[1] == expected.function and expected.pdu_bytes else 0
+
+
+class AsciiSplitter(Splitter):
+    """ASCII (SL 2.5.2): from a colon to LF."""
+
+    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
+        found = []
+        while self._buffer:
+            end = self._buffer.find(b"\n")
+            start = self._buffer.rfind(b":", 0, end if end >= 0 else len(self._buffer))
+            if end < 0:
+                if settled or len(self._buffer) > MAX_ASCII:
+                    found.append(self._noise(len(self._buffer), "no frame"))
+                return found
+            if start != 0:
+                found.append(self._noise(start if start > 0 else end + 1, "noise"))
+                continue
+            t_ns, raw = self._cut(end + 1)
+            found.append(_ascii_frame(t_ns, raw))
+        return found
+
+
+def _ascii_frame(t_ns: int, raw: bytes) -> Frame:
+    try:
+        body = bytes.fromhex(raw[1:].strip(b"\r\n").decode("ascii"))
+    except ValueError:
+        body = b""
+    if len(body) < 3:
+        return Frame(t_ns, -1, b"", raw, "no frame")
+    return Frame(t_ns, body[0], body[1:-1], raw, "" if sum(body) & 0xFF == 0 else "check sum")
+
+
+class MbapSplitter(Splitter):
+    """Modbus TCP (TG 3.1.3). After a header that cannot be right the rest of what came is noise."""
+
+    def _split(self, expected: Expected | None, settled: bool) -> list[Frame]:
+        found = []
+        while len(self._buffer) >= 6:
+            size = 6 + int.from_bytes(self._buffer[4:6])
+            if not 8 <= size <= MAX_ADU:
+                found.append(self._noise(len(self._buffer), "a header that cannot be right"))
+                return found
+            if len(self._buffer) < size:
+                break
+            foreign = self._buffer[2:4] != b"\0\0"
+            t_ns, raw = self._cut(size)
+            bad = "not Modbus: a protocol id other than 0" if foreign else ""
+            found.append(Frame(t_ns, raw[6], raw[7:], raw, bad, int.from_bytes(raw[:2])))
+        if settled and self._buffer:
+            found.append(self._noise(len(self._buffer), "no frame"))
+        return found
+
+
+def splitter(framing: str) -> Splitter:
+    """The splitter for one direction of a wire with that framing: rtu, ascii, mbap or udp."""
+    return {"rtu": RtuSplitter, "ascii": AsciiSplitter}.get(framing, MbapSplitter)()

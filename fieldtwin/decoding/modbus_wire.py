@@ -1,0 +1,250 @@
+"""One Modbus wire of a trace: chunks both ways in, words and exchanges out.
+
+On a serial line one request is awaited at a time, and the next one ends it; on MBAP replies are told by their
+transaction id. What answers nothing is a stray. No clock: times come with the chunks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from fieldtwin.decoding.exchange import Exchange, Span
+from fieldtwin.decoding.modbus_frames import Expected, Frame, splitter
+from fieldtwin.decoding.modbus_pdu import Asked, parse_reply, parse_request, words
+from fieldtwin.decoding.tags import TagMap
+from gateway.core.values import Scalar
+
+MAX_OPEN = 64
+"""Requests without an answer that are remembered on an MBAP wire; an older one will have none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A device that answers on the wire: its name in the system and its tags."""
+
+    name: str
+    tags: TagMap
+
+
+@dataclass(slots=True)
+class _Open:
+    frame: Frame
+    asked: Asked
+    device: str
+    tags: TagMap | None
+    text: str = ""
+
+
+class ModbusWire:
+    """`framing` is rtu, ascii, mbap or udp. `echo`: what was sent comes back first. `served`: the far end is the master."""
+
+    def __init__(
+        self, bus: str, framing: str, units: dict[int, Unit], *, echo: bool = False, served: bool = False
+    ) -> None:
+        self.bus = bus
+        self._units = units
+        self._serial = framing in ("rtu", "ascii")
+        self._requests, self._replies = splitter(framing), splitter(framing)
+        self._datagrams = framing == "udp"
+        self._echo = echo and self._serial
+        self._echo_due = b""
+        self._served = served
+        self._open: dict[int, _Open] = {}  # by transaction id; on a line there is one, with id -1
+
+    def feed(self, sent: bool, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
+        """A chunk, in the order of the trace. Each text describes a frame, or what there is of one."""
+        return self._take_requests(data, t_ns) if sent != self._served else self._take_replies(data, t_ns)
+
+    def finish(self) -> list[Exchange]:
+        """Nothing follows: what is still awaited has no answer."""
+        texts: list[str] = []
+        done: list[Exchange] = []
+        self._settle(texts, done)
+        done += [self._unanswered(o) for o in self._open.values()]
+        self._open.clear()
+        return done
+
+    # -- requests -----------------------------------------------------------------------------------------------------
+
+    def _take_requests(self, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
+        texts: list[str] = []
+        done: list[Exchange] = []
+        frames = self._requests.feed(data, t_ns)
+        if not self._served:
+            frames += self._requests.flush()  # what we send is a frame, whole
+            self._echo_due = data if self._echo else b""
+        for frame in frames:
+            if frame.bad:
+                texts.append(f"{_bytes(len(frame.raw))} that are no request ({frame.bad})")
+                continue
+            if self._serial:
+                self._settle(texts, done)
+                done += [self._unanswered(o) for o in self._open.values()]
+                self._open.clear()
+            texts.append(self._request(frame, done))
+        return texts or [f"{_bytes(self._requests.pending)} of a request"], done
+
+    def _request(self, frame: Frame, done: list[Exchange]) -> str:
+        unit, asked = self._units.get(frame.unit), parse_request(frame.pdu)
+        opened = _Open(frame, asked, unit.name if unit else "", unit.tags if unit else None)
+        text = opened.text = self._describe(opened)
+        if frame.unit == 0 and self._serial:
+            done.append(self._exchange(opened, None, "", ""))
+            return f"{text}, to all"
+        if (replaced := self._open.pop(frame.transaction, None)) is not None:
+            done.append(self._unanswered(replaced))
+        if len(self._open) >= MAX_OPEN:
+            done.append(self._unanswered(self._open.pop(next(iter(self._open)))))
+        self._open[frame.transaction] = opened
+        return text
+
+    def _describe(self, opened: _Open) -> str:
+        asked = opened.asked
+        text = f"{opened.device or f'unit {opened.frame.unit}'}: {asked.service}"
+        if asked.problem:
+            return f"{text}, malformed: {opened.frame.pdu.hex(' ')}"
+        if asked.spans:
+            text += f" {' and '.join(map(str, asked.spans))}"
+        span = asked.write_span
+        if span is not None and asked.written:
+            text += f": {_values(opened.tags, span, asked.written, opened.frame.t_ns)}"
+        elif span is not None and span.table == "holding":
+            text += f": AND {opened.frame.pdu[3:5].hex()}h, OR {opened.frame.pdu[5:7].hex()}h"
+        return text
+
+    # -- replies ------------------------------------------------------------------------------------------------------
+
+    def _take_replies(self, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
+        texts: list[str] = []
+        done: list[Exchange] = []
+        if self._echo_due:
+            echo = data[: len(self._echo_due)]
+            if echo == self._echo_due[: len(echo)]:
+                self._echo_due = self._echo_due[len(echo) :]
+                data = data[len(echo) :]
+                texts.append("echo")
+                if not data:
+                    return texts, done
+            else:
+                self._echo_due = b""
+                texts.append("the echo differs from what was sent: a collision")
+        if self._datagrams:
+            self._replies.flush()
+        self._judge(self._replies.feed(data, t_ns, self._expected()), texts, done)
+        if not texts:
+            texts = [f"{_bytes(self._replies.pending)} of a reply"]
+        return texts, done
+
+    def _expected(self) -> Expected | None:
+        opened = self._open.get(-1)
+        if opened is None:
+            return None
+        return Expected(opened.frame.unit, opened.asked.function, opened.asked.reply_bytes)
+
+    def _settle(self, texts: list[str], done: list[Exchange]) -> None:
+        """A new request is there: what is left of replies is complete, or noise."""
+        self._judge(self._replies.flush(self._expected()), texts, done)
+
+    def _judge(self, frames: Iterable[Frame], texts: list[str], done: list[Exchange]) -> None:
+        for frame in frames:
+            opened = self._open.get(frame.transaction)
+            ours = opened is not None and frame.unit == opened.frame.unit and frame.pdu
+            if not ours or opened is None or (frame.bad and frame.bad != "check sum"):
+                texts.append(self._stray(frame, done))
+                continue
+            del self._open[frame.transaction]
+            if frame.bad:
+                done.append(self._exchange(opened, frame, frame.bad, "damaged: the check sum is wrong"))
+            else:
+                done.append(self._answered(opened, frame))
+            texts.append(f"{opened.device or f'unit {frame.unit}'}: {done[-1].reply_text}")
+
+    def _stray(self, frame: Frame, done: list[Exchange]) -> str:
+        if frame.bad:
+            return f"{_bytes(len(frame.raw))} of noise ({frame.bad})"
+        unit = self._units.get(frame.unit)
+        name = unit.name if unit else ""
+        text = f"{name or f'unit {frame.unit}'}: a frame that answers nothing"
+        done.append(
+            Exchange(
+                frame.t_ns, frame.t_ns, self.bus, name, frame.unit, frame.pdu[0] & 0x7F if frame.pdu else 0, "stray",
+                reply=frame.raw, problem="stray", text=text, reply_text=text,
+            )
+        )  # fmt: skip
+        return text
+
+    def _answered(self, opened: _Open, frame: Frame) -> Exchange:
+        answer = parse_reply(opened.asked, opened.frame.pdu, frame.pdu)
+        span, text = opened.asked.read_span, answer.detail or "done"
+        registers: tuple[int, ...] = ()
+        tags: dict[str, Scalar | None] = {}
+        if span is not None and answer.read:
+            registers = words(span, answer.read)
+            if opened.tags is not None:
+                tags = opened.tags.of_registers(span, answer.read, frame.t_ns)
+            text = _shown(opened.tags, span, tags, registers)
+        return self._exchange(opened, frame, answer.problem, text, registers, tags, answer.exception)
+
+    def _unanswered(self, opened: _Open) -> Exchange:
+        return self._exchange(opened, None, "no reply", "no reply")
+
+    def _exchange(
+        self,
+        opened: _Open,
+        reply: Frame | None,
+        problem: str,
+        reply_text: str,
+        registers: tuple[int, ...] = (),
+        tags: dict[str, Scalar | None] | None = None,
+        exception: int | None = None,
+    ) -> Exchange:
+        asked, frame, found = opened.asked, opened.frame, dict(tags or {})
+        span = asked.write_span
+        if span is not None and asked.written:
+            registers = words(span, asked.written) + registers
+            if opened.tags is not None:
+                found |= opened.tags.of_registers(span, asked.written, frame.t_ns)
+        if opened.tags is not None:
+            for touched in asked.spans:
+                for name in opened.tags.names(touched):
+                    found.setdefault(name, None)
+        return Exchange(
+            t_ns=frame.t_ns,
+            end_ns=reply.t_ns if reply else frame.t_ns,
+            bus=self.bus,
+            device=opened.device,
+            unit=frame.unit,
+            function=asked.function,
+            service=asked.service,
+            spans=asked.spans,
+            registers=registers,
+            tags=found,
+            exception=exception,
+            latency_ns=reply.t_ns - frame.t_ns if reply else None,
+            request=frame.raw,
+            reply=reply.raw if reply else b"",
+            problem=problem or asked.problem,
+            text=opened.text,
+            reply_text=reply_text,
+        )
+
+
+def _values(tags: TagMap | None, span: Span, data: bytes, t_ns: int) -> str:
+    found = tags.of_registers(span, data, t_ns) if tags is not None else {}
+    return _shown(tags, span, found, words(span, data))
+
+
+def _shown(tags: TagMap | None, span: Span, found: dict[str, Scalar | None], registers: tuple[int, ...]) -> str:
+    """The tags where there are any, else the words."""
+    if tags is not None and found:
+        return tags.show(found)
+    if tags is not None and tags.secret(span):
+        return "(secret)"
+    most = 8
+    numbers = " ".join(str(r) if span.table in ("coil", "discrete") else f"{r:04X}" for r in registers[:most])
+    return numbers + (f" ... ({len(registers)})" if len(registers) > most else "")
+
+
+def _bytes(count: int) -> str:
+    return f"{count} byte" + "s" * (count != 1)

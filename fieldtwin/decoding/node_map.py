@@ -1,0 +1,136 @@
+"""What is known of a CANopen node without asking it: its tags, its objects' types, and what its PDOs carry.
+
+From the profile, its EDS and the system file at first; then from what the node is seen to be told or to answer, so that a mapping
+written over SDO counts from then on. Pure but for reading the EDS.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fieldtwin.decoding.tags import TagMap
+from gateway.core.errors import FieldtwinError
+from gateway.core.values import Scalar
+from gateway.devices.canopen_rpdo import BITS
+from gateway.devices.config import DeviceConfig
+from gateway.protocols.canopen.cob_id import RPDO1_BASE, TPDO_BASES
+from gateway.protocols.canopen.configure import (
+    PDO_INVALID,
+    RPDO_COMMUNICATION,
+    RPDO_MAPPING,
+    TPDO_COMMUNICATION,
+    TPDO_MAPPING,
+    TPDO_MAX,
+    PdoConfig,
+)
+from gateway.protocols.canopen.datatypes import decode
+from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
+
+_PARAMETERS = range(RPDO_COMMUNICATION, TPDO_MAPPING + TPDO_MAX)
+_KINDS = (("TPDO", TPDO_COMMUNICATION, TPDO_MAPPING), ("RPDO", RPDO_COMMUNICATION, RPDO_MAPPING))
+
+
+@dataclass(frozen=True, slots=True)
+class Pdo:
+    """A PDO of a node: ``TPDO1``, whether the node sends it, and what it carries; None where that is not known."""
+
+    node: int
+    name: str
+    sends: bool
+    mapping: PdoMapping | None
+
+
+class NodeMap:
+    """One node of a bus."""
+
+    def __init__(self, config: DeviceConfig) -> None:
+        self.name = config.name
+        self.node = config.address
+        self.tags = TagMap(config.profile)
+        self._dictionary = _dictionary(config)
+        self._held: dict[tuple[int, int], int] = {}
+        for entry in self._dictionary or ():
+            if entry.index in _PARAMETERS and isinstance(entry.default, int):
+                self._held[entry.index, entry.subindex] = entry.default
+        self._configured(config)
+        self.pdos = self._find()
+
+    def learn(self, index: int, subindex: int, data: bytes) -> bool:
+        """An object's value was seen; True when it changed the node's PDOs."""
+        if index not in _PARAMETERS or not 1 <= len(data) <= 4:
+            return False
+        value = int.from_bytes(data, "little")
+        if self._held.get((index, subindex)) == value:
+            return False
+        self._held[index, subindex] = value
+        self.pdos = self._find()
+        return True
+
+    def value(
+        self, index: int, subindex: int, data: bytes, t_ns: int
+    ) -> tuple[dict[str, Scalar | None], Scalar | None]:
+        """Tags by name, and the value: the tag's, or by the EDS's type, or in hex."""
+        tags = self.tags.of_object(index, subindex, data, t_ns)
+        if tags:
+            return tags, next(iter(tags.values()))
+        entry = self._dictionary.get(index, subindex) if self._dictionary else None
+        if entry is not None:
+            try:
+                value = decode(entry.type_code, data)
+                return {}, value.hex() if isinstance(value, bytes) else value
+            except FieldtwinError:
+                pass  # another size than the type's: shown as it is
+        return {}, data.hex()
+
+    def _configured(self, config: DeviceConfig) -> None:
+        """What the system file makes of it counts more than what it is delivered with."""
+        boot = config.canopen
+        for pdo in boot.tpdos or ():
+            self._set(TPDO_COMMUNICATION, TPDO_MAPPING, pdo)
+        for pdo in boot.rpdos or ():
+            self._set(RPDO_COMMUNICATION, RPDO_MAPPING, pdo)
+        if config.tpdo1:
+            first = PdoConfig(1, TPDO_BASES[0] + self.node, True, 254, 0, self._mapping(config.tpdo1.tags))
+            self._set(TPDO_COMMUNICATION, TPDO_MAPPING, first)
+        if boot.rpdo1:
+            first = PdoConfig(1, RPDO1_BASE + self.node, True, 255, None, self._mapping(boot.rpdo1.tags))
+            self._set(RPDO_COMMUNICATION, RPDO_MAPPING, first)
+
+    def _mapping(self, names: tuple[str, ...]) -> PdoMapping:
+        tags = [self.tags.profile.tags[name] for name in names]
+        return PdoMapping.of((*t.object, BITS[t.type]) for t in tags if t.object)
+
+    def _set(self, communication: int, mapping: int, pdo: PdoConfig) -> None:
+        at = pdo.number - 1
+        self._held[communication + at, 1] = pdo.cob_id | (0 if pdo.enabled else PDO_INVALID)
+        self._held[mapping + at, 0] = len(pdo.mapping.entries)
+        for sub, entry in enumerate(pdo.mapping.entries, 1):
+            self._held[mapping + at, sub] = entry.word
+
+    def _find(self) -> dict[int, Pdo]:
+        """The PDOs that there are, by COB-ID."""
+        found = {}
+        for kind, communication, mapping in _KINDS:
+            for (index, sub), cob in self._held.items():
+                if sub == 1 and 0 <= (at := index - communication) < TPDO_MAX and not cob & PDO_INVALID:
+                    name = f"{kind}{at + 1}"
+                    found[cob & 0x7FF] = Pdo(self.node, name, kind == "TPDO", self._mapped(mapping + at))
+        return found
+
+    def _mapped(self, record: int) -> PdoMapping | None:
+        count = self._held.get((record, 0), 0)
+        words = [self._held.get((record, sub), 0) for sub in range(1, min(count, 64) + 1)]
+        try:
+            return PdoMapping(tuple(PdoEntry.from_word(word) for word in words)) if words else None
+        except FieldtwinError:
+            return None
+
+
+def _dictionary(config: DeviceConfig) -> ObjectDictionary | None:
+    """The node's EDS; None where it has none or it cannot be read, which says nothing about the run."""
+    path = config.profile.eds_path
+    try:
+        return load_dictionary(path, config.address) if path else None
+    except FieldtwinError:
+        return None

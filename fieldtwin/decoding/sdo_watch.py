@@ -1,0 +1,204 @@
+"""SDO transfers of one node, as somebody sees them who only listens (CiA 301, 7.2.4.3).
+
+Expedited, segmented and in blocks, both ways. The first eight bits of a frame say what it is, but inside a block, where they
+number its segments: so the state is followed. What fits nothing is a stray. Pure; keeps one transfer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gateway.protocols.canopen.abort_codes import meaning
+
+MAX_BYTES = 1 << 20
+"""What is kept of one object's value."""
+
+_ABORT = 0x80
+
+
+@dataclass(slots=True)
+class Transfer:
+    """A transfer, as far as it is known. `data` is whole once it is over; `aborted_by` is client or server."""
+
+    upload: bool
+    index: int
+    subindex: int
+    t_ns: int
+    request: bytes
+    data: bytearray = field(default_factory=bytearray)
+    reply: bytes = b""
+    block: bool = False
+    abort: int | None = None
+    aborted_by: str = ""
+    answered: bool = False
+    segments: dict[int, bytes] = field(default_factory=dict)
+    """Of the present sub-block, not acknowledged."""
+    in_segments: bool = False
+    last: int = 0
+    """The number of the last segment of a sub-block, if that is the last of all; else 0."""
+    last_sent: bool = False
+    """Of a segmented download: the client has nothing more."""
+
+    @property
+    def name(self) -> str:
+        return f"{self.index:04X}h:{self.subindex:02X}"
+
+    @property
+    def service(self) -> str:
+        return "SDO upload" if self.upload else "SDO download"
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What a frame was. `done`: the transfer that it ended. `dropped`: one that a new request left without an answer."""
+
+    text: str
+    done: Transfer | None = None
+    dropped: Transfer | None = None
+
+
+class SdoWatch:
+    """Fed with the data of each frame on the node's two SDO identifiers, in order."""
+
+    def __init__(self) -> None:
+        self.open: Transfer | None = None
+
+    def drop(self) -> Transfer | None:
+        """Nothing follows: what is open has no answer."""
+        now, self.open = self.open, None
+        return now
+
+    def request(self, data: bytes, t_ns: int) -> Seen:
+        """A frame of the client's."""
+        if len(data) < 8:
+            return Seen(f"an SDO request of {len(data)} bytes")
+        first, kind, now = data[0], data[0] >> 5, self.open
+        if first == _ABORT:
+            return self._aborted(data, "client")
+        if now is not None and now.in_segments and not now.upload:
+            return _segment_of_block(now, data)
+        if kind in (1, 2) or (kind == 5 and first & 3 == 0) or (kind == 6 and first & 1 == 0):
+            return self._begin(data, kind, t_ns)
+        if now is None:
+            return Seen("an SDO request that belongs to no transfer")
+        if kind == 0 and not now.upload:
+            _keep(now, data[1 : 8 - (first >> 1 & 7)])
+            now.last_sent = bool(first & 1)
+            return Seen(f"{now.name}: segment" + (", the last" if now.last_sent else ""))
+        if kind == 3 and now.upload:
+            return Seen(f"{now.name}: the next segment")
+        if kind == 5 and now.block:
+            return self._block_upload_goes_on(now, data)
+        if kind == 6 and now.block:
+            _trim(now, first >> 2 & 7)
+            return Seen(f"{now.name}: end of the blocks")
+        return Seen("an SDO request that does not fit its transfer")
+
+    def reply(self, data: bytes, t_ns: int) -> Seen:
+        """A frame of the server's."""
+        now = self.open
+        if now is None or len(data) < 4:
+            return Seen("an SDO reply that nobody waits for")
+        first, kind, ours = data[0], data[0] >> 5, data[1:4] == now.request[1:4]
+        if first == _ABORT:
+            return self._aborted(data, "server")
+        if now.in_segments and now.upload:
+            return _segment_of_block(now, data)
+        now.reply = data
+        if kind == 2 and now.upload and ours:
+            return self._upload_reply(now, data)
+        if kind == 3 and not now.upload and ours:
+            now.answered = True
+            return self._over(now) if now.request[0] & 2 else Seen(f"{now.name}: go on")
+        if kind == 1 and not now.upload and now.answered:
+            return self._over(now) if now.last_sent else Seen(f"{now.name}: segment taken")
+        if kind == 0 and now.upload and now.answered:
+            _keep(now, data[1 : 8 - (first >> 1 & 7)])
+            return self._over(now) if first & 1 else Seen(f"{now.name}: segment")
+        if now.block and kind == (6 if now.upload else 5):
+            return self._block_reply(now, data, ours)
+        return Seen("an SDO reply to another request")
+
+    def _begin(self, data: bytes, kind: int, t_ns: int) -> Seen:
+        dropped = self.drop()
+        now = Transfer(kind in (2, 5), int.from_bytes(data[1:3], "little"), data[3], t_ns, data, block=kind in (5, 6))
+        self.open = now
+        if kind == 1 and data[0] & 2:
+            _keep(now, _expedited(data))
+        return Seen(f"{now.service} {now.name}" + (" in blocks" if now.block else ""), dropped=dropped)
+
+    def _upload_reply(self, now: Transfer, data: bytes) -> Seen:
+        now.answered, now.block = True, False  # a node may answer a block upload with a plain one
+        if data[0] & 2:
+            _keep(now, _expedited(data))
+            return self._over(now)
+        size = f"{int.from_bytes(data[4:8], 'little')} bytes" if data[0] & 1 else "some bytes"
+        return Seen(f"{now.name}: {size} in segments")
+
+    def _block_upload_goes_on(self, now: Transfer, data: bytes) -> Seen:
+        match data[0] & 3:
+            case 3:
+                now.in_segments = True
+                return Seen(f"{now.name}: begin")
+            case 2:
+                _acknowledge(now, data[1])
+                return Seen(f"{now.name}: {data[1]} segments taken")
+        return self._over(now)
+
+    def _block_reply(self, now: Transfer, data: bytes, ours: bool) -> Seen:
+        if now.upload and not data[0] & 1 and ours:
+            now.answered = True
+            return Seen(f"{now.name}: blocks of {now.request[4]}")
+        if now.upload:
+            _trim(now, data[0] >> 2 & 7)
+            return Seen(f"{now.name}: end of the blocks")
+        if data[0] & 3 == 0 and ours:
+            now.answered = now.in_segments = True
+            return Seen(f"{now.name}: blocks of {data[4] if len(data) > 4 else '?'}")
+        if data[0] & 3 == 2:
+            _acknowledge(now, data[1])
+            return Seen(f"{now.name}: {data[1]} segments taken")
+        return self._over(now)
+
+    def _over(self, now: Transfer) -> Seen:
+        self.open = None
+        return Seen("", done=now)
+
+    def _aborted(self, data: bytes, by: str) -> Seen:
+        code, now = int.from_bytes(data[4:8], "little"), self.open
+        if now is None or data[1:4] != now.request[1:4]:
+            return Seen(f"abort {code:08X}h {meaning(code)}, of no transfer")
+        now.abort, now.aborted_by, now.reply = code, by, data
+        return self._over(now)
+
+
+def _expedited(data: bytes) -> bytes:
+    return data[4 : 8 - (data[0] >> 2 & 3 if data[0] & 1 else 0)]
+
+
+def _keep(now: Transfer, data: bytes) -> None:
+    if len(now.data) < MAX_BYTES:
+        now.data += data
+
+
+def _trim(now: Transfer, unused: int) -> None:
+    if unused:
+        del now.data[max(0, len(now.data) - unused) :]
+
+
+def _segment_of_block(now: Transfer, data: bytes) -> Seen:
+    number = data[0] & 0x7F
+    now.segments[number] = data[1:]
+    if data[0] & 0x80:
+        now.last = number
+    return Seen(f"{now.name}: segment {number} of a block" + (", the last" if data[0] & 0x80 else ""))
+
+
+def _acknowledge(now: Transfer, upto: int) -> None:
+    """Segments 1 to `upto` count; the rest will come again, numbered from 1."""
+    for number in range(1, upto + 1):
+        _keep(now, now.segments.get(number, b""))
+    if upto and upto == now.last:
+        now.in_segments = False
+    now.segments.clear()
+    now.last = 0

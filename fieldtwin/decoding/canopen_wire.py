@@ -11,7 +11,7 @@ from fieldtwin.decoding.exchange import Exchange, Span
 from fieldtwin.decoding.lss_watch import LssWatch
 from fieldtwin.decoding.node_map import NodeMap, Pdo
 from fieldtwin.decoding.sdo_watch import SdoWatch, Seen, Transfer
-from fieldtwin.decoding.tags import TagMap, show_value
+from fieldtwin.decoding.tags import show_value
 from gateway.core.canframe import CanFrame
 from gateway.core.errors import FieldtwinError
 from gateway.core.values import Scalar
@@ -145,7 +145,7 @@ class CanopenWire:
             found, value = node.value(entry.index, entry.subindex, raw, t_ns)
             tags |= found
             if not found:
-                others.append(f"{entry.index:04X}h:{entry.subindex:02X} {show_value(value)}")
+                others.append(f"{node.named(entry.index, entry.subindex)} {show_value(value)}")
         said = ", ".join(filter(None, [node.tags.show(tags), *others]))
         return self._message(t_ns, pdo.node, pdo.name, f"{head} {said}", data, spans=tuple(spans), tags=tags)
 
@@ -157,57 +157,60 @@ class CanopenWire:
         done = []
         if seen.dropped is not None:
             done.append(self._transferred(node, seen.dropped, t_ns, "no reply"))
-        text = seen.text
         if seen.done is not None:
             done.append(self._transferred(node, seen.done, t_ns, "abort" if seen.done.abort is not None else ""))
-            text = done[-1].reply_text
-        elif not reply and watch.open is not None and watch.open.request is data and not watch.open.upload:
-            text += self._to_write(node, watch.open, t_ns)
-        return f"{self._called(node)}: {text}", done
+            return f"{self._called(node)}: {done[-1].reply_text}", done
+        if watch.open is not None and watch.open.request is data and not reply:
+            return self._asked(node, watch.open), done
+        return f"{self._called(node)}: {seen.text}", done
 
-    def _to_write(self, node: int, transfer: Transfer, t_ns: int) -> str:
-        return f" = {self._value(node, transfer, t_ns)[2]}" if transfer.data else ""
+    def _asked(self, node: int, transfer: Transfer) -> str:
+        """The request of a transfer, with the name of the object and what is written at once."""
+        known = self._nodes.get(node)
+        name = known.named(transfer.index, transfer.subindex) if known else transfer.name
+        text = f"{self._called(node)}: {transfer.service} {name}" + (" in blocks" if transfer.block else "")
+        return text if transfer.upload or not transfer.data else f"{text} = {self._said(node, transfer)}"
+
+    def _said(self, node: int, transfer: Transfer) -> str:
+        data, known = bytes(transfer.data), self._nodes.get(node)
+        if not data:
+            return "nothing"
+        return known.said(transfer.index, transfer.subindex, data, transfer.t_ns) if known else data.hex(" ")
 
     def _transferred(self, node: int, transfer: Transfer, t_ns: int, problem: str) -> Exchange:
-        tags, value, said = self._value(node, transfer, t_ns)
-        text = f"{transfer.service} {transfer.name}"
-        if not transfer.upload and transfer.data:
-            text += f" = {said}"
+        tags, value = self._value(node, transfer, t_ns)
+        text = self._asked(node, transfer)
         failed = transfer.abort is not None or bool(problem)
         known_node = None if failed else self._nodes.get(node)
         if known_node is not None and known_node.learn(transfer.index, transfer.subindex, bytes(transfer.data)):
             self._find_pdos()
+        named = self._nodes[node].named(transfer.index, transfer.subindex) if node in self._nodes else transfer.name
         if transfer.abort is not None:
-            reply_text = f"{transfer.name}: abort {transfer.abort:08X}h {meaning(transfer.abort)}"
+            reply_text = f"{named}: abort {transfer.abort:08X}h {meaning(transfer.abort)}"
             reply_text += " (by the master)" if transfer.aborted_by == "client" else ""
         elif problem:
             reply_text = problem
         else:
-            reply_text = f"{transfer.name} = {said}" if transfer.upload else f"{transfer.name}: written"
+            reply_text = f"{named} = {self._said(node, transfer)}" if transfer.upload else f"{named}: written"
         known = value is not None and not (failed and transfer.upload)
         return Exchange(
             transfer.t_ns, t_ns, self.bus, self._device(node), node, 0, transfer.service,
             (Span("read" if transfer.upload else "write", "object", transfer.index, 1, transfer.subindex),),
             tags=tags if known else dict.fromkeys(tags), abort=transfer.abort,
             latency_ns=None if problem == "no reply" else t_ns - transfer.t_ns, request=transfer.request,
-            reply=transfer.reply, problem=problem, text=f"{self._called(node)}: {text}", reply_text=reply_text,
+            reply=transfer.reply, problem=problem, text=text, reply_text=reply_text,
             value=value if known else None,
         )  # fmt: skip
 
-    def _value(self, node: int, transfer: Transfer, t_ns: int) -> tuple[dict[str, Scalar | None], Scalar | None, str]:
-        """Tags, value, and both in words, of what a transfer has moved so far."""
+    def _value(self, node: int, transfer: Transfer, t_ns: int) -> tuple[dict[str, Scalar | None], Scalar | None]:
+        """Tags and value of what a transfer has moved so far; of one that moved nothing, the tags' names."""
         data, known = bytes(transfer.data), self._nodes.get(node)
         if known is None:
-            return {}, data.hex(), data.hex(" ")
-        if not data and transfer.upload:
+            return {}, data.hex()
+        if not data:
             named = known.tags.names(Span("read", "object", transfer.index, 1, transfer.subindex))
-            return dict.fromkeys(named), None, "nothing"
-        tags, value = known.value(transfer.index, transfer.subindex, data, t_ns)
-        return tags, value, _said(known.tags, tags, value)
+            return dict.fromkeys(named), None
+        return known.value(transfer.index, transfer.subindex, data, t_ns)
 
     def _find_pdos(self) -> None:
         self._pdos = {cob: pdo for node in self._nodes.values() for cob, pdo in node.pdos.items()}
-
-
-def _said(tag_map: TagMap, tags: dict[str, Scalar | None], value: Scalar | None) -> str:
-    return tag_map.show(tags) if tags else show_value(value)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fieldtwin.decoding.tags import TagMap
+from fieldtwin.decoding.tags import TagMap, show_value
 from gateway.core.errors import FieldtwinError
 from gateway.core.values import Scalar
 from gateway.devices.canopen_rpdo import BITS
@@ -28,6 +28,7 @@ from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictiona
 from gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
 
 _PARAMETERS = range(RPDO_COMMUNICATION, TPDO_MAPPING + TPDO_MAX)
+_MAPPINGS = frozenset((*range(RPDO_MAPPING, TPDO_COMMUNICATION), *range(TPDO_MAPPING, TPDO_MAPPING + TPDO_MAX)))
 _KINDS = (("TPDO", TPDO_COMMUNICATION, TPDO_MAPPING), ("RPDO", RPDO_COMMUNICATION, RPDO_MAPPING))
 
 
@@ -82,6 +83,27 @@ class NodeMap:
             except FieldtwinError:
                 pass  # another size than the type's: shown as it is
         return {}, data.hex()
+
+    def named(self, index: int, subindex: int) -> str:
+        """``6010h:00 slope_long``: the tag, else what the EDS calls the object, else the number alone."""
+        number, tag = f"{index:04X}h:{subindex:02X}", self.tags.by_object.get((index, subindex))
+        entry = self._dictionary.get(index, subindex) if self._dictionary else None
+        name = tag.name if tag else entry.name.rpartition(".")[2] if entry else ""
+        return f"{number} {name}".rstrip()
+
+    def said(self, index: int, subindex: int, data: bytes, t_ns: int) -> str:
+        """The value in words: with its unit where it is a tag; identifiers and mappings of PDOs as what they are."""
+        word = int.from_bytes(data, "little")
+        if len(data) == 4 and index in _PARAMETERS:
+            if index not in _MAPPINGS and subindex == 1:
+                return f"{word & 0x7FF:03X}h" + (" (off)" if word & PDO_INVALID else "")
+            if index in _MAPPINGS and subindex:
+                return str(PdoEntry.from_word(word))
+        tags, value = self.value(index, subindex, data, t_ns)
+        if not tags:
+            return show_value(value) if not isinstance(value, str) or value != data.hex() else data.hex(" ")
+        text = self.tags.show(tags)
+        return text.removeprefix(f"{next(iter(tags))} ")
 
     def _configured(self, config: DeviceConfig) -> None:
         """What the system file makes of it counts more than what it is delivered with."""

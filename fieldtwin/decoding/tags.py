@@ -76,8 +76,8 @@ class TagMap:
 
     def _show(self, name: str, value: Scalar | None) -> str:
         tag = self.profile.tags.get(name)
-        if tag is None:
-            return show_value(value)
+        if tag is None:  # a message or a mailbox's payload, in hex
+            return str(value) if value not in (None, "") else "empty"
         if tag.secret:
             return "(secret)"
         word = dict(tag.values).get(value) if isinstance(value, int) else None

@@ -25,8 +25,8 @@ MAX_STATES = 200_000
 
 @dataclass(frozen=True, slots=True)
 class Given:
-    """What one scan is given: inputs by variable (None: BAD, never a value), ms since the scan before, and whether the taker
-    of each message output has emptied its mailbox since."""
+    """What one scan is given: inputs by variable (None: BAD, never a value; a `TagValue` with its quality), ms since the scan
+    before, and whether the taker of each message output has emptied its mailbox since."""
 
     inputs: tuple[tuple[str, Any], ...]
     ms: float
@@ -34,10 +34,14 @@ class Given:
 
     def describe(self) -> dict[str, Any]:
         """JSON-able: for a counterexample."""
-        shown = {
-            name: value.hex() if isinstance(value, bytes) else value for name, value in self.inputs if value is not None
-        }
+        shown = {name: _shown(value) for name, value in self.inputs if value is not None}
         return {"after_ms": self.ms, "inputs": shown, "taken": self.taken}
+
+
+def _shown(value: Any) -> Any:
+    if isinstance(value, TagValue):
+        return {"value": value.value, "quality": str(value.quality), "reason": str(value.reason)}
+    return value.hex() if isinstance(value, bytes) else value
 
 
 Invariant = Callable[[Any], bool]
@@ -49,8 +53,9 @@ class Proof:
     """What is to be proved of a program.
 
     `make` makes it; `domain` has for each input the values that a scan may bring (a message input's are payloads, None for
-    no message; None for any other is BAD); `steps_ms` the times between scans; `key` what of the program matters, as
-    something hashable: two states with one key are the same. `clogs`: mailboxes may also be full.
+    no message; None for any other is BAD without a value, a `TagValue` one of any quality); `steps_ms` the times between
+    scans; `key` what of the program matters, as something hashable: two states with one key are the same. `clogs`: mailboxes
+    may also be full.
     """
 
     make: Callable[[], Program]
@@ -160,6 +165,10 @@ def _hand_in(program: Program, given: Given, now_ns: int) -> None:
         variable = program.variables[name]
         if variable.kind is TagKind.MESSAGE:
             program.__dict__[name] = () if value is None else (Message(1, now_ns, value),)
+            continue
+        if isinstance(value, TagValue):
+            program.__dict__[name] = value.value
+            qualities[name] = TagValue(value.value, value.quality, value.reason, now_ns)
             continue
         program.__dict__[name] = value
         quality, reason = (Quality.BAD, Reason.TIMEOUT) if value is None else (Quality.GOOD, Reason.NONE)

@@ -385,7 +385,10 @@ def test_a_forced_output_is_published_simulated_and_the_logic_sees_it_before_it_
     rig.feed(10, x=1.5)
     force(rig, "d.out", -4.0)
     force(rig, "copy.count", 100)
+    seen: list[int] = []
+    rig.program.also = lambda scan: seen.append(rig.program.count)
     out = rig.execute(11)
+    assert seen == [101]  # the logic added 1 to what was forced, not to what it had
     assert out.value("d.out") == TagValue(-4.0, Quality.SIMULATED, t_ns=11 * MS)
     assert out.value("copy.count") == TagValue(100, Quality.SIMULATED, t_ns=11 * MS)
     assert out.value("copy.first").quality is Quality.GOOD
@@ -427,11 +430,13 @@ def test_why_a_tag_changed_is_known() -> None:
 def test_outputs_first_publishes_at_the_cycles_start_what_the_scan_before_computed() -> None:
     rig = Rig()
     scan = Scan(rig.image, [rig.bound], 100, outputs_first=True)
-    published = []
-    for ms in (10, 20, 30):
+    published: list[object] = []
+    rig.program.also = lambda info: published.append(rig.reader.snapshot().value("d.out").value)
+    for n, ms in enumerate((10, 20, 30), 1):
         rig.feed(ms, x=float(ms))
-        rig.program.also = lambda info: published.append(rig.reader.snapshot().value("d.out").value)
         scan.execute(ms * MS)
+        after = rig.reader.snapshot()
+        assert (after.counter, after.value("d.out").value) == (n, published[-1])  # once a scan, and nothing at its end
     assert published == [None, 10.0, 20.0]
 
 

@@ -11,6 +11,7 @@ import pytest
 from gateway.core.errors import Bug
 from gateway.core.image import TagKind
 from gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, STATES, delta
+from gateway.core.values import Quality, Reason, TagValue
 from plc.diagram import svg
 from plc.program import ScanInfo, var_input, var_local, var_output
 from plc.prove import Proof, machine_key, prove
@@ -61,6 +62,8 @@ def test_a_machine_takes_the_first_transition_that_holds_one_a_scan() -> None:
     assert scan(pump, 5, start=True, stop=True) == "FILLING"  # from IDLE `stop` leads nowhere
     assert scan(pump, 6, start=True, stop=True) == "IDLE"
     assert pump.scans_filling == 3
+    assert scan(pump, 7, start=True) == "FILLING"
+    assert scan(pump, 20, level=85.0) == "IDLE"  # full just when it takes too long: the first of the two, and no more
 
 
 def test_time_in_a_state_counts_from_the_scan_that_entered_it() -> None:
@@ -144,6 +147,41 @@ def test_what_does_not_hold_comes_with_a_shortest_way_to_it() -> None:
     assert (result.proved, result.broken) == (False, "never a fault")
     assert [g.ms for g in result.way] == [10.0, 60.0]
     assert result.way[0].describe()["inputs"] == {"start": True, "level": 10.0, "stop": False}
+    slow = prove(replace(wrong, steps_ms=(10.0, 20.0)))  # filling, then three scans are the fewest that make 50 ms
+    assert [g.ms for g in slow.way][1:] == [10.0, 20.0, 20.0]
+
+
+class Wary(Pump):
+    """Fills on no value but a good one."""
+
+    trusts = (Quality.GOOD,)
+
+    def execute(self, scan: ScanInfo) -> None:
+        self.quality = self.tag("level").quality
+        if self.state_name == "IDLE" and self.quality not in self.trusts:
+            self.level = None  # type: ignore[assignment]
+        super().execute(scan)
+
+
+class Gullible(Wary):
+    trusts = (Quality.GOOD, Quality.UNCERTAIN)
+
+
+def test_the_quality_of_an_input_is_part_of_what_is_proved() -> None:
+    old = TagValue(15.0, Quality.UNCERTAIN, Reason.TIMEOUT)
+    proof = replace(
+        PUMP_PROOF,
+        make=Wary,
+        domain={**PUMP_PROOF.domain, "level": [10.0, None, old]},
+        invariants={
+            "begins on what is good": lambda p: p.state_name != "FILLING" or p.in_state_ms or p.quality is Quality.GOOD,
+            "a value that is not there is bad": lambda p: (p.level is None) <= (p.quality is not Quality.GOOD),
+        },
+    )
+    assert prove(proof).proved
+    found = prove(replace(proof, make=Gullible))
+    assert (found.broken, len(found.way)) == ("begins on what is good", 1)
+    assert found.way[0].describe()["inputs"]["level"] == {"value": 15.0, "quality": "uncertain", "reason": "timeout"}
 
 
 def test_logic_that_raises_is_a_counterexample_too() -> None:

@@ -82,6 +82,15 @@ def test_leaving_loops() -> None:
     body = """FOR i := 1 TO 3 DO j := 0;
                 REPEAT j := j + 1; IF j = 2 THEN CONTINUE; END_IF; s := s + j; UNTIL j >= 3 END_REPEAT; END_FOR"""
     assert run("i, j, s : INT;", body)["s"] == 3 * (1 + 3)
+    body = "REPEAT i := i + 1; IF i = 3 THEN CONTINUE; END_IF; s := s + i; UNTIL i >= 3 END_REPEAT"
+    assert run("i, s : INT;", body)["i"] == 3  # CONTINUE goes to the condition, not past it
+
+
+def test_a_subrange_holds_what_is_inside_it() -> None:
+    assert run("level : INT(0..100); i : INT := 100;", "level := i;")["level"] == 100
+    for i in (101, -1):
+        with pytest.raises(LogicError, match="0 to 100"):
+            run(f"level : INT(0..100); i : INT := {i};", "level := i;")
 
 
 def test_names_of_python_and_of_this_compiler_are_names_like_others() -> None:

@@ -178,6 +178,11 @@ class StuckAlarm:
             raise ScanStuck(f"{self._s * 1000:g} ms and no end")
 
 
+def lead(until_due_ns: int) -> int:
+    """How long before a deadline to be awake, in ns, when it is `until_due_ns` away; 0 when it has passed."""
+    return max(0, min(LEAD_NS, until_due_ns // LEAD_SHARE))
+
+
 def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Callable[[], bool]) -> None:
     """Drive `task` on the wall clock, and `loop` in its slack, until `stop_requested()`; outputs are safe afterwards.
 
@@ -195,9 +200,9 @@ def run_task(task: Driven, loop: asyncio.AbstractEventLoop, stop_requested: Call
             elif now_ns - polled_ns >= POLL_NS:
                 _run_loop(loop, 0)
             else:
-                lead_ns = min(LEAD_NS, (due_ns - now_ns) // LEAD_SHARE)
-                sleep_until_ns(due_ns - lead_ns)
-                while due_ns - lead_ns <= time.monotonic_ns() < due_ns:
+                wake_ns = due_ns - lead(due_ns - now_ns)
+                sleep_until_ns(wake_ns)
+                while wake_ns <= time.monotonic_ns() < due_ns:
                     pass
                 if time.monotonic_ns() >= due_ns and task.running and not stop_requested():
                     task.run_once()

@@ -1,0 +1,88 @@
+"""The PLC on the wall clock: awake a little before its deadlines, never early, and open to be told things meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import time
+
+import pytest
+
+from gateway.core.errors import Bug
+from plc.realtime import GUARD_NS, LEAD_NS, lead, monotonic_ns, run_task, sleep_until_ns
+
+MS = 1_000_000
+
+
+class Beat:
+    """A task that only notes when it was run, relative to when it was due."""
+
+    def __init__(self, cycle_ns: int, count: int) -> None:
+        self.cycle_ns, self.count = cycle_ns, count
+        self.late_ns: list[int] = []
+        self.stopped = 0
+        self.deadline_ns = 0
+
+    @property
+    def running(self) -> bool:
+        return not self.stopped
+
+    def start(self) -> None:
+        self.deadline_ns = monotonic_ns() + self.cycle_ns
+
+    def run_once(self) -> None:
+        now_ns = monotonic_ns()
+        self.late_ns.append(now_ns - self.deadline_ns)
+        self.deadline_ns += ((now_ns - self.deadline_ns) // self.cycle_ns + 1) * self.cycle_ns
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+
+def test_the_lead_is_a_twentieth_of_the_way_and_never_more_than_60_us() -> None:
+    assert LEAD_NS == 60_000
+    assert [lead(ns) for ns in (-5 * MS, 0, 19, 400_000, 1_200_000, GUARD_NS, 1000 * MS)] == [
+        0, 0, 0, 20_000, 60_000, 60_000, 60_000,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("cycle_ns", [700_000, 4 * MS])
+def test_no_scan_begins_before_its_deadline_though_signals_wake_the_process(cycle_ns: int) -> None:
+    """Shorter than the guard the channel is polled, longer it is served in between; both are interrupted all the time."""
+    beat = Beat(cycle_ns, 25)
+    loop = asyncio.new_event_loop()
+    served = []
+    loop.call_soon(lambda: served.append(1))
+    rung = []
+    before = signal.signal(signal.SIGALRM, lambda *_: rung.append(1))
+    signal.setitimer(signal.ITIMER_REAL, 0.0003, 0.0003)
+    try:
+        run_task(beat, loop, lambda: len(beat.late_ns) >= beat.count)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+        loop.close()
+    assert min(beat.late_ns) >= 0
+    assert len(beat.late_ns) == beat.count
+    assert beat.stopped == 1
+    assert served
+    assert rung
+
+
+def test_outputs_are_made_safe_whatever_ends_the_task() -> None:
+    class Raises(Beat):
+        def run_once(self) -> None:
+            raise Bug("broken")
+
+    beat, loop = Raises(MS, 1), asyncio.new_event_loop()
+    with pytest.raises(Bug, match="broken"):
+        run_task(beat, loop, lambda: False)
+    loop.close()
+    assert beat.stopped == 1
+
+
+def test_sleeping_ends_at_the_instant_or_after_it() -> None:
+    for ahead_ns in (-MS, 0, 300_000):
+        until = time.monotonic_ns() + ahead_ns
+        sleep_until_ns(until)
+        assert time.monotonic_ns() >= until

@@ -1,0 +1,225 @@
+"""CANopen frames of a trace as words and exchanges: SDO transfers of every kind, learnt PDOs, and the small services."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from report_rig import MS, can, note, observatory
+
+from emulators.canopen.sdo_server import SdoServer
+from fieldtwin.decoding.decoder import Decoder, exchanges
+from fieldtwin.decoding.exchange import Exchange, Span
+from fieldtwin.decoding.sdo_watch import SdoWatch, Transfer
+from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.canframe import CanFrame
+from gateway.protocols.canopen.sdo import Done, SdoDownload, SdoTransfer, SdoUpload, Send
+from gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
+
+
+def only(events: list[Event]) -> Exchange:
+    (found,) = exchanges(observatory(), events)
+    return found
+
+
+def texts(events: list[Event]) -> list[str]:
+    decoder = Decoder(observatory())
+    return [decoder.decode(e).text for e in events]
+
+
+def test_an_upload() -> None:
+    events = [can(1, "605#4018100400000000"), can(4, "585#43181004ED030000")]
+    assert texts(events) == ["inclinometer: SDO upload 1018h:04 serial", "inclinometer: 1018h:04 serial = 1005"]
+    found = only(events)
+    assert (found.device, found.unit, found.service, found.latency_ns) == ("inclinometer", 5, "SDO upload", 3 * MS)
+    assert found.spans == (Span("read", "object", 0x1018, 1, 4),)
+    assert (found.value, found.tags, found.ok) == (1005, {"serial": 1005}, True)
+    assert str(found.spans[0]) == "1018h:04"
+
+
+def test_a_download_and_its_abort() -> None:
+    events = [can(1, "605#2B171000F4010000"), can(4, "585#8017100030000906")]
+    assert texts(events) == [
+        "inclinometer: SDO download 1017h:00 Producer heartbeat time = 500",
+        "inclinometer: 1017h:00 Producer heartbeat time: abort 06090030h invalid value for parameter",
+    ]
+    found = only(events)
+    assert (found.abort, found.problem, found.value, found.access) == (0x06090030, "abort", 500, "write")
+
+
+def test_a_transfer_that_nobody_answers() -> None:
+    found = exchanges(observatory(), [can(1, "605#4018100400000000"), can(500, "605#4018100400000000")])
+    assert [(e.t_ns // MS, e.problem, e.value) for e in found] == [(1, "no reply", None), (500, "no reply", None)]
+
+
+def test_a_tpdo_as_the_system_file_maps_it() -> None:
+    found = only([can(1, "185#9E013500")])
+    assert (found.service, found.tags, found.access) == ("TPDO1", {"slope_long": 4.14, "slope_lateral": 0.53}, "read")
+    assert found.text == "inclinometer: TPDO1 slope_long 4.14 deg, slope_lateral 0.53 deg"
+
+
+def write(t_ms: float, index: int, sub: int, value: int) -> list[Event]:
+    head = index.to_bytes(2, "little").hex() + f"{sub:02X}"
+    command = "23" if sub else "2F"  # 4 bytes, or 1
+    return [
+        can(t_ms, f"605#{command}{head}{value.to_bytes(4, 'little').hex()}"),
+        can(t_ms + 1, f"585#60{head}00000000"),
+    ]
+
+
+def test_a_mapping_is_learnt_from_what_is_written() -> None:
+    """TPDO1 is moved to another identifier with one object of the two, as a configuration tool would do it."""
+    moved = [*write(0, 0x1800, 1, 0x8000_0185), *write(2, 0x1A00, 0, 0), *write(4, 0x1A00, 1, 0x6020_0010)]
+    moved += [*write(6, 0x1A00, 0, 1), *write(8, 0x1800, 1, 0x0000_01A5)]
+    found = exchanges(observatory(), [*moved, can(10, "1A5#3500"), can(11, "185#3500")])
+    assert found[-2].tags == {"slope_lateral": 0.53}
+    assert found[-1].tags == {}  # that identifier is nobody's now, and what is in it is unknown
+    assert texts(moved)[0::2] == [
+        "inclinometer: SDO download 1800h:01 COB-ID used by TPDO = 185h (off)",
+        "inclinometer: SDO download 1A00h:00 Number of mapped objects = 0",
+        "inclinometer: SDO download 1A00h:01 Mapped object 1 = 6020h:00/16",
+        "inclinometer: SDO download 1A00h:00 Number of mapped objects = 1",
+        "inclinometer: SDO download 1800h:01 COB-ID used by TPDO = 1A5h",
+    ]
+
+
+def test_a_mapping_that_was_refused_is_not_learnt() -> None:
+    refused = [can(0, "605#231A000110002060"), can(1, "585#801A000100000106")]
+    assert exchanges(observatory(), [*refused, can(10, "185#9E013500")])[-1].tags["slope_long"] == 4.14
+
+
+def test_a_pdo_that_is_too_short_says_nothing() -> None:
+    found = only([can(1, "185#9E01")])
+    assert (found.problem, found.tags) == ("malformed", {})
+
+
+@pytest.mark.parametrize(
+    ("frame", "service", "text", "value"),
+    [
+        ("000#0105", "NMT start", "inclinometer: NMT start", None),
+        ("000#8000", "NMT enter pre-operational", "all nodes: NMT enter pre-operational", None),
+        ("080#", "SYNC", "SYNC", None),
+        ("080#07", "SYNC", "SYNC 7", None),
+        ("085#1081110000000000", "EMCY", "inclinometer: EMCY 8110h CAN overrun (objects lost)", 0x8110),
+        ("705#00", "boot-up", "inclinometer: boot-up", "INITIALISING"),
+        ("705#05", "heartbeat", "inclinometer: OPERATIONAL", "OPERATIONAL"),
+        ("70C#7F", "heartbeat", "node 12: PRE-OPERATIONAL", "PRE-OPERATIONAL"),
+        ("18C#0102", "TPDO1", "node 12: TPDO1 01 02", None),
+        ("20C#0102", "RPDO1", "node 12: RPDO1 01 02", None),
+        ("100#112233445566", "TIME", "TIME 11 22 33 44 55 66", None),
+    ],
+)
+def test_messages(frame: str, service: str, text: str, value: object) -> None:
+    found = only([can(1, frame)])
+    assert (found.service, found.text, found.value, found.ok) == (service, text, value, True)
+
+
+def test_frames_that_are_no_canopen() -> None:
+    odd = [can(0, "18DA00F1#01", ext=True), can(1, "000#", err=True), can(2, "705#", rtr=True), can(3, "6E1#00")]
+    odd += [
+        note(4, Kind.FRAME, "can0", id=1 << 31, bytes="00", dir="sent"),
+        note(5, Kind.FRAME, "can0", id=1, bytes="zz"),
+    ]
+    assert texts(odd)[:4] == [
+        "18DA00F1#01: no CANopen (29-bit identifier)", "error frame", "asks for 705h", "6E1#00: no identifier of CANopen",
+    ]  # fmt: skip
+    assert all(text.startswith("unreadable") for text in texts(odd)[4:])
+    assert exchanges(observatory(), odd) == []
+
+
+def test_lss() -> None:
+    found = exchanges(
+        observatory(),
+        [can(0, "7E5#0401000000000000"), can(1, "7E5#1105000000000000"), can(3, "7E4#1100000000000000"),
+         can(5, "7E5#1700000000000000"), can(6, "7E4#1702000000000000"), can(7, "7E5#5E00000000000000"),
+         can(8, "7E5#5100000000800000")],
+    )  # fmt: skip
+    assert [(e.text, e.reply_text, e.problem) for e in found] == [
+        ("LSS switch state global to configuration", "", ""),
+        ("LSS configure node id 5", "done", ""),
+        ("LSS store configuration", "storage media access error", "abort"),
+        ("LSS inquire node id", "no reply", "no reply"),
+        ("LSS fastscan from the start", "no reply", ""),
+    ]
+    assert found[1].latency_ns == 2 * MS
+
+
+class Objects:
+    """An object dictionary of one entry."""
+
+    def __init__(self, value: bytes) -> None:
+        self.value = value
+
+    def read(self, index: int, subindex: int, now_ns: int) -> bytes:
+        return self.value
+
+    def begin_write(self, index: int, subindex: int, size: int | None) -> None:
+        return None
+
+    def write(self, index: int, subindex: int, raw: bytes, now_ns: int) -> None:
+        self.value = raw
+
+
+def listened(transfer: SdoTransfer, server: SdoServer) -> Transfer:
+    """A transfer between our client and the emulator's server, and what a listener makes of it."""
+    watch, seen = SdoWatch(), []
+    waiting = deque([transfer.start(0).data])
+    while waiting:
+        request = waiting.popleft()
+        seen.append(watch.request(request, 0).done)
+        for reply in server.request(request, 0):
+            seen.append(watch.reply(reply, 0).done)
+            step = transfer.feed(reply_frame(reply), 0)
+            if isinstance(step, Send):
+                waiting.append(step.frame.data)
+            if isinstance(step, Done) and step.last is not None:
+                waiting.append(step.last.data)
+        while waiting and (more := transfer.more(0)) is not None:
+            waiting.append(more.frame.data)
+    (done,) = [t for t in seen if t is not None]
+    assert watch.open is None
+    return done
+
+
+def reply_frame(data: bytes) -> CanFrame:
+    return CanFrame(0x585, data)
+
+
+@pytest.mark.parametrize("size", [1, 4, 5, 7, 8, 34, 35, 36, 500])
+@pytest.mark.parametrize("blocks", [False, True])
+def test_transfers_of_every_kind_are_followed(size: int, blocks: bool) -> None:
+    value = bytes(i % 251 for i in range(size))
+    server = SdoServer(Objects(value), 10**9, block=5)
+    kind = SdoBlockUpload if blocks else SdoUpload
+    done = listened(kind(5, 0x2000, 3, 10**9), server)
+    assert (done.service, done.name, bytes(done.data), done.abort) == ("SDO upload", "2000h:03", value, None)
+    objects = Objects(b"")
+    server = SdoServer(objects, 10**9, block=5)
+    download = SdoBlockDownload if blocks else SdoDownload
+    done = listened(download(5, 0x2000, 3, 10**9, value), server)
+    assert (done.service, bytes(done.data), objects.value) == ("SDO download", value, value)
+
+
+@given(st.lists(st.tuples(st.sampled_from([0x605, 0x585, 0x7E4, 0x7E5, 0x185, 0x85, 0x705]), st.binary(max_size=8))))
+@settings(max_examples=60)
+def test_any_frames_are_described(frames: list[tuple[int, bytes]]) -> None:
+    events = [note(t, Kind.FRAME, "can0", id=i, bytes=d.hex(), dir="sent") for t, (i, d) in enumerate(frames)]
+    assert all(texts(events))
+    exchanges(observatory(), events)
+
+
+def test_what_is_no_frame_has_words_too() -> None:
+    events = [
+        note(0, Kind.TAG, "ctd.pressure", value=12.5, quality="good", reason="none"),
+        note(0, Kind.TAG, "ctd.status", value=1, quality="bad", reason="timeout"),
+        note(0, Kind.STATE, "relay.state", value=1),
+        note(0, Kind.FAULT, "f1", name="drop", on=True, target="line1"),
+        note(0, Kind.STEP, "3", text="wait for ctd", verdict="passed"),
+        note(0, Kind.NOTE, "run", text="began"),
+    ]
+    assert texts(events) == [
+        "ctd.pressure 12.5 dbar, good", "ctd.status 1 (sampling), bad: timeout", "relay.state = 1",
+        "fault f1: drop on line1", "step 3: wait for ctd: passed", "run: began",
+    ]  # fmt: skip

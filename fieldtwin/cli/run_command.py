@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shlex
 import signal
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import click
 
@@ -57,6 +59,11 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
 @click.option(
     "--capture", type=click.Path(dir_okay=False), help="Write what goes over the wires to this file (JSON lines)."
 )
+@click.option("--virtual", is_flag=True, help="With --prototype: in virtual time, in this process, as fast as it goes.")
+@click.option("--seed", type=int, default=None, help="Another seed than the prototype file's (with --virtual).")
+@click.option("--seeds", default="", metavar="1..200", help="With --virtual: a run for each of these seeds.")
+@click.option("--jobs", type=click.IntRange(1, 256), default=1, help="So many runs of --seeds at once.")
+@click.option("--trace", type=click.Path(dir_okay=False), help="With --virtual: every event to this file (JSON lines).")
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
 @json_option
@@ -76,6 +83,11 @@ def command(
     can: str,
     commands: str | None,
     capture: str | None,
+    virtual: bool,
+    seed: int | None,
+    seeds: str,
+    jobs: int,
+    trace: str | None,
     cold: bool,
     profiles: tuple[str, ...],
     as_json: bool,
@@ -96,6 +108,32 @@ def command(
         )
     if prototype and allow_writes:
         raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
+    if virtual:
+        if plant or field_host or listen or can or capture:
+            raise UsageError(
+                "--virtual is a prototype in this process, its wires in memory",
+                hint="--plant, --field, --listen, --can and --capture go with real wires; --trace FILE has the frames",
+            )
+        if duration_s <= 0:
+            raise UsageError("--virtual needs an end", expected="--for 24h")
+        return _run_virtual(
+            VirtualRequest(
+                system,
+                duration_s,
+                seed,
+                profiles,
+                prototype_file,
+                recordings,
+                speed,
+                commands,
+                trace,
+            ),
+            seeds,
+            jobs,
+            as_json,
+        )
+    if seeds or seed is not None or trace or jobs != 1:
+        raise UsageError("--seed, --seeds, --jobs and --trace go with --virtual")
     options = RunOptions(
         system=system,
         prototype=prototype,
@@ -115,6 +153,55 @@ def command(
         cold=cold,
     )
     return asyncio.run(_run(options, as_json))
+
+
+class VirtualRequest(NamedTuple):
+    """What the command line says of a run in virtual time."""
+
+    system: str
+    duration_s: float
+    seed: int | None
+    profiles: tuple[str, ...]
+    prototype_file: str | None
+    recordings: tuple[str, ...]
+    speed: float
+    commands: str | None
+    trace: str | None
+
+
+def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, as_json: bool) -> int:
+    from fieldtwin.cli.virtual_view import parse_seeds, run_many, run_one
+    from fieldtwin.running.virtual_run import VirtualOptions
+
+    options = VirtualOptions(
+        system=request.system,
+        duration_s=request.duration_s,
+        seed=request.seed,
+        profiles=tuple(Path(p) for p in request.profiles),
+        prototype_file=Path(request.prototype_file) if request.prototype_file else None,
+        recordings=pairs(request.recordings, "--recording"),
+        speed=request.speed,
+        commands=parse_periods(request.commands) if request.commands is not None else DEFAULT_SCRIPT,
+        trace=Path(request.trace) if request.trace else None,
+    )
+    if not seeds:
+        return run_one(options, as_json)
+    if request.trace or request.seed is not None:
+        raise UsageError("--seeds makes many runs", hint="--seed and --trace belong to one")
+    return run_many(options, parse_seeds(seeds), jobs, as_json, lambda seed: _again(seed))
+
+
+def _again(seed: int) -> str:
+    """The command line that repeats the run of one seed."""
+    words, skip = [], False
+    for word in sys.argv[1:]:
+        if skip:
+            skip = False
+        elif word in ("--seeds", "--jobs"):
+            skip = True
+        elif not word.startswith(("--seeds=", "--jobs=")):
+            words.append(word)
+    return shlex.join(["fieldtwin", *words, "--seed", str(seed)])
 
 
 async def _run(options: RunOptions, as_json: bool) -> int:

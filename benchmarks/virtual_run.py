@@ -1,0 +1,110 @@
+#!/usr/bin/env python3
+"""How many times as fast as time a whole prototype runs in virtual time: gateway, PLC and emulators, unmodified.
+
+    benchmarks/virtual_run.py [--runs 3] [--quick]
+
+The observatory with its sensor polled each second, its mailbox each 500 ms, TPDO and heartbeat each second: with a scan of
+100 ms, with one of 10 ms, and with everything at 100 ms. Everything is traced and hashed, and every value that is published as
+good is compared with what its device held. The peer is the wall clock: 1. Beside it, for scale, the same loop doing nothing but
+wake two tasks a scan. Medians; exit status 1 when a goal is missed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+from peers import Goals
+
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.loop import VirtualLoop
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+
+ROOT = Path(__file__).resolve().parents[1]
+SHIPPED = ROOT / "profiles" / "systems"
+CASES = {
+    "each second, scan 100 ms": (100, 1000, 500, 1000, 3600.0, 1000.0),
+    "each second, scan 10 ms": (10, 1000, 500, 1000, 600.0, 150.0),
+    "everything at 100 ms": (100, 100, 100, 100, 600.0, 300.0),
+}
+"""Scan, sensor, mailbox, TPDO and heartbeat in ms; virtual seconds; the goal."""
+
+
+def system(folder: Path, scan: int, sensor: int, mailbox: int, node: int) -> Path:
+    """The shipped system file with other periods; everything else is as shipped."""
+    text = (SHIPPED / "observatory.yaml").read_text()
+    for old, new in (
+        ("cycle_ms: 10", f"cycle_ms: {scan}"),
+        ("{values: {every_ms: 500}, status: {every_ms: 1000}}", f"{{values: {{every_ms: {sensor}}}}}"),
+        ("stale_after_ms: 1500", "stale_after_ms: 3500"),
+        (
+            "heartbeat: {producer_ms: 500, consumer_ms: 1500}",
+            f"heartbeat: {{producer_ms: {node}, consumer_ms: {3 * node}}}",
+        ),
+        ("event_ms: 100}", f"event_ms: {node}}}"),
+        ("stale_after_ms: 500\n", "stale_after_ms: 3500\n"),
+        ("{inbox: {every_ms: 200}, status: {every_ms: 2000}}", f"{{inbox: {{every_ms: {mailbox}}}}}"),
+    ):
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    path = folder / "observatory.yaml"
+    path.write_text(text)
+    (folder / "observatory.prototype.yaml").write_text((SHIPPED / "observatory.prototype.yaml").read_text())
+    return path
+
+
+def faster(path: Path, seconds: float) -> tuple[float, str]:
+    """One run; how many times as fast as time, and its trace's hash."""
+    run = VirtualRun(VirtualOptions(str(path), seconds, seed=1))
+    began = time.perf_counter()
+    run.run()
+    took = time.perf_counter() - began
+    summary = run.summary()
+    assert summary["published"]["checked"], summary
+    assert summary["ok"], summary["errors"]
+    return seconds / took, summary["trace"]["sha256"]
+
+
+def idle(scan_ms: int, seconds: float) -> float:
+    """The loop alone: two tasks that wake each scan."""
+    loop = VirtualLoop()
+    clock = VirtualClock(loop)
+
+    async def task() -> None:
+        for _ in range(int(seconds * 1000 / scan_ms)):
+            await clock.sleep_until_ns(loop.now_ns + scan_ms * 1_000_000)
+
+    async def main() -> None:
+        await asyncio.gather(task(), task())
+
+    began = time.perf_counter()
+    loop.run_until_complete(main())
+    return seconds / (time.perf_counter() - began)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--quick", action="store_true", help="one short run each")
+    options = parser.parse_args()
+    goals = Goals()
+    print("times as fast as time                 median    loop alone    trace")
+    for name, (scan, sensor, mailbox, node, seconds, goal) in CASES.items():
+        runs, seconds = (1, seconds / 5) if options.quick else (options.runs, seconds)
+        with tempfile.TemporaryDirectory() as folder:
+            path = system(Path(folder), scan, sensor, mailbox, node)
+            found = [faster(path, seconds) for _ in range(runs)]
+        speed = median(f for f, _ in found)
+        assert len({digest for _, digest in found}) == 1, "the same seed gave different traces"
+        print(f"  {name:<32} {speed:>9.0f}x {idle(scan, seconds):>12.0f}x    {found[0][1][:12]}")
+        goals.least(f"virtual, {name}", speed, goal, "times as fast as time")
+    return goals.verdict()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,123 @@
+"""`fieldtwin run --virtual` on a terminal: how far it is, what came of it, and of many seeds which failed."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from fieldtwin.cli.live_view import print_summary
+from fieldtwin.cli.talk import data, talk
+from gateway.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from fieldtwin.running.many_seeds import SeedResult
+    from fieldtwin.running.virtual_run import VirtualOptions
+
+
+def parse_seeds(text: str) -> range:
+    """``7`` or ``1..200``. Raises `UsageError`."""
+    from fieldtwin.running.many_seeds import MAX_SEEDS
+
+    first, dots, last = text.partition("..")
+    if not first.isdigit() or (dots and not last.isdigit()):
+        raise UsageError("seeds", expected="a number, or 1..200", got=text)
+    seeds = range(int(first), int(last or first) + 1)
+    if not 0 < len(seeds) <= MAX_SEEDS:
+        raise UsageError("seeds", expected=f"1 to {MAX_SEEDS} of them, the lower first", got=text)
+    return seeds
+
+
+def run_one(options: VirtualOptions, as_json: bool) -> int:
+    """One run, its summary on stdout. The exit status: 0 when all is well."""
+    from fieldtwin.running.virtual_run import VirtualRun
+
+    run = VirtualRun(options)
+    talk.print(
+        f"{run.system.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
+    )
+    began = time.perf_counter()
+    with _bar(options.duration_s) as at:
+        run.run(at)
+    took_s = time.perf_counter() - began
+    summary = run.summary()
+    if as_json:
+        json.dump(summary, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_summary(summary)
+        data.print(f"  trace          {summary['trace']['events']} events, sha256 {summary['trace']['sha256']}")
+        data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times as fast as time")
+    return 0 if summary["ok"] else 1
+
+
+def run_many(options: VirtualOptions, seeds: range, jobs: int, as_json: bool, again: Callable[[int], str]) -> int:
+    """A run a seed. `again(seed)` is the line that repeats one. The exit status: 0 when all were well."""
+    from fieldtwin.running.many_seeds import run_seeds
+
+    began = time.perf_counter()
+    done = 0
+    with _bar(float(len(seeds)), "seeds") as at:
+
+        def ended(result: SeedResult) -> None:
+            nonlocal done
+            done += 1
+            at(float(done))
+
+        results = run_seeds(options, seeds, jobs, ended)
+    took_s = time.perf_counter() - began
+    failed = [r for r in results if not r.ok]
+    if as_json:
+        json.dump({"results": [_plain(r) for r in results], "failed": [r.seed for r in failed]}, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+        return 1 if failed else 0
+    for result in failed:
+        data.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
+        for error in result.errors:
+            data.print(f"  {error}", soft_wrap=True, markup=False)
+        data.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
+    table.add_row("virtual time", shown_time(options.duration_s * len(results)))
+    checked, wrong = sum(r.checked for r in results), sum(r.wrong for r in results)
+    table.add_row("published", f"{checked} compared with what the devices held, {wrong} wrong")
+    table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times as fast as time")
+    data.print(table)
+    data.print("[bold red]not ok[/bold red]" if failed else "[bold green]ok[/bold green]")
+    return 1 if failed else 0
+
+
+def _plain(result: SeedResult) -> dict[str, Any]:
+    return {name: getattr(result, name) for name in result.__slots__}
+
+
+def shown_time(seconds: float) -> str:
+    """A length of virtual time, for a person."""
+    if seconds >= 2 * 3600:
+        return f"{seconds / 3600:g} h"
+    return f"{seconds / 60:g} min" if seconds >= 120 else f"{seconds:g} s"
+
+
+class _bar:
+    """A progress bar on stderr where that is a terminal. ``with _bar(60.0) as at: at(12.0)``."""
+
+    def __init__(self, total: float, unit: str = "s") -> None:
+        columns = (
+            TextColumn("{task.percentage:3.0f} %"),
+            BarColumn(),
+            TextColumn("{task.completed:g} {task.fields[unit]}"),
+        )
+        self._progress = Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal)
+        self._task = self._progress.add_task("", total=total, unit=unit)
+
+    def __enter__(self) -> Callable[[float], None]:
+        self._progress.start()
+        return lambda value: self._progress.update(self._task, completed=value)
+
+    def __exit__(self, *exc: object) -> None:
+        self._progress.stop()

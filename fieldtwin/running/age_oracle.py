@@ -1,0 +1,81 @@
+"""The strict oracle of a run in virtual time: was every value that was published as good held by its device inside its age.
+
+Both sides share one clock there, so "inside its age" is exact: from the value's own time to the moment of its publication the
+device must have held those very bytes at least once. Bounded: what lies `KEPT_NS` back is forgotten.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field
+from typing import Any
+
+from gateway.core.clock import NS_PER_S
+
+KEPT_NS = 600 * NS_PER_S
+EXAMPLES = 10
+
+
+@dataclass
+class _Held:
+    """What a tag was: from `times_ns[i]` on, `raws[i]`."""
+
+    times_ns: list[int] = field(default_factory=list)
+    raws: list[bytes] = field(default_factory=list)
+
+    def note(self, t_ns: int, raw: bytes) -> None:
+        self.times_ns.append(t_ns)
+        self.raws.append(raw)
+
+    def was(self, raw: bytes, from_ns: int, to_ns: int) -> bool:
+        """Whether it was `raw` at any time between, both ends included."""
+        first = max(0, bisect_right(self.times_ns, from_ns) - 1)
+        last = bisect_right(self.times_ns, to_ns)
+        return raw in self.raws[first:last]
+
+    def forget(self, before_ns: int) -> None:
+        gone = bisect_right(self.times_ns, before_ns) - 1
+        if gone > 0:
+            del self.times_ns[:gone], self.raws[:gone]
+
+
+class AgeOracle:
+    """Tell it what was published (`published`) and what was held (`held`), in order of time; then `judge`."""
+
+    def __init__(self) -> None:
+        self.checked = 0
+        self.wrong_count = 0
+        self.wrong: list[str] = []
+        self._held: dict[str, _Held] = {}
+        self._waiting: list[tuple[int, str, bytes, object, int]] = []
+
+    def held(self, tag: str, raw: bytes, t_ns: int) -> None:
+        """From `t_ns` on the device holds `raw` for DEVICE.TAG."""
+        self._held.setdefault(tag, _Held()).note(t_ns, raw)
+
+    def published(self, tag: str, raw: bytes, value: object, source_ns: int, now_ns: int) -> None:
+        """DEVICE.TAG was published as good at `now_ns`, as of `source_ns`."""
+        self._waiting.append((now_ns, tag, raw, value, source_ns))
+
+    def judge(self, emulated: frozenset[str]) -> None:
+        """Compare what is waiting. Tags of devices that are not `emulated` are nobody's to judge."""
+        for now_ns, tag, raw, value, source_ns in self._waiting:
+            if tag.partition(".")[0] not in emulated:
+                continue
+            self.checked += 1
+            held = self._held.get(tag)
+            if held is None or not held.was(raw, source_ns, now_ns):
+                self.wrong_count += 1
+                if len(self.wrong) < EXAMPLES:
+                    age_s = (now_ns - source_ns) / NS_PER_S
+                    self.wrong.append(
+                        f"{tag} was published as {value!r} ({raw.hex()}), {age_s:.3f} s old: the device held no such thing"
+                    )
+        if self._waiting:
+            oldest_ns = self._waiting[-1][0] - KEPT_NS
+            for held in self._held.values():
+                held.forget(oldest_ns)
+        self._waiting.clear()
+
+    def describe(self) -> dict[str, Any]:
+        return {"checked": self.checked, "wrong": self.wrong_count, "examples": list(self.wrong)}

@@ -1,0 +1,95 @@
+"""The ledger of virtual hours: one line a run that ended, so that nights add up and none is run twice.
+
+A line belongs to what was run: system and prototype file, version, virtual time, faults. Only lines of the same make a seed done.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import msgspec
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.running.many_seeds import SeedResult
+from gateway.core.errors import FileInvalid, Unreachable
+
+
+class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One run. `what` is `fingerprint` of what was run; `wrong` values of `checked` were never held by their device."""
+
+    what: str
+    version: str
+    seed: int
+    hours: float
+    ok: bool
+    checked: int
+    wrong: int
+    sha256: str
+    errors: tuple[str, ...] = ()
+
+
+def fingerprint(*parts: str) -> str:
+    """A name for what was run: the same texts (files, options) give the same name."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "big") + part.encode())
+    return digest.hexdigest()[:16]
+
+
+class Ledger:
+    """A file of entries, appended to. A last line that a kill cut off is taken away. Raises `FileInvalid`, `Unreachable`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.entries: list[Entry] = []
+        data = path.read_bytes() if path.exists() else b""
+        *lines, rest = data.split(b"\n")
+        for number, line in enumerate(lines, 1):
+            try:
+                self.entries.append(msgspec.json.decode(line, type=Entry))
+            except msgspec.DecodeError as e:
+                raise FileInvalid(f"no line of a ledger: {e}", path=str(path), line=number) from e
+        if rest:
+            os.truncate(path, len(data) - len(rest))
+
+    def done(self, what: str) -> set[int]:
+        """The seeds that were run of this, by this version."""
+        return {e.seed for e in self.entries if e.what == what and e.version == __version__}
+
+    def add(self, what: str, hours: float, result: SeedResult) -> None:
+        """On disk before this returns."""
+        entry = Entry(
+            what,
+            __version__,
+            result.seed,
+            hours,
+            result.ok,
+            result.checked,
+            result.wrong,
+            result.sha256,
+            result.errors,
+        )
+        try:
+            with self.path.open("ab") as file:
+                file.write(msgspec.json.encode(entry) + b"\n")
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as e:
+            raise Unreachable(f"cannot write the ledger: {e.strerror}", where=str(self.path)) from e
+        self.entries.append(entry)
+
+    @property
+    def hours(self) -> float:
+        """All virtual hours in it."""
+        return sum(e.hours for e in self.entries)
+
+    @property
+    def wrong(self) -> int:
+        return sum(e.wrong for e in self.entries)
+
+    @property
+    def failed(self) -> list[Entry]:
+        """The runs that did not end well."""
+        return [e for e in self.entries if not e.ok]

@@ -1,0 +1,76 @@
+"""One run in virtual time after the other, a seed each, in several processes: which seeds fail, and why."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, replace
+
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+
+MAX_SEEDS = 100_000
+_ERRORS_SHOWN = 5
+
+
+@dataclass(frozen=True, slots=True)
+class SeedResult:
+    """How the run of one seed ended. `checked` values were compared with what devices held, `wrong` of them never were."""
+
+    seed: int
+    ok: bool
+    errors: tuple[str, ...]
+    checked: int
+    wrong: int
+    events: int
+    sha256: str
+
+
+def run_seed(options: VirtualOptions) -> SeedResult:
+    """One run, whole."""
+    run = VirtualRun(options)
+    run.run()
+    summary = run.summary()
+    return SeedResult(
+        run.seed,
+        summary["ok"],
+        tuple(summary["errors"][:_ERRORS_SHOWN]),
+        summary["published"]["checked"],
+        summary["published"]["wrong"],
+        summary["trace"]["events"],
+        summary["trace"]["sha256"],
+    )
+
+
+def run_seeds(
+    options: VirtualOptions, seeds: range, jobs: int, on_result: Callable[[SeedResult], None] | None = None
+) -> list[SeedResult]:
+    """A run a seed, `jobs` at a time, in the order of the seeds. `on_result` is told of each as it ends."""
+    if jobs <= 1:
+        results = []
+        for seed in seeds:
+            results.append(run_seed(replace(options, seed=seed)))
+            if on_result is not None:
+                on_result(results[-1])
+        return results
+    found: dict[int, SeedResult] = {}
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        for result in _as_they_end(pool, options, seeds, 2 * jobs):
+            found[result.seed] = result
+            if on_result is not None:
+                on_result(result)
+    return [found[seed] for seed in seeds]
+
+
+def _as_they_end(
+    pool: ProcessPoolExecutor, options: VirtualOptions, seeds: range, at_once: int
+) -> Iterator[SeedResult]:
+    waiting: set[Future[SeedResult]] = set()
+    for seed in seeds:
+        waiting.add(pool.submit(run_seed, replace(options, seed=seed)))
+        if len(waiting) >= at_once:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            yield from (future.result() for future in done)
+    while waiting:
+        done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+        yield from (future.result() for future in done)

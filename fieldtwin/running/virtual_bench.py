@@ -1,0 +1,198 @@
+"""A prototype in virtual time as a scenario's bench: what happens is traced, and whoever judges asks here.
+
+A `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `VirtualLoop`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+from emulators.virtual.loop import VirtualLoop
+from fieldtwin.running.shore import Scripted, Shore
+from fieldtwin.running.states import NAMES
+from fieldtwin.scenarios.bench import Can, Reading
+from fieldtwin.scenarios.trace import Kind, Trace
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import Direction
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.nursery import Nursery
+from gateway.core.values import TagValue
+from plc.publishing import Change
+from twin.prototype_file import Prototype
+from twin.system import System
+from twin.virtual import VirtualPrototype
+
+
+class VirtualBench:
+    """``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
+
+    `commands` is what the far end commands by itself; a scenario does that with `send`. `far_end` False leaves it out.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        prototype: Prototype,
+        loop: VirtualLoop,
+        run_dir: Path,
+        trace: Trace,
+        *,
+        seed: int | None = None,
+        commands: list[Scripted] | None = None,
+        far_end: bool = True,
+    ) -> None:
+        self.system = system
+        self.trace = trace
+        self.loop = loop
+        self.run = VirtualPrototype(
+            system, prototype, loop, run_dir, seed=seed, taps=[_FrameTap(self, system)], on_change=self._changed
+        )
+        self.shore: Shore | None = None
+        self._commands = commands or []
+        self._far_end = far_end
+        self._updates: dict[str, int] = {}
+        self._states = {f"{program}.state" for program in system.plc.programs}
+        self._stack = AsyncExitStack()
+
+    target = "virtual"
+    can = frozenset(
+        {
+            Can.SEND_COMMAND,
+            Can.SEE_WIRE,
+            Can.SEE_HELD,
+            Can.EXACT_TIME,
+        }
+    )
+
+    async def __aenter__(self) -> VirtualBench:
+        await self._stack.enter_async_context(self.run)
+        self.run.gateway.tags.on_put = self._put
+        device = next(iter(self.run.field.far), None)
+        if device is not None and self._far_end:
+            self.shore = Shore(self.system, device, self.run.field.far[device], self.run.clock, self.run.net)
+            nursery = await self._stack.enter_async_context(Nursery())
+            nursery.start(self.shore.run(self._commands), "far end")
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self._stack.aclose()
+
+    # -- what happens ---------------------------------------------------------------------------------------------------
+
+    @property
+    def now_ns(self) -> int:
+        """Since the run's start."""
+        return self.loop.now_ns - self.run.started_ns
+
+    def note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
+        """Something happened now."""
+        self.trace.note(self.now_ns, kind, where, data)
+
+    def _put(self, name: str, value: TagValue) -> None:
+        self._updates[name] = self._updates.get(name, 0) + 1
+        shown = value.value.hex() if isinstance(value.value, bytes) else value.value
+        self.note(
+            Kind.TAG, name, {"value": shown, "quality": value.quality.name.lower(), "reason": value.reason.name.lower()}
+        )
+
+    def _changed(self, change: Change) -> None:
+        value: Any = change.after
+        if change.tag in self._states and isinstance(value, int) and 0 <= value < len(NAMES):
+            value = NAMES[value]
+        self.note(Kind.STATE, change.tag, {"value": value})
+
+    # -- Bench ----------------------------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        return self.now_ns / NS_PER_S
+
+    async def sleep_until_s(self, t_s: float) -> None:
+        """Raises what a part of the system failed with meanwhile."""
+        await self.run.clock.sleep_until_ns(self.run.started_ns + round(t_s * NS_PER_S))
+        failure = self.run.failure()
+        if failure is not None:
+            raise failure
+
+    def names(self) -> list[str]:
+        return [*self.run.gateway.tags.names, *self.run.plc.outputs.last()]
+
+    def reading(self, name: str) -> Reading | None:
+        outputs = self.run.plc.outputs.last()
+        if name in outputs and name not in self.run.gateway.tags.names:
+            value: Any = outputs[name]
+            if name in self._states and isinstance(value, int) and 0 <= value < len(NAMES):
+                value = NAMES[value]
+            return None if value is None else Reading(value, "good", "", 0.0, 0)
+        if name not in self.run.gateway.tags.names:
+            raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
+        now_ns = self.run.clock.monotonic_ns()
+        seen = self.run.gateway.tags.current(name, now_ns)
+        if not self._updates.get(name) and seen.value is None:
+            return None
+        return Reading(
+            seen.value,
+            seen.quality.name.lower(),
+            seen.reason.name.lower(),
+            (now_ns - seen.t_ns) / NS_PER_S,
+            self._updates.get(name, 0),
+        )
+
+    def late_ms(self) -> float:
+        return 0.0
+
+    async def send(self, period_s: int) -> None:
+        if self.shore is None:
+            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+        self.shore.send(period_s)
+
+    async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
+        raise UsageError("values cannot be set on this target", expected="one that can", got=f"{device}.{tag}")
+
+    async def inject(self, fault: dict[str, Any]) -> None:
+        raise UsageError("faults cannot be put in on this target", got=str(fault.get("name")))
+
+    async def clear(self, id: str) -> None:
+        raise UsageError("there are no faults on this target", got=id)
+
+    async def held(self, name: str) -> list[tuple[float, bytes]]:
+        device, _, tag = name.partition(".")
+        if device not in self.run.field.devices:
+            raise UsageError(f"no emulated device {device!r}", expected=", ".join(self.run.field.devices))
+        start_ns = self.run.started_ns
+        return [
+            ((h.t_ns - start_ns) / NS_PER_S, h.raw)
+            for h in self.run.field.devices[device].journal.since(0)
+            if h.tag == tag
+        ]
+
+
+class _FrameTap:
+    """`gateway.core.connection.Tap` that writes a trace."""
+
+    def __init__(self, bench: VirtualBench, system: System) -> None:
+        self._note: Callable[[Kind, str, dict[str, Any]], None] = bench.note
+        self._bus = {str(bus.endpoint): name for name, bus in system.buses.items()}
+        self._known: dict[int, tuple[Endpoint, str]] = {}
+
+    def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
+        self._note(Kind.FRAME, self._name(endpoint), {"dir": direction.value, "bytes": data.hex()})
+
+    def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
+        data: dict[str, Any] = {"dir": direction.value, "id": frame.can_id, "bytes": frame.data.hex()}
+        for word, is_set in (("rtr", frame.remote), ("ext", frame.extended), ("err", frame.error)):
+            if is_set:
+                data[word] = True
+        self._note(Kind.FRAME, self._name(endpoint), data)
+
+    def _name(self, endpoint: Endpoint) -> str:
+        """The bus of an endpoint: writing one out takes longer than all else here."""
+        known = self._known.get(id(endpoint))
+        if known is None or known[0] is not endpoint:
+            known = endpoint, self._bus.get(str(endpoint), str(endpoint))
+            self._known[id(endpoint)] = known
+        return known[1]

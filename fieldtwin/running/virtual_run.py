@@ -1,0 +1,222 @@
+"""A run in virtual time: ``fieldtwin run SYSTEM --prototype --virtual --seed N --for 24h``.
+
+Everything happens in this thread, sealed off from clocks, sockets and threads; between two pieces of the run the world is
+looked at again, to show how far it is. What is the same from run to run is traced and hashed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.seal import sealed
+from fieldtwin.running.age_oracle import AgeOracle
+from fieldtwin.running.shore import Shore, script
+from fieldtwin.running.states import StateWatch, expected_states
+from fieldtwin.running.summary import summarise
+from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.scenarios.trace import Event, Kind, Trace
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FieldtwinError
+from gateway.core.values import Quality, TagValue
+from gateway.runtime.learnt import describe_learnt
+from gateway.runtime.status import describe
+from twin.field import FieldSide
+from twin.field_process import FieldConfig, resolve
+
+PIECE_S = 10.0
+"""Virtual seconds between two looks at the world, and between two judgements."""
+SETTLE_S = 10.0
+"""How long a command that is still under way may take after the run's time is over."""
+LAST_REPLIES_S = 0.5
+TRACE_KEPT = 20_000
+MAX_ERRORS = 100
+
+
+@dataclass(frozen=True)
+class VirtualOptions:
+    """What to run, and for how long. `faults` is put in besides; `trace` is a file for every event."""
+
+    system: str
+    duration_s: float
+    seed: int | None = None
+    profiles: tuple[Path, ...] = ()
+    prototype_file: Path | None = None
+    recordings: dict[str, str] = field(default_factory=dict)
+    speed: float = 0.0
+    commands: tuple[int, ...] = ()
+    faults: tuple[dict[str, Any], ...] = ()
+    trace: Path | None = None
+    prototype: bool = True
+    field_host: str = ""
+
+
+class _Instance:
+    name = "virtual"
+
+
+class VirtualRun:
+    """One run. `summary()` afterwards; `trace` and `oracle` while it runs."""
+
+    def __init__(self, options: VirtualOptions) -> None:
+        config = FieldConfig(
+            system=options.system,
+            run_dir="",
+            prototype=str(options.prototype_file) if options.prototype_file else "",
+            profiles=tuple(map(str, options.profiles)),
+            recordings=options.recordings,
+            speed=options.speed,
+        )
+        twin = resolve(config)  # what can be wrong in the files is wrong before anything starts
+        self.options = options
+        self.system = twin.ecs.system
+        self.prototype = twin.prototype
+        self.seed = self.prototype.seed if options.seed is None else options.seed
+        self.instance = _Instance()
+        self.states = StateWatch(self.system)
+        self.oracle = AgeOracle()
+        self.errors: list[str] = []
+        self.trace = Trace(TRACE_KEPT)
+        self.gateway_status: dict[str, Any] | None = None
+        self.plc_status: dict[str, Any] | None = None
+        self.field_status: dict[str, Any] | None = None
+        self.counted_before: dict[str, dict[str, int]] = {}
+        self.outputs_confirmed_safe: bool | None = None
+        self.elapsed_s = 0.0
+        self.mapping: dict[Endpoint, Endpoint] = {}
+        self.far: dict[str, Endpoint] = {}
+        self.shore: Shore | None = None
+        self._numbers: dict[str, int] = {}
+        self._emulated: frozenset[str] = frozenset()
+
+    @property
+    def disturbed(self) -> bool:
+        return bool(self.options.faults)
+
+    def run(self, progress: Callable[[float], None] | None = None) -> None:
+        """Run it. `progress` is told the virtual seconds that are over, from time to time. Errors are kept in `errors`."""
+        loop = VirtualLoop()
+        with ExitStack() as stack:
+            run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
+            sink: BinaryIO | None = None
+            if self.options.trace is not None:
+                sink = stack.enter_context(self.options.trace.open("wb"))
+            self.trace = Trace(TRACE_KEPT, sink)
+            stack.callback(loop.close)
+            with sealed():
+                main = loop.create_task(self._main(loop, run_dir), name="run")
+                main.add_done_callback(lambda _: loop.stop())
+            while not main.done():
+                with sealed():
+                    loop.run_forever()
+                if progress is not None:
+                    progress(self.elapsed_s)
+            self._end(main, loop)
+
+    def _end(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
+        error = None if main.cancelled() else main.exception()
+        if isinstance(error, FieldtwinError):
+            self.errors.append(str(error))
+        elif error is not None:
+            raise error
+        for context in loop.unhandled[:MAX_ERRORS]:
+            self.errors.append(f"nobody caught: {context.get('message')} {context.get('exception') or ''}".strip())
+
+    async def _main(self, loop: VirtualLoop, run_dir: Path) -> None:
+        o = self.options
+        commands = script(o.commands, o.duration_s) if o.commands else []
+        async with VirtualBench(
+            self.system,
+            self.prototype,
+            loop,
+            run_dir,
+            self.trace,
+            seed=self.seed,
+            commands=commands,
+            far_end=bool(commands),
+        ) as bench:
+            self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
+            self._emulated = frozenset(bench.run.field.devices)
+            bench.run.gateway.tags.on_put = self._watched(bench)
+            self.trace.listeners.append(self._on_event)
+            for program in self.system.plc.programs:
+                self.states.note(program, "STANDBY", loop.now_ns)
+            for fault in o.faults:  # each knows its time
+                await bench.inject(fault)
+            await self._through(bench, loop)
+            await self._settle(bench)
+            if self.shore is not None:
+                await self.shore.halt()
+            self.outputs_confirmed_safe = await bench.run.stop_gateway()
+            await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
+            self._judge(bench.run.field)
+            self._take_status(bench)
+
+    async def _through(self, bench: VirtualBench, loop: VirtualLoop) -> None:
+        """To the end of the run's time, piece by piece."""
+        while (left_s := self.options.duration_s - bench.now_s()) > 0:
+            await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
+            self.elapsed_s = bench.now_s()
+            self._judge(bench.run.field)
+            loop.stop()  # the world is looked at
+            await asyncio.sleep(0)
+
+    async def _settle(self, bench: VirtualBench) -> None:
+        """A command that is still under way may arrive."""
+        deadline_s = bench.now_s() + SETTLE_S
+        while self.shore is not None and bench.now_s() < deadline_s:
+            expected = expected_states(self.shore.commands_sent)
+            if all(self.states.sequence(p) == expected for p in self.states.current):
+                return
+            await bench.sleep_until_s(bench.now_s() + 0.1)
+
+    # -- what is judged -------------------------------------------------------------------------------------------------
+
+    def _watched(self, bench: VirtualBench) -> Callable[[str, TagValue], None]:
+        told, loop = bench.run.gateway.tags.on_put, bench.loop
+
+        def put(name: str, value: TagValue) -> None:
+            if told is not None:
+                told(name, value)
+            if value.quality is Quality.GOOD:
+                self.oracle.published(name, value.raw, value.value, value.t_ns, loop.now_ns)
+
+        return put
+
+    def _on_event(self, event: Event) -> None:
+        if event.kind is Kind.STATE and event.where.endswith(".state") and isinstance(event.data["value"], str):
+            self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
+
+    def _judge(self, side: FieldSide) -> None:
+        for name, device in side.devices.items():
+            for held in device.journal.since(self._numbers.get(name, 0)):
+                self.oracle.held(f"{name}.{held.tag}", held.raw, held.t_ns)
+                self._numbers[name] = held.number
+        self.oracle.judge(self._emulated)
+
+    def _take_status(self, bench: VirtualBench) -> None:
+        now_ns = bench.loop.now_ns
+        gateway, plc = bench.run.gateway, bench.run.plc
+        self.gateway_status = {
+            **describe(gateway, now_ns),
+            "learnt": describe_learnt(gateway.drivers.values()),
+            "store_error": "",
+        }
+        self.plc_status = {**plc.describe(), "gateway_alive": plc.gateway_alive, "counters": plc.counters()}
+        self.field_status = bench.run.field.status()
+
+    def summary(self) -> dict[str, Any]:
+        """As of a run on this computer, with seed and trace; nothing in it depends on how fast it was."""
+        return {
+            **summarise(self),
+            "virtual": True,
+            "seed": self.seed,
+            "trace": {"events": self.trace.count, "sha256": self.trace.hexdigest()},
+            "virtual_s": round(self.elapsed_s, 3),
+        }

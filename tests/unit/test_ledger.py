@@ -1,0 +1,52 @@
+"""The ledger of virtual hours: what is in it counts, once, and a kill costs at most the line that was being written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fieldtwin.running.ledger import Ledger, fingerprint
+from fieldtwin.running.many_seeds import SeedResult
+from gateway.core.errors import FileInvalid
+
+
+def result(seed: int, ok: bool = True, wrong: int = 0) -> SeedResult:
+    return SeedResult(seed, ok, () if ok else ("it failed",), 100, wrong, 1000, "ab" * 32)
+
+
+def test_runs_add_up_and_are_known_again(tmp_path: Path) -> None:
+    path = tmp_path / "ledger.jsonl"
+    first = Ledger(path)
+    what = fingerprint("system", "1h")
+    first.add(what, 1.0, result(1))
+    first.add(what, 1.0, result(2, ok=False, wrong=1))
+    again = Ledger(path)
+    assert again.done(what) == {1, 2}
+    assert again.done(fingerprint("system", "2h")) == set()
+    assert (again.hours, again.wrong, [e.seed for e in again.failed]) == (2.0, 1, [2])
+    assert again.failed[0].errors == ("it failed",)
+
+
+def test_a_line_that_a_kill_cut_off_goes(tmp_path: Path) -> None:
+    path = tmp_path / "ledger.jsonl"
+    Ledger(path).add("w", 0.5, result(1))
+    whole = path.read_bytes()
+    for cut in range(1, len(whole)):
+        path.write_bytes(whole + whole[:cut].replace(b"\n", b""))
+        ledger = Ledger(path)
+        assert ledger.done("w") == {1}
+        ledger.add("w", 0.5, result(3))
+        assert Ledger(path).done("w") == {1, 3}
+
+
+def test_what_is_no_line_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "ledger.jsonl"
+    path.write_text('{"what": 1}\n')
+    with pytest.raises(FileInvalid, match="no line of a ledger") as e:
+        Ledger(path)
+    assert e.value.line == 1
+
+
+def test_texts_are_not_mixed_up() -> None:
+    assert fingerprint("ab", "c") != fingerprint("a", "bc")

@@ -17,7 +17,7 @@ from typing import Any
 
 from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import FieldtwinError, FileInvalid
-from gateway.core.image import INPUTS, Image, TagKind, TagSpec
+from gateway.core.image import INPUTS, Image, Message, TagKind, TagSpec
 from gateway.core.values import Quality, Reason, Scalar, TagValue
 from plc.binding import BoundProgram, InputBinding, substitute
 from plc.program import (
@@ -31,6 +31,9 @@ from plc.program import (
     Variable,
 )
 from plc.publishing import OutputImage, find
+
+MAX_SHOWN, MAX_SHOWN_BYTES = 4, 24
+"""Of the messages that a scan took, what is remembered with a change that it made."""
 
 
 class _Input:
@@ -113,9 +116,11 @@ class Scan:
             item = _Input(bound.name, bound.program, variable, spec, index, binding)
             (self._messages if item.message else self._plain).append(item)
             own[variable.name] = item
-        plain = [item for item in own.values() if not item.message]
-        self._seen[bound.name] = lambda: {item.name: item.namespace[item.name] for item in plain}
-        others = {v.name: tag for namespace, v, tag in self._between if namespace is bound.program.__dict__}
+        namespace, names = bound.program.__dict__, [v.name for v in bound.variables(Role.INPUT)]
+        self._seen[bound.name] = lambda: {
+            name: _as_text(value) if isinstance(value := namespace[name], tuple) else value for name in names
+        }
+        others = {v.name: tag for space, v, tag in self._between if space is namespace}
 
         def lookup(name: str) -> TagValue:
             if name in others:
@@ -253,6 +258,13 @@ class Scan:
             "image_retries": self._reader.retries,
             "image_gave_up": self._reader.gave_up,
         }
+
+
+def _as_text(messages: tuple[Message, ...]) -> str | None:
+    """The messages that a scan took, in hex and shortened, for people who ask why; None for none."""
+    shown = [m.data[:MAX_SHOWN_BYTES].hex() + ("..." if len(m.data) > MAX_SHOWN_BYTES else "") for m in messages]
+    more = [f"{len(shown) - MAX_SHOWN} more"] if len(shown) > MAX_SHOWN else []
+    return ", ".join(shown[:MAX_SHOWN] + more) or None
 
 
 def _failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from rich.table import Table
 from fieldtwin.cli.live_view import print_summary
 from fieldtwin.cli.talk import data, talk
 from gateway.core.errors import UsageError
+from gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
     from fieldtwin.running.many_seeds import SeedResult
@@ -41,10 +41,10 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
     talk.print(
         f"{run.system.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
     )
-    began = time.perf_counter()
+    began_ns = WallClock().monotonic_ns()
     with _bar(options.duration_s) as at:
         run.run(at)
-    took_s = time.perf_counter() - began
+    took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
     summary = run.summary()
     if as_json:
         json.dump(summary, sys.stdout, indent=2)
@@ -60,7 +60,7 @@ def run_many(options: VirtualOptions, seeds: range, jobs: int, as_json: bool, ag
     """A run a seed. `again(seed)` is the line that repeats one. The exit status: 0 when all were well."""
     from fieldtwin.running.many_seeds import run_seeds
 
-    began = time.perf_counter()
+    began_ns = WallClock().monotonic_ns()
     done = 0
     with _bar(float(len(seeds)), "seeds") as at:
 
@@ -70,7 +70,7 @@ def run_many(options: VirtualOptions, seeds: range, jobs: int, as_json: bool, ag
             at(float(done))
 
         results = run_seeds(options, seeds, jobs, ended)
-    took_s = time.perf_counter() - began
+    took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
     failed = [r for r in results if not r.ok]
     if as_json:
         json.dump({"results": [_plain(r) for r in results], "failed": [r.seed for r in failed]}, sys.stdout, indent=2)

@@ -63,6 +63,11 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
 @click.option("--seed", type=int, default=None, help="Another seed than the prototype file's (with --virtual).")
 @click.option("--seeds", default="", metavar="1..200", help="With --virtual: a run for each of these seeds.")
 @click.option("--jobs", type=click.IntRange(1, 256), default=1, help="So many runs of --seeds at once.")
+@click.option(
+    "--ledger",
+    type=click.Path(dir_okay=False),
+    help="With --seeds: add each run to this file, and leave out those in it.",
+)
 @click.option("--trace", type=click.Path(dir_okay=False), help="With --virtual: every event to this file (JSON lines).")
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
@@ -87,6 +92,7 @@ def command(
     seed: int | None,
     seeds: str,
     jobs: int,
+    ledger: str | None,
     trace: str | None,
     cold: bool,
     profiles: tuple[str, ...],
@@ -130,6 +136,7 @@ def command(
             ),
             seeds,
             jobs,
+            Path(ledger) if ledger else None,
             as_json,
         )
     if seeds or seed is not None or trace or jobs != 1:
@@ -169,7 +176,7 @@ class VirtualRequest(NamedTuple):
     trace: str | None
 
 
-def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, as_json: bool) -> int:
+def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | None, as_json: bool) -> int:
     from fieldtwin.cli.virtual_view import parse_seeds, run_many, run_one
     from fieldtwin.running.virtual_run import VirtualOptions
 
@@ -185,10 +192,12 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, as_json: bool) 
         trace=Path(request.trace) if request.trace else None,
     )
     if not seeds:
+        if ledger is not None:
+            raise UsageError("--ledger goes with --seeds")
         return run_one(options, as_json)
     if request.trace or request.seed is not None:
         raise UsageError("--seeds makes many runs", hint="--seed and --trace belong to one")
-    return run_many(options, parse_seeds(seeds), jobs, as_json, lambda seed: _again(seed))
+    return run_many(options, parse_seeds(seeds), jobs, as_json, _again, ledger)
 
 
 def _again(seed: int) -> str:
@@ -197,9 +206,9 @@ def _again(seed: int) -> str:
     for word in sys.argv[1:]:
         if skip:
             skip = False
-        elif word in ("--seeds", "--jobs"):
+        elif word in ("--seeds", "--jobs", "--ledger"):
             skip = True
-        elif not word.startswith(("--seeds=", "--jobs=")):
+        elif not word.startswith(("--seeds=", "--jobs=", "--ledger=")):
             words.append(word)
     return shlex.join(["fieldtwin", *words, "--seed", str(seed)])
 

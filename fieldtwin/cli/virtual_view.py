@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.progress import BarColumn, Progress, TextColumn
@@ -51,25 +52,44 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
         sys.stdout.write("\n")
     else:
         print_summary(summary)
-        data.print(f"  trace          {summary['trace']['events']} events, sha256 {summary['trace']['sha256']}")
-        data.print(f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times as fast as time")
+        trace = summary["trace"]
+        data.print(f"  trace          {trace['events']} events, sha256 {trace['sha256']}", soft_wrap=True)
+        data.print(
+            f"  took           {took_s:.1f} s, {run.elapsed_s / took_s:,.0f} times as fast as time", soft_wrap=True
+        )
     return 0 if summary["ok"] else 1
 
 
-def run_many(options: VirtualOptions, seeds: range, jobs: int, as_json: bool, again: Callable[[int], str]) -> int:
-    """A run a seed. `again(seed)` is the line that repeats one. The exit status: 0 when all were well."""
-    from fieldtwin.running.many_seeds import run_seeds
+def run_many(
+    options: VirtualOptions,
+    seeds: range,
+    jobs: int,
+    as_json: bool,
+    again: Callable[[int], str],
+    ledger_path: Path | None = None,
+) -> int:
+    """A run a seed. `again(seed)` is the line that repeats one. The exit status: 0 when all were well.
+
+    With a ledger, seeds that it has are not run again, and each that ends is written down at once.
+    """
+    from fieldtwin.running.ledger import Ledger
+    from fieldtwin.running.many_seeds import run_seeds, what_runs
 
     began_ns = WallClock().monotonic_ns()
-    done = 0
-    with _bar(float(len(seeds)), "seeds") as at:
+    ledger = Ledger(ledger_path) if ledger_path is not None else None
+    what = what_runs(options)
+    left = [seed for seed in seeds if ledger is None or seed not in ledger.done(what)]
+    count = 0
+    with _bar(float(len(left)), "seeds") as at:
 
         def ended(result: SeedResult) -> None:
-            nonlocal done
-            done += 1
-            at(float(done))
+            nonlocal count
+            count += 1
+            at(float(count))
+            if ledger is not None:
+                ledger.add(what, options.duration_s / 3600, result)
 
-        results = run_seeds(options, seeds, jobs, ended)
+        results = run_seeds(options, left, jobs, ended)
     took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
     failed = [r for r in results if not r.ok]
     if as_json:
@@ -87,6 +107,10 @@ def run_many(options: VirtualOptions, seeds: range, jobs: int, as_json: bool, ag
     checked, wrong = sum(r.checked for r in results), sum(r.wrong for r in results)
     table.add_row("published", f"{checked} compared with what the devices held, {wrong} wrong")
     table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times as fast as time")
+    if ledger is not None:
+        table.add_row("not run again", f"{len(seeds) - len(left)} seeds that the ledger has")
+        bad = f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
+        table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{bad}")
     data.print(table)
     data.print("[bold red]not ok[/bold red]" if failed else "[bold green]ok[/bold green]")
     return 1 if failed else 0

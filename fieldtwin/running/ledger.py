@@ -5,7 +5,6 @@ A line belongs to what was run: system and prototype file, version, virtual time
 
 from __future__ import annotations
 
-import hashlib
 import os
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from gateway.core.errors import FileInvalid, Unreachable
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One run. `what` is `fingerprint` of what was run; `wrong` values of `checked` were never held by their device."""
+    """One run. `what` is `many_seeds.what_runs` of what was run; `wrong` values of `checked` were never held by their device."""
 
     what: str
     version: str
@@ -28,14 +27,6 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wrong: int
     sha256: str
     errors: tuple[str, ...] = ()
-
-
-def fingerprint(*parts: str) -> str:
-    """A name for what was run: the same texts (files, options) give the same name."""
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(len(part).to_bytes(8, "big") + part.encode())
-    return digest.hexdigest()[:16]
 
 
 class Ledger:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 
@@ -26,6 +27,22 @@ class SeedResult:
     sha256: str
 
 
+def fingerprint(*parts: str) -> str:
+    """A name for what was run: the same texts (files, options) give the same name."""
+    digest = hashlib.sha256()
+    for part in parts:
+        digest.update(len(part).to_bytes(8, "big") + part.encode())
+    return digest.hexdigest()[:16]
+
+
+def what_runs(options: VirtualOptions) -> str:
+    """A name for what these options run, whatever the seed: of the files' contents and what the command line says."""
+    run = VirtualRun(options)
+    prototype = run.prototype.path.read_text(encoding="utf-8")
+    said = repr(replace(options, seed=None, trace=None, profiles=(), prototype_file=None))
+    return fingerprint(run.system.hash, prototype, said)
+
+
 def run_seed(options: VirtualOptions) -> SeedResult:
     """One run, whole."""
     run = VirtualRun(options)
@@ -43,7 +60,7 @@ def run_seed(options: VirtualOptions) -> SeedResult:
 
 
 def run_seeds(
-    options: VirtualOptions, seeds: range, jobs: int, on_result: Callable[[SeedResult], None] | None = None
+    options: VirtualOptions, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
 ) -> list[SeedResult]:
     """A run a seed, `jobs` at a time, in the order of the seeds. `on_result` is told of each as it ends."""
     if jobs <= 1:
@@ -63,7 +80,7 @@ def run_seeds(
 
 
 def _as_they_end(
-    pool: ProcessPoolExecutor, options: VirtualOptions, seeds: range, at_once: int
+    pool: ProcessPoolExecutor, options: VirtualOptions, seeds: Sequence[int], at_once: int
 ) -> Iterator[SeedResult]:
     waiting: set[Future[SeedResult]] = set()
     for seed in seeds:

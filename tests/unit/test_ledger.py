@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.running.ledger import Ledger, fingerprint
-from fieldtwin.running.many_seeds import SeedResult
+from fieldtwin.running.ledger import Ledger
+from fieldtwin.running.many_seeds import SeedResult, fingerprint
 from gateway.core.errors import FileInvalid
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import Enum
+from typing import Any
 
 from fieldtwin.scenarios.trace import Event
 from twin.system import System
@@ -46,12 +48,34 @@ class CheckResult:
     names: tuple[str, ...] = ()
 
 
+@dataclass
+class Counts:
+    """What was touched, how often. `touched` and `refused`: (device, access, table, address, count, subindex)."""
+
+    services: Counter[tuple[str, str]] = field(default_factory=Counter)
+    problems: Counter[tuple[str, str]] = field(default_factory=Counter)
+    exceptions: Counter[tuple[str, int]] = field(default_factory=Counter)
+    aborts: Counter[tuple[str, int]] = field(default_factory=Counter)
+    touched: Counter[tuple[str, str, str, int, int, int]] = field(default_factory=Counter)
+    refused: Counter[tuple[str, str, str, int, int, int]] = field(default_factory=Counter)
+    transitions: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
+    pairs: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    """(fault's name, PROGRAM.VARIABLE, state)."""
+
+    def add(self, other: Counts) -> None:
+        """Add another run's."""
+        for each in fields(self):
+            getattr(self, each.name).update(getattr(other, each.name))
+
+
 @dataclass(frozen=True)
 class ScenarioResult:
     """One scenario against one target with one seed.
 
     `reproduce` is the one line that runs it again. `simulated_s` is the run's own time, `took_s` the host's. `trace` are
-    the events that are still in memory, `dropped` how many are not; `trace_hash` is over all.
+    the events that are still in memory, `dropped` how many are not; `trace_hash` is over all. `counts` is what a `Collector` that
+    listened to the run has counted; without them the report counts what is in `trace`.
     """
 
     name: str
@@ -69,6 +93,7 @@ class ScenarioResult:
     trace: Sequence[Event] = ()
     trace_hash: str = ""
     dropped: int = 0
+    counts: Counts | None = None
 
     @property
     def title(self) -> str:
@@ -83,6 +108,12 @@ class Machine:
     variable: str
     states: tuple[str, ...]
     transitions: tuple[tuple[str, str], ...] = ()
+
+    def name_of(self, value: Any) -> str:
+        """The state's name for its code; what is none is shown as it is."""
+        if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(self.states):
+            return self.states[value]
+        return str(value)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,183 @@
+"""What a run has touched of all that there is: registers and objects, refusals, transitions, faults in states.
+
+`Collector` listens to a trace (or is fed one) and gives `Counts`, which add up over scenarios. What is missing is worked out
+from the profiles when the report is written. Bounded by what the system has, and `MOST` for what it has not.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable, Iterable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from fieldtwin.decoding.decoder import Decoder
+from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.report.model import Counts, Machine
+from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.errors import ModbusExceptionReply
+from gateway.core.profile import Tag
+from gateway.devices.config import DeviceConfig
+from gateway.protocols.canopen.abort_codes import MEANINGS
+from twin.system import System
+
+MOST = 2000
+"""Different things of a kind that are counted."""
+
+K = TypeVar("K", bound=Hashable)
+
+
+class Collector:
+    """Counts one run's events. Subscribe `feed` to a trace: what a full trace has dropped is counted as well."""
+
+    def __init__(self, system: System, machines: Iterable[Machine] = ()) -> None:
+        self.counts = Counts()
+        self._decoder = Decoder(system)
+        self._machines = {m.variable: m for m in machines}
+        self._states: dict[str, str] = {}
+        self._faults: dict[str, str] = {}
+
+    def feed(self, event: Event) -> None:
+        """Take an event."""
+        self.take(event, self._decoder.feed(event))
+
+    def finish(self) -> Counts:
+        """The run is over."""
+        for exchange in self._decoder.finish():
+            self._exchange(exchange)
+        return self.counts
+
+    def take(self, event: Event, exchanges: Iterable[Exchange]) -> None:
+        """The same for who has decoded the event already."""
+        if event.kind is Kind.FRAME:
+            for exchange in exchanges:
+                self._exchange(exchange)
+        elif event.kind is Kind.STATE and event.where in self._machines:
+            self._state(event.where, self._machines[event.where].name_of(event.data.get("value")))
+        elif event.kind is Kind.FAULT:
+            self._fault(event.where, str(event.data.get("name", event.where)), bool(event.data.get("on")))
+
+    def _exchange(self, exchange: Exchange) -> None:
+        counts, device = self.counts, exchange.device or f"{exchange.bus} {exchange.unit}"
+        _count(counts.services, (device, exchange.service))
+        if exchange.problem:
+            _count(counts.problems, (device, exchange.problem))
+        if exchange.exception is not None:
+            _count(counts.exceptions, (device, exchange.exception))
+        if exchange.abort is not None:
+            _count(counts.aborts, (device, exchange.abort))
+        if exchange.device:
+            for span in exchange.spans:
+                touched = counts.touched if exchange.ok else counts.refused
+                _count(touched, (exchange.device, span.access, span.table, span.address, span.count, span.subindex))
+
+    def _state(self, variable: str, state: str) -> None:
+        before = self._states.get(variable)
+        self._states[variable] = state
+        if before is not None and before != state:
+            _count(self.counts.transitions, (variable, before, state))
+        for name in self._faults.values():
+            _count(self.counts.pairs, (name, variable, state))
+
+    def _fault(self, id: str, name: str, on: bool) -> None:
+        if not on:
+            self._faults.pop(id, None)
+            return
+        self._faults[id] = name
+        _count(self.counts.faults, name)
+        for variable, machine in self._machines.items():
+            state = self._states.get(variable, machine.states[0] if machine.states else "")
+            _count(self.counts.pairs, (name, variable, state))
+
+
+def _count(counter: Counter[K], key: K) -> None:
+    if key in counter or len(counter) < MOST:
+        counter[key] += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A tag of a device: how often it was read and written, refused, and whether it can be at all."""
+
+    name: str
+    where: str
+    readable: bool
+    writable: bool
+    read: int
+    written: int
+    refused: int
+
+    @property
+    def missing(self) -> list[str]:
+        """``read``, ``written``: what never happened and could have."""
+        missing = ["read"] if self.readable and not self.read else []
+        return missing + (["written"] if self.writable and not self.written else [])
+
+
+@dataclass(frozen=True)
+class DeviceCoverage:
+    """A device: its tags, and how often something else was touched, as text."""
+
+    device: str
+    profile: str
+    places: tuple[Place, ...]
+    others: tuple[tuple[str, int], ...] = field(default=())
+
+    def share(self, what: str) -> tuple[int, int]:
+        """How many tags were ``read`` or ``written``, of how many that can be."""
+        able = [p for p in self.places if (p.readable if what == "read" else p.writable)]
+        return sum(what not in p.missing for p in able), len(able)
+
+
+def devices_covered(system: System, counts: Counts) -> list[DeviceCoverage]:
+    """Every device of the system. What a tag's registers share with a longer read counts for the tag."""
+    return [_device(config, counts) for config in system.devices.values()]
+
+
+def _device(config: DeviceConfig, counts: Counts) -> DeviceCoverage:
+    touched = {key: n for key, n in counts.touched.items() if key[0] == config.name}
+    refused = {key: n for key, n in counts.refused.items() if key[0] == config.name}
+    places, known = [], set()
+    for tag in config.profile.tags.values():
+        read = {key: n for key, n in touched.items() if key[1] == "read" and _covers(key, tag)}
+        written = {key: n for key, n in touched.items() if key[1] == "write" and _covers(key, tag)}
+        known |= read.keys() | written.keys()
+        where = str(tag.at) if tag.at else "{:04X}h:{:02X}".format(*(tag.object or (0, 0)))
+        places.append(
+            Place(
+                tag.name, where, tag.readable, tag.name in config.writable, sum(read.values()), sum(written.values()),
+                sum(n for key, n in refused.items() if _covers(key, tag)),
+            )
+        )  # fmt: skip
+    others = sorted((_where(key), n) for key, n in touched.items() if key not in known)
+    return DeviceCoverage(config.name, config.profile.name, tuple(places), tuple(others))
+
+
+_Key = tuple[str, str, str, int, int, int]
+
+
+def _covers(key: _Key, tag: Tag) -> bool:
+    _, _, table, address, count, subindex = key
+    if tag.object is not None:
+        return table == "object" and tag.object == (address, subindex)
+    at = tag.registers
+    return table == at.table and address <= at.address and at.end <= address + count
+
+
+def _where(key: _Key) -> str:
+    _, access, table, address, count, subindex = key
+    if table == "object":
+        return f"{access} {address:04X}h:{subindex:02X}"
+    return f"{access} {table}:{address}" + (f" x {count}" if count != 1 else "")
+
+
+def exceptions_missing(counts: Counts) -> list[int]:
+    """Exception codes of the standard that nobody sent."""
+    seen = {code for _, code in counts.exceptions}
+    return [code for code in ModbusExceptionReply.NAMES if code not in seen]
+
+
+def aborts_missing(counts: Counts) -> list[int]:
+    """Abort codes of the standard that nobody sent."""
+    seen = {code for _, code in counts.aborts}
+    return [code for code in MEANINGS if code not in seen]

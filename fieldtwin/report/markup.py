@@ -1,0 +1,61 @@
+"""HTML and SVG as values: text is escaped unless it is markup already, so that a name out of a file stays a name.
+
+Knows elements and nothing of reports.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from html import escape
+
+
+class Markup(str):
+    """Text that is HTML. Only this module and constants of the code make it."""
+
+    __slots__ = ()
+
+
+Child = str | Iterable["Child"] | None
+
+_VOID = frozenset({"br", "hr", "meta", "link", "img", "col"})
+_SVG_EMPTY = frozenset({"rect", "path", "line", "circle", "polyline", "use"})
+_UNSEEN = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\ud800-\udfff\ufffe\uffff\u202a-\u202e\u2066-\u2069]")
+"""What no document may hold or what turns the direction of reading: shown as a replacement character."""
+
+
+def text(value: object) -> Markup:
+    """A text for element content and attributes: escaped, and without characters that no document may hold."""
+    return value if isinstance(value, Markup) else Markup(escape(_UNSEEN.sub("\ufffd", str(value))))
+
+
+def clean(value: object) -> str:
+    """The same without escaping, for writers that escape by themselves."""
+    return _UNSEEN.sub("\ufffd", str(value))
+
+
+def join(children: Child) -> Markup:
+    """Children one behind the other."""
+    if children is None:
+        return Markup("")
+    if isinstance(children, str):
+        return text(children)
+    return Markup("".join(join(child) for child in children))
+
+
+def el(name: str, *children: Child, **attributes: object) -> Markup:
+    """An element. ``cls`` is the class, ``_`` in a name stands for ``-``; None leaves an attribute out, True: it has no value."""
+    parts = [name]
+    for key, value in attributes.items():
+        attribute = "class" if key == "cls" else key.replace("_", "-")
+        if value is True:
+            parts.append(attribute)
+        elif value is not None and value is not False:
+            shown = f"{value:.1f}".removesuffix(".0") if isinstance(value, float) else text(value)
+            parts.append(f'{attribute}="{shown}"')
+    head = " ".join(parts)
+    if name in _VOID:
+        return Markup(f"<{head}>")
+    if name in _SVG_EMPTY and not children:
+        return Markup(f"<{head}/>")
+    return Markup(f"<{head}>{join(children)}</{name}>")

@@ -1,0 +1,213 @@
+"""The time around a failure, cut out of a trace: what was on the wires, in which states programs were, what tags said.
+
+One pass over the events for all windows of a scenario; each keeps at most `MOST_FRAMES` frames, `MOST_LANES` tags and
+`MOST_STEPS` changes of each. Draws nothing.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from fieldtwin.decoding.decoder import Decoder
+from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.report.coverage import Collector
+from fieldtwin.report.model import CheckResult, Counts, Machine, ScenarioResult
+from fieldtwin.scenarios.trace import Event, Kind
+from twin.system import System
+
+SECOND_NS = 1_000_000_000
+MOST_FRAMES = 160
+"""Frames before the failure; a quarter as many behind it."""
+MOST_STEPS = 600
+MOST_EXCHANGES = 1500
+LONGEST_NS = 60 * SECOND_NS
+"""Of what led to a failure, this much is drawn at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A tag or state has had `value` since `t_ns`. `quality` is "" for a state."""
+
+    t_ns: int
+    value: Any
+    quality: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultBar:
+    """A fault was on from `on_ns` to `off_ns` (None: it still was)."""
+
+    id: str
+    name: str
+    target: str
+    on_ns: int
+    off_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLine:
+    """A frame in the window, in words."""
+
+    t_ns: int
+    bus: str
+    sent: bool
+    raw: str
+    text: str
+    bad: bool
+
+
+@dataclass
+class Window:
+    """Around `check`, from `start_ns` to `end_ns`. `cut` are frames that were left out. `lost`: the trace begins later."""
+
+    check: CheckResult
+    start_ns: int
+    end_ns: int
+    at_ns: int
+    lost: bool = False
+    exchanges: list[Exchange] = field(default_factory=list)
+    states: dict[str, list[Step]] = field(default_factory=dict)
+    tags: dict[str, list[Step]] = field(default_factory=dict)
+    faults: list[FaultBar] = field(default_factory=list)
+    before: deque[FrameLine] = field(default_factory=lambda: deque(maxlen=MOST_FRAMES))
+    after: list[FrameLine] = field(default_factory=list)
+    frames: int = 0
+    unseen: int = 0
+    """Exchanges and changes that were too many."""
+
+    @property
+    def lines(self) -> list[FrameLine]:
+        """The frames that were kept, in order."""
+        return [*self.before, *self.after]
+
+    @property
+    def cut(self) -> int:
+        return self.frames - len(self.before) - len(self.after)
+
+    @property
+    def span_ns(self) -> int:
+        return max(1, self.end_ns - self.start_ns)
+
+
+def around(check: CheckResult, end_ns: int) -> Window | None:
+    """The window of a check; None for one that was never decided."""
+    if check.t_ns is None:
+        return None
+    at = check.t_ns
+    since = check.since_ns if check.since_ns is not None else at
+    led_up = min(LONGEST_NS, max(SECOND_NS, (at - since) * 6 // 5))
+    behind = max(SECOND_NS // 4, led_up // 6)
+    return Window(check, max(0, at - led_up), min(at + behind, max(end_ns, at + behind // 4)), at)
+
+
+class Study:
+    """One pass over a scenario's trace: its counts, and the windows around the checks that are given."""
+
+    def __init__(self, system: System, machines: Sequence[Machine], scenario: ScenarioResult) -> None:
+        self._decoder = Decoder(system)
+        self._collector = Collector(system, machines)
+        self._machines = {m.variable: m for m in machines}
+        self._scenario = scenario
+        self._now: dict[Kind, dict[str, Step]] = {Kind.TAG: {}, Kind.STATE: {}}
+        self._on: dict[str, FaultBar] = {}
+        self._off: list[FaultBar] = []
+
+    def run(self, checks: Sequence[CheckResult]) -> tuple[Counts, list[Window]]:
+        """What the scenario's trace holds. The counts are those that a listener made, where it made some."""
+        trace = self._scenario.trace
+        end_ns = trace[-1].t_ns if trace else 0
+        windows = [w for w in (around(c, end_ns) for c in checks) if w is not None]
+        first_ns = trace[0].t_ns if trace else 0
+        for window in windows:
+            window.lost = bool(self._scenario.dropped) and first_ns > window.start_ns
+        begun: set[int] = set()
+        for event in trace:
+            for number, window in enumerate(windows):
+                if number not in begun and event.t_ns >= window.start_ns:
+                    begun.add(number)
+                    self._begin(window)
+            self._event(event, [w for w in windows if w.start_ns <= event.t_ns <= w.end_ns], windows)
+        for exchange in self._decoder.finish():
+            self._exchange(exchange, windows)
+        for window in windows:
+            bars = [*self._off, *self._on.values()]
+            window.faults = [
+                b for b in bars if b.on_ns <= window.end_ns and (b.off_ns is None or b.off_ns >= window.start_ns)
+            ]
+        counts = self._scenario.counts
+        return (self._collector.finish() if counts is None else counts), windows
+
+    def _begin(self, window: Window) -> None:
+        """What was so when the window begins."""
+        window.tags = {name: [step] for name, step in self._now[Kind.TAG].items()}
+        window.states = {name: [step] for name, step in self._now[Kind.STATE].items()}
+
+    def _event(self, event: Event, inside: list[Window], windows: list[Window]) -> None:
+        data, done = event.data, ()
+        if event.kind is Kind.FRAME:
+            if inside:
+                decoded = self._decoder.decode(event)
+                done = decoded.exchanges
+                bad = any(not e.ok for e in done)
+                line = FrameLine(event.t_ns, event.where, data.get("dir") == "sent", _raw(event), decoded.text, bad)
+                for window in inside:
+                    _keep(window, line)
+            else:
+                done = tuple(self._decoder.feed(event))
+            for exchange in done:
+                self._exchange(exchange, windows)
+        elif event.kind in (Kind.TAG, Kind.STATE):
+            self._changed(event, inside)
+        elif event.kind is Kind.FAULT:
+            self._fault(event)
+        self._collector.take(event, done)
+
+    def _exchange(self, exchange: Exchange, windows: list[Window]) -> None:
+        for window in windows:
+            if exchange.t_ns <= window.end_ns and exchange.end_ns >= window.start_ns:
+                if len(window.exchanges) < MOST_EXCHANGES:
+                    window.exchanges.append(exchange)
+                else:
+                    window.unseen += 1
+
+    def _changed(self, event: Event, inside: list[Window]) -> None:
+        data, name, value = event.data, event.where, event.data.get("value")
+        machine = self._machines.get(name)
+        step = Step(
+            event.t_ns, machine.name_of(value) if machine else value, data.get("quality", ""), data.get("reason", "")
+        )
+        self._now[event.kind][name] = step
+        for window in inside:
+            steps = (window.tags if event.kind is Kind.TAG else window.states).setdefault(name, [])
+            if len(steps) < MOST_STEPS:
+                steps.append(step)
+            else:
+                window.unseen += 1
+
+    def _fault(self, event: Event) -> None:
+        id, on = event.where, bool(event.data.get("on"))
+        known = self._on.pop(id, None)
+        if known is not None:
+            self._off.append(FaultBar(id, known.name, known.target, known.on_ns, event.t_ns))
+        if on:
+            target = event.data.get("target") or ""
+            self._on[id] = FaultBar(id, str(event.data.get("name", id)), str(target), event.t_ns, None)
+
+
+def _keep(window: Window, line: FrameLine) -> None:
+    window.frames += 1
+    if line.t_ns <= window.at_ns:
+        window.before.append(line)
+    elif len(window.after) < MOST_FRAMES // 4:
+        window.after.append(line)
+
+
+def _raw(event: Event) -> str:
+    """The bytes as they are written: a CAN identifier before them."""
+    data = event.data
+    raw = " ".join(data.get("bytes", "")[i : i + 2] for i in range(0, len(data.get("bytes", "")), 2))
+    return f"{data['id']:03X} # {raw}" if isinstance(data.get("id"), int) else raw

@@ -114,7 +114,7 @@ def image_for(
     outputs: dict[str, TagSpec] = {}
     writers: dict[str, str] = {}
     own = {
-        tag: TagSpec(tag, v.kind, v.unit, limits=v.limits)
+        tag: _own_spec(tag, v)
         for bound in programs
         for v, tag in bound.published()
         if tag not in plant and v.kind is not TagKind.MESSAGE
@@ -144,7 +144,7 @@ def image_for(
 
 
 def _own_spec(tag: str, v: Variable) -> TagSpec:
-    return TagSpec(tag, v.kind, v.unit, v.max_bytes, v.depth, v.limits)
+    return TagSpec(tag, v.kind, v.unit, v.max_bytes, v.depth, v.limits, v.words)
 
 
 def _check_names(bound: BoundProgram) -> None:

@@ -16,7 +16,7 @@ program. Nothing here waits.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar
@@ -71,7 +71,8 @@ class Role(Enum):
 @dataclass(frozen=True, slots=True)
 class Variable:
     """A declared variable. `initial` is what it is before the first scan; `max_bytes` and `depth` are a message output's;
-    `retain`: its value outlives the process; `limits`: shown to watchers, and what a force has to keep to."""
+    `retain`: its value outlives the process; `limits`: shown to watchers, and what a force has to keep to;
+    `words`: the names of its values."""
 
     name: str
     role: Role
@@ -82,6 +83,7 @@ class Variable:
     depth: int = 0
     retain: bool = False
     limits: tuple[float, float] | None = None
+    words: tuple[tuple[int, str], ...] = ()
 
 
 def var_input(kind: TagKind, initial: Scalar | None = None) -> Any:
@@ -97,9 +99,11 @@ def var_output(kind: TagKind, initial: Scalar | None = None, unit: str = "", lim
     return Variable("", Role.OUTPUT, kind, initial, unit, limits=limits)
 
 
-def var_local(kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None) -> Any:
-    """Declare a local variable that watchers see as ``<program>.<name>``."""
-    return Variable("", Role.LOCAL, kind, initial, unit, limits=limits)
+def var_local(
+    kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None, words: Sequence[str] = ()
+) -> Any:
+    """Declare a local variable that watchers see as ``<program>.<name>``, by its `words` (for 0, 1, 2...) where it has some."""
+    return Variable("", Role.LOCAL, kind, initial, unit, limits=limits, words=tuple(enumerate(words)))
 
 
 def var_retain(kind: TagKind, initial: Scalar | None = None, unit: str = "", limits: Limits = None) -> Any:

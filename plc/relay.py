@@ -148,7 +148,9 @@ class Relay(Program):
     period_s: int = var_output(TagKind.INT, initial=0, unit="s")
     response: Outbox = message_output()
     log: Outbox = message_output(LOG_BYTES, depth=64)
-    state: int = var_local(TagKind.INT, initial=STATE_CODES["STANDBY"], limits=(0, len(STATE_CODES) - 1))
+    state: int = var_local(
+        TagKind.INT, STATE_CODES["STANDBY"], limits=(0, len(STATE_CODES) - 1), words=tuple(STATE_CODES)
+    )
     period: int = var_local(TagKind.INT, initial=0, unit="s")
     commands: int = var_local(TagKind.INT, initial=0)
     responses: int = var_local(TagKind.INT, initial=0)

@@ -18,7 +18,7 @@ whose time in the state has passed. `when` is an expression over the program's v
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import CodeType
 from typing import Any, ClassVar
 
@@ -113,6 +113,9 @@ class StateMachine(Program):
         table = cls.__dict__.get("table")
         if table is None:
             return
+        names = table.states
+        state = replace(cls.variables["state"], limits=(0, len(names) - 1), words=tuple(enumerate(names)))
+        cls.variables = {**cls.variables, "state": state}
         cls._guards = {}
         for transition in table.transitions:
             cls._guards[transition] = _compiled(cls, transition)

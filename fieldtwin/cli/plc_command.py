@@ -113,15 +113,17 @@ def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> in
 @yes_option
 @instance_option
 def force(tag: str, value: str, yes: bool, instance: str) -> int:
-    """Put VALUE (true, false, a number) in the place of TAG until it is unforced: an input, an output or a local."""
+    """Put VALUE in the place of TAG, an input, an output or a local, until it is unforced: true, false, a number, a state."""
     from fieldtwin.cli.plc_views import is_now
     from fieldtwin.running.plc_client import parse_value
 
-    wanted = parse_value(value)
-    now = is_now([row for row in _tags(instance, (tag,)) if row["tag"] == tag], tag)
-    _sure(f"force {tag}: {now} now, {wanted} from then on", yes)
+    rows = [row for row in _tags(instance, (tag,)) if row["tag"] == tag]
+    now = is_now(rows, tag)
+    codes = {word: int(code) for code, word in rows[-1]["words"].items()}
+    wanted = codes[value] if value in codes else parse_value(value)
+    _sure(f"force {tag}: {now} now, {value} from then on", yes)
     _act(instance, "force", tag=tag, value=wanted)
-    talk.print(f"{tag} is forced to {wanted}", markup=False)
+    talk.print(f"{tag} is forced to {value}", markup=False)
     return 0
 
 

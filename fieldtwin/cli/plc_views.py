@@ -61,7 +61,7 @@ def tag_table(rows: list[Row]) -> Table:
         style = "yellow" if forced else "red" if row["quality"] == "bad" else ""
         cells = {
             "tag": row["tag"],
-            "value": _value(row["value"]),
+            "value": _named(row, row["value"]),
             "unit": row["unit"],
             "limits": _limits(row["limits"]),
             "quality": _quality(row),
@@ -70,6 +70,11 @@ def tag_table(rows: list[Row]) -> Table:
         }
         table.add_row(*(Text(cells[name]) for name in names), style=style)
     return table
+
+
+def _named(row: Row, value: Any) -> str:
+    """A value by its word where it has one, such as a state's name."""
+    return str(row["words"].get(str(value), _value(value)))
 
 
 def _limits(limits: list[float] | None) -> str:
@@ -160,7 +165,7 @@ def is_now(rows: list[Row], tag: str) -> str:
         raise UsageError(f"no tag {tag!r}", expected="a tag without *")
     row = rows[-1]
     limits = f" ({_limits(row['limits'])})" if _limits(row["limits"]) else ""
-    return f"{row['side']} {_value(row['value'])} {row['unit']}".strip() + f"{limits}, {_quality(row)},"
+    return f"{row['side']} {_named(row, row['value'])} {row['unit']}".strip() + f"{limits}, {_quality(row)},"
 
 
 def acts_text(acts: dict[str, int]) -> str:

@@ -205,7 +205,7 @@ class RunSession:
         deadline_s = self.elapsed_s + SETTLE_S
         while self.shore is not None and self.elapsed_s < deadline_s and not self.stopped.is_set():
             expected = expected_states(self.shore.commands_sent)
-            if all(self.states.sequence(p) == expected for p in self.states.current):
+            if all(self.states.sequence(p) == expected for p in self.states.relays):
                 return
             await asyncio.sleep(WATCH_S)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,11 +27,18 @@ def expected_states(periods_s: list[int]) -> list[str]:
     return expected
 
 
+def state_words(layout: ImageLayout, programs: Iterable[str]) -> dict[str, dict[int, str]]:
+    """Of each program that shows a `state` with names: the name of each of its codes."""
+    tags = {tag.name: tag for region in layout.regions for tag in region.tags}
+    return {p: dict(tags[f"{p}.state"].words) for p in programs if f"{p}.state" in tags and tags[f"{p}.state"].words}
+
+
 class StateWatch:
     """Looks at every program's exported `state` and keeps the transitions, with the time since the first look."""
 
     def __init__(self, system: System) -> None:
         self._programs = list(system.plc.programs)
+        self._words: dict[str, dict[int, str]] = {}
         self._reader: RegionReader | None = None
         self._first_ns = 0
         self.current: dict[str, str] = {}
@@ -40,12 +47,22 @@ class StateWatch:
     @contextmanager
     def attached(self, layout: ImageLayout, path: Path) -> Iterator[None]:
         """Read from the image file within this context."""
+        self.knows(layout)
         with attached(layout, path) as image:
             self._reader = image.reader(OUTPUTS)
             try:
                 yield
             finally:
                 self._reader = None
+
+    def knows(self, layout: ImageLayout) -> None:
+        """The names of each program's states are those of this process image."""
+        self._words = state_words(layout, self._programs)
+
+    @property
+    def relays(self) -> list[str]:
+        """Programs seen that are the paper's state machine: it alone goes where the far end's commands say."""
+        return [p for p in self.current if list(self._words.get(p, {}).values()) == NAMES]
 
     def look(self, now_ns: int) -> None:
         """Note every program's state."""
@@ -55,12 +72,12 @@ class StateWatch:
         if not snapshot.counter:
             return
         for program in self._programs:
-            name = f"{program}.state"
-            if name not in snapshot.shape.index:
+            words = self._words.get(program)
+            if not words:
                 continue
-            value = snapshot.value(name).value
-            if isinstance(value, int) and 0 <= value < len(NAMES):
-                self.note(program, NAMES[value], now_ns)
+            value = snapshot.value(f"{program}.state").value
+            if isinstance(value, int) and value in words:
+                self.note(program, words[value], now_ns)
 
     def note(self, program: str, state: str, now_ns: int) -> None:
         """A program is in `state` now."""

@@ -237,7 +237,7 @@ def _state_checks(run: Run) -> list[str]:
         return []
     expected = expected_states(run.shore.commands_sent)
     failed = []
-    for program in run.system.plc.programs:
+    for program in run.states.relays:
         seen = run.states.sequence(program)
         if seen and seen != expected:
             failed.append(f"{program}: the commands ask for {' '.join(expected)}, seen were {' '.join(seen)}")

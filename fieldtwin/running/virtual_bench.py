@@ -12,7 +12,7 @@ from typing import Any
 
 from emulators.virtual.loop import VirtualLoop
 from fieldtwin.running.shore import Scripted, Shore
-from fieldtwin.running.states import NAMES
+from fieldtwin.running.states import state_words
 from fieldtwin.scenarios.bench import Can, Reading
 from fieldtwin.scenarios.trace import Kind, Trace
 from gateway.core.canframe import CanFrame
@@ -56,7 +56,9 @@ class VirtualBench:
         self._commands = commands or []
         self._far_end = far_end
         self._updates: dict[str, int] = {}
-        self._states = {f"{program}.state" for program in system.plc.programs}
+        self._words = {
+            f"{p}.state": words for p, words in state_words(self.run.twin.ecs.layout, system.plc.programs).items()
+        }
         self._stack = AsyncExitStack()
 
     target = "virtual"
@@ -101,10 +103,16 @@ class VirtualBench:
         )
 
     def _changed(self, change: Change) -> None:
-        value: Any = change.after
-        if change.tag in self._states and isinstance(value, int) and 0 <= value < len(NAMES):
-            value = NAMES[value]
-        self.note(Kind.STATE, change.tag, {"value": value})
+        self.note(Kind.STATE, change.tag, {"value": self._named(change.tag, change.after)})
+
+    def _named(self, tag: str, value: Any) -> Any:
+        """A state by its name."""
+        return self._words[tag].get(value, value) if tag in self._words else value
+
+    def states(self) -> dict[str, str]:
+        """Each program's state now, of those that have names."""
+        now = {tag.removesuffix(".state"): self._named(tag, self.run.plc.outputs.current(tag)) for tag in self._words}
+        return {program: state for program, state in now.items() if isinstance(state, str)}
 
     # -- Bench ----------------------------------------------------------------------------------------------------------
 
@@ -124,9 +132,7 @@ class VirtualBench:
     def reading(self, name: str) -> Reading | None:
         outputs = self.run.plc.outputs.last()
         if name in outputs and name not in self.run.gateway.tags.names:
-            value: Any = outputs[name]
-            if name in self._states and isinstance(value, int) and 0 <= value < len(NAMES):
-                value = NAMES[value]
+            value = self._named(name, outputs[name])
             return None if value is None else Reading(value, "good", "", 0.0, 0)
         if name not in self.run.gateway.tags.names:
             raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")

@@ -145,8 +145,9 @@ class VirtualRun:
             self._emulated = frozenset(bench.run.field.devices)
             bench.run.gateway.tags.on_put = self._watched(bench)
             self.trace.listeners.append(self._on_event)
-            for program in self.system.plc.programs:
-                self.states.note(program, "STANDBY", loop.now_ns)
+            self.states.knows(bench.run.twin.ecs.layout)
+            for program, state in bench.states().items():
+                self.states.note(program, state, loop.now_ns)
             for fault in o.faults:  # each knows its time
                 await bench.inject(fault)
             await self._through(bench, loop)
@@ -172,7 +173,7 @@ class VirtualRun:
         deadline_s = bench.now_s() + SETTLE_S
         while self.shore is not None and bench.now_s() < deadline_s:
             expected = expected_states(self.shore.commands_sent)
-            if all(self.states.sequence(p) == expected for p in self.states.current):
+            if all(self.states.sequence(p) == expected for p in self.states.relays):
                 return
             await bench.sleep_until_s(bench.now_s() + 0.1)
 

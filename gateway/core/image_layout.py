@@ -47,8 +47,8 @@ class TagKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TagSpec:
-    """One tag: its name (``device.tag`` or ``program.variable``), kind, unit, and the smallest and largest value that it
-    is meant to have (None: whatever its kind holds).
+    """One tag: its name (``device.tag`` or ``program.variable``), kind, unit, the smallest and largest value that it is
+    meant to have (None: whatever its kind holds), and the words for its values where it has some (a state's names).
 
     A MESSAGE has payloads of at most `max_bytes` and keeps the last `depth` of them. Raises `FileInvalid` for a size
     that makes no sense.
@@ -60,6 +60,7 @@ class TagSpec:
     max_bytes: int = 0
     depth: int = 0
     limits: tuple[float, float] | None = None
+    words: tuple[tuple[int, str], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -83,6 +84,8 @@ class TagSpec:
             text |= {"max_bytes": self.max_bytes, "depth": self.depth}
         if self.limits is not None:
             text["limits"] = [float(limit) for limit in self.limits]  # 0 and 0.0 are one layout
+        if self.words:
+            text["words"] = [list(word) for word in self.words]
         return text
 
     @classmethod
@@ -96,6 +99,7 @@ class TagSpec:
                 int(text.get("max_bytes", 0)),
                 int(text.get("depth", 0)),
                 None if text.get("limits") is None else _pair(*text["limits"]),
+                tuple((int(code), str(word)) for code, word in text.get("words", ())),
             )
         except (KeyError, ValueError, TypeError, AttributeError) as e:
             raise FileInvalid("not the description of a tag", expected="name, kind, unit", got=str(text)) from e

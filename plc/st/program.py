@@ -167,8 +167,11 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
             body[v.name] = message_output(v.kind.max_bytes, v.kind.depth)
         elif kind is not None:
             unit_of = "ns" if ty.is_kind(v.kind, "duration") else ""
+            words = tuple((code, word) for word, code in v.kind.values.items()) if isinstance(v.kind, ty.Enum) else ()
             limits = (float(v.kind.low), float(v.kind.high)) if isinstance(v.kind, ty.Subrange) else None
-            body[v.name] = Variable(v.name, _ROLES[v.role], kind, unit=unit_of, retain=v.retain, limits=limits)
+            body[v.name] = Variable(
+                v.name, _ROLES[v.role], kind, unit=unit_of, retain=v.retain, limits=limits, words=words
+            )
     return type(found.name, (StProgram,), body)
 
 

@@ -12,7 +12,7 @@ from gateway.core.errors import Unreachable, UsageError
 from gateway.core.image import INPUTS, TagKind, TagSpec
 from gateway.core.values import Quality, Reason, TagValue
 from plc.acts import Acts
-from plc.binding import InputBinding, image_for
+from plc.binding import BoundProgram, InputBinding, image_for
 from plc.config import PlcConfig, ProgramConfig
 from plc.runner import Runner
 from plc.states import ANY, StateMachine, StateTable, Transition
@@ -71,7 +71,7 @@ def test_every_tag_has_what_an_engineer_asks_for(tmp_path: Path) -> None:
     rows = rig.rows(later_ms=2)
     assert rows["tank.level"] == {
         "tag": "tank.level", "side": "input", "kind": "real", "value": 1.5, "quality": "good", "reason": "none", "age_s": 0.008,
-        "time": "2023-11-14T22:13:19.992+00:00", "unit": "m", "limits": [0.0, 4.0], "forced": None, "seen": {},
+        "time": "2023-11-14T22:13:19.992+00:00", "unit": "m", "words": {}, "limits": [0.0, 4.0], "forced": None, "seen": {},
     }  # fmt: skip
     pump = rows["pump.speed"]
     assert (pump["side"], pump["value"], pump["quality"], pump["age_s"]) == ("output", 900, "good", 0.002)
@@ -122,6 +122,8 @@ class Door(StateMachine):
 
 def test_a_machine_is_forced_into_states_that_it_has() -> None:
     Door().check("state", 1)
+    state = image_for([BoundProgram("door", Door())], {}).regions[1].tags[0]
+    assert (state.name, state.words, state.limits) == ("door.state", ((0, "SHUT"), (1, "OPEN")), (0, 1))
     with pytest.raises(UsageError, match=r"expected 0 \(SHUT\), 1 \(OPEN\); got 2"):
         Door().check("state", 2)
 

@@ -6,6 +6,7 @@ arrow with its guard. Transitions from any state are drawn from each. Pure: text
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from math import atan2, cos, hypot, pi, sin
@@ -15,10 +16,10 @@ from plc.states import StateTable
 _CHAR = 7.2
 """Width of a character of the 12 px monospace face, in px."""
 _BOX_H = 40.0
-_LABEL_H = 18.0
+_LINE_H = 16.0
 _MARGIN = 60.0
-_LABEL_AT = 0.36
-"""How far along its arrow a label stands: nearer to the source, since arrows meet in the middle."""
+_LABEL_AT = (0.36, 0.5, 0.26, 0.62, 0.72, 0.18)
+"""How far along its arrow a label may stand, the best first: nearer to the source, since arrows meet in the middle."""
 _STYLE = """
   svg { font: 12px ui-monospace, Menlo, Consolas, monospace; fill: none }
   .ground { fill: #fff }
@@ -44,10 +45,38 @@ class _Box:
         return self.x + dx * length, self.y + dy * length
 
 
+class _Labels:
+    """Puts texts where they hide neither a state nor each other, as far as there is room."""
+
+    def __init__(self, boxes: Iterable[_Box]) -> None:
+        self._taken = [(b.x - b.width / 2, b.y - _BOX_H / 2, b.x + b.width / 2, b.y + _BOX_H / 2) for b in boxes]
+        self.drawn: list[str] = []
+
+    def place(self, spots: Sequence[tuple[float, float]], lines: Sequence[str]) -> None:
+        """At the first of `spots` (the middle of the text) where it hides nothing; else where it hides least."""
+        if not lines:
+            return
+        width, height = max(len(line) for line in lines) * _CHAR + 8, len(lines) * _LINE_H + 2
+        frames = [(x - width / 2, y - height / 2, x + width / 2, y + height / 2) for x, y in spots]
+        frame = min(frames, key=lambda f: sum(_overlap(f, other) for other in self._taken))
+        self._taken.append(frame)
+        left, top = frame[:2]
+        self.drawn.append(
+            f'<rect class="paper" x="{left:.1f}" y="{top:.1f}" width="{width:.1f}" height="{height:.1f}" rx="3"/>'
+        )
+        for n, line in enumerate(lines):
+            y = top + 13 + n * _LINE_H
+            self.drawn.append(f'<text class="label" x="{left + width / 2:.1f}" y="{y:.1f}">{escape(line)}</text>')
+
+
+def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))
+
+
 def svg(table: StateTable, title: str = "", current: str = "") -> str:
     """The drawing; `current` is highlighted."""
     arrows = _arrows(table)
-    longest = max((len(label) for *_, label in arrows), default=0)
+    longest = max((len(line) for *_, lines in arrows for line in lines), default=0)
     boxes = _places(table, longest)
     width = max(b.x + b.width / 2 for b in boxes.values()) + _MARGIN + longest * _CHAR / 2
     height = max(b.y for b in boxes.values()) + _BOX_H + _MARGIN
@@ -57,10 +86,10 @@ def svg(table: StateTable, title: str = "", current: str = "") -> str:
         f'height="{height:.0f}" role="img"><title>{escape(title or "state machine")}</title><style>{_STYLE}</style>'
         '<rect class="ground" width="100%" height="100%"/>'
     ]
-    labels: list[str] = []
-    for source, target, text in arrows:
+    labels = _Labels(boxes.values())
+    for source, target, lines in arrows:
         both = any(s == target and t == source for s, t, _ in arrows)
-        parts.append(_arrow(boxes[source], boxes[target], source == target, both, middle, text, labels))
+        parts.append(_arrow(boxes[source], boxes[target], source == target, both, middle, lines, labels))
     for name, box in boxes.items():
         style = "box now" if name == current else "box"
         left, top = box.x - box.width / 2, box.y - _BOX_H / 2
@@ -74,16 +103,16 @@ def svg(table: StateTable, title: str = "", current: str = "") -> str:
     parts.append(
         f'<path class="arrow" d="M{first.x:.1f},{top - 21:.1f} V{top - 6:.1f}"/>{_tip(first.x, top - 1, pi / 2)}'
     )
-    return "\n".join([*parts, *labels, "</svg>", ""])
+    return "\n".join([*parts, *labels.drawn, "</svg>", ""])
 
 
-def _arrows(table: StateTable) -> list[tuple[str, str, str]]:
-    """(source, target, label): several transitions between the same two states share an arrow."""
+def _arrows(table: StateTable) -> list[tuple[str, str, list[str]]]:
+    """(source, target, labels): several transitions between the same two states share an arrow, a line for each."""
     found: dict[tuple[str, str], list[str]] = {}
     for state in table.states:
         for transition in table.leaving(state):
             found.setdefault((state, transition.target), []).append(transition.label)
-    return [(s, t, " | ".join(dict.fromkeys(label for label in labels if label))) for (s, t), labels in found.items()]
+    return [(s, t, list(dict.fromkeys(label for label in labels if label))) for (s, t), labels in found.items()]
 
 
 def _places(table: StateTable, longest: int) -> dict[str, _Box]:
@@ -101,14 +130,16 @@ def _places(table: StateTable, longest: int) -> dict[str, _Box]:
     }
 
 
-def _arrow(a: _Box, b: _Box, loop: bool, both: bool, middle: tuple[float, float], text: str, labels: list[str]) -> str:
+def _arrow(
+    a: _Box, b: _Box, loop: bool, both: bool, middle: tuple[float, float], lines: list[str], labels: _Labels
+) -> str:
     if loop:
         outward = atan2(a.y - middle[1], a.x - middle[0]) if (a.x, a.y) != middle else 0.0
         x1, y1 = a.edge(outward - 0.5)
         x2, y2 = a.edge(outward + 0.5)
         px, py = a.x + cos(outward) * 110, a.y + sin(outward) * 90
         bend = f"C{px:.1f},{py:.1f} {px:.1f},{py:.1f} {x2:.1f},{y2:.1f}"
-        labels.append(_label(a.x + cos(outward) * 92, a.y + sin(outward) * 78, text))
+        labels.place([(a.x + cos(outward) * far, a.y + sin(outward) * far * 0.85) for far in (92, 110, 128)], lines)
         return f'<path class="arrow" d="M{x1:.1f},{y1:.1f} {bend}"/>{_tip(x2, y2, atan2(y2 - py, x2 - px))}'
     dx, dy = b.x - a.x, b.y - a.y
     length = hypot(dx, dy)
@@ -116,21 +147,14 @@ def _arrow(a: _Box, b: _Box, loop: bool, both: bool, middle: tuple[float, float]
     px, py = (a.x + b.x) / 2 - dy / length * sway * 2, (a.y + b.y) / 2 + dx / length * sway * 2
     x1, y1 = a.edge(atan2(py - a.y, px - a.x))
     x2, y2 = b.edge(atan2(py - b.y, px - b.x))
-    near, far = (1 - _LABEL_AT) ** 2, _LABEL_AT**2
-    bent = 2 * _LABEL_AT * (1 - _LABEL_AT)
-    labels.append(_label(near * x1 + bent * px + far * x2, near * y1 + bent * py + far * y2, text))
+    labels.place([(_bezier(x1, px, x2, at), _bezier(y1, py, y2, at)) for at in _LABEL_AT], lines)
     tip = _tip(x2, y2, atan2(y2 - py, x2 - px))
     return f'<path class="arrow" d="M{x1:.1f},{y1:.1f} Q{px:.1f},{py:.1f} {x2:.1f},{y2:.1f}"/>{tip}'
 
 
-def _label(x: float, y: float, text: str) -> str:
-    if not text:
-        return ""
-    width = len(text) * _CHAR + 8
-    return (
-        f'<rect class="paper" x="{x - width / 2:.1f}" y="{y - _LABEL_H / 2:.1f}" width="{width:.1f}" height="{_LABEL_H}" rx="3"/>'
-        f'<text class="label" x="{x:.1f}" y="{y + 4:.1f}">{escape(text)}</text>'
-    )
+def _bezier(start: float, control: float, end: float, at: float) -> float:
+    """A coordinate of a quadratic curve, `at` 0 to 1 of its way."""
+    return (1 - at) ** 2 * start + 2 * at * (1 - at) * control + at**2 * end
 
 
 def _tip(x: float, y: float, angle: float) -> str:

@@ -112,6 +112,33 @@ def test_a_diagram_shows_every_state_and_every_way_out_of_it() -> None:
     assert "http" not in drawn.replace("http://www.w3.org/2000/svg", "")  # nothing is fetched
 
 
+SEQUENCE = StateTable(
+    *(Transition(f"STEP{i}", f"STEP{i + 1}", f"sensor_{i} and not alarm", 100 * i) for i in range(7)),
+    Transition("STEP7", "STEP0", when="restart"),
+    Transition(ANY, "STEP0", when="estop", do="safe"),
+    Transition("STEP3", "STEP3", when="again", do="count"),
+)
+
+
+@pytest.mark.parametrize("table", [Pump.table, Relay.table, SEQUENCE], ids=["pump", "relay", "sequence"])
+def test_in_a_diagram_no_label_hides_a_state_or_another_label(table: StateTable) -> None:
+    root = ET.fromstring(svg(table))
+    width, height = float(root.attrib["width"]), float(root.attrib["height"])
+    frames = [
+        (float(e.attrib["x"]), float(e.attrib["y"]), float(e.attrib["width"]), float(e.attrib["height"]))
+        for e in root.iter("{http://www.w3.org/2000/svg}rect")
+        if e.attrib["class"] in ("paper", "box")
+    ]
+    assert len(frames) > len(table.states)
+    for n, (x, y, w, h) in enumerate(frames):
+        assert x >= 0
+        assert y >= 0
+        assert x + w <= width
+        assert y + h <= height
+        for ox, oy, ow, oh in frames[:n]:
+            assert x >= ox + ow or ox >= x + w or y >= oy + oh or oy >= y + h
+
+
 def test_the_relays_diagram_says_what_its_machine_does() -> None:
     for period_s in (PERIOD_MIN, -1, 0, 1, PERIOD_MAX):
         for state in STATES:

@@ -1,7 +1,8 @@
 """The strict oracle of a run in virtual time: was every value that was published as good held by its device inside its age.
 
-Both sides share one clock there, so "inside its age" is exact: from the value's own time to the moment of its publication the
-device must have held those very bytes at least once. Bounded: what lies `KEPT_NS` back is forgotten.
+Both sides share one clock there, so "inside its age" is exact: from the moment in which the device was asked (for what it sends
+unasked: the value's own time) to the publication it must have held those very bytes at least once. Bounded: what lies `KEPT_NS`
+back is forgotten.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class AgeOracle:
         self._held.setdefault(tag, _Held()).note(t_ns, raw)
 
     def published(self, tag: str, raw: bytes, value: object, source_ns: int, now_ns: int) -> None:
-        """DEVICE.TAG was published as good at `now_ns`, as of `source_ns`."""
+        """DEVICE.TAG was published as good at `now_ns`; nothing older than `source_ns` may stand for it."""
         self._waiting.append((now_ns, tag, raw, value, source_ns))
 
     def judge(self, emulated: frozenset[str]) -> None:

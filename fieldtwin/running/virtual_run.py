@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
+from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ PIECE_S = 10.0
 SETTLE_S = 10.0
 """How long a command that is still under way may take after the run's time is over."""
 LAST_REPLIES_S = 0.5
+ASKED_KEPT = 64
 TRACE_KEPT = 20_000
 MAX_ERRORS = 100
 
@@ -93,6 +95,8 @@ class VirtualRun:
         self.far: dict[str, Endpoint] = {}
         self.shore: Shore | None = None
         self._numbers: dict[str, int] = {}
+        self._asked: dict[str, deque[int]] = {}
+        """By bus: when requests were sent, ns since the start."""
         self._emulated: frozenset[str] = frozenset()
 
     @property
@@ -181,16 +185,27 @@ class VirtualRun:
 
     def _watched(self, bench: VirtualBench) -> Callable[[str, TagValue], None]:
         told, loop = bench.run.gateway.tags.on_put, bench.loop
+        start_ns = bench.run.started_ns
+        bus_of = {
+            name: device.bus
+            for name, device in self.system.devices.items()
+            if not self.system.buses[device.bus].endpoint.is_can
+        }
 
         def put(name: str, value: TagValue) -> None:
             if told is not None:
                 told(name, value)
             if value.quality is Quality.GOOD:
-                self.oracle.published(name, value.raw, value.value, value.t_ns, loop.now_ns)
+                # A value is of the moment in which its reply was complete; the device answered after it was asked.
+                asked = self._asked.get(bus_of.get(name.partition(".")[0], ""), ())
+                asked_ns = next((start_ns + t for t in reversed(asked) if start_ns + t <= value.t_ns), value.t_ns)
+                self.oracle.published(name, value.raw, value.value, asked_ns, loop.now_ns)
 
         return put
 
     def _on_event(self, event: Event) -> None:
+        if event.kind is Kind.FRAME and event.data["dir"] == "sent":
+            self._asked.setdefault(event.where, deque(maxlen=ASKED_KEPT)).append(event.t_ns)
         if event.kind is Kind.STATE and event.where.endswith(".state") and isinstance(event.data["value"], str):
             self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
 

@@ -1,0 +1,38 @@
+"""A hundred seeded hours of the observatory at a scan of 100 ms: no wrong value is published as good, nothing is lost or stuck.
+
+`scripts/test --long` runs this; FIELDTWIN_LONG_HOURS makes it longer or shorter.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from fieldtwin.running.many_seeds import run_seeds
+from fieldtwin.running.virtual_run import VirtualOptions
+
+pytestmark = [pytest.mark.long, pytest.mark.timeout(3600)]
+HOURS = int(os.environ.get("FIELDTWIN_LONG_HOURS", "100"))
+RUN_HOURS = 2
+SHIPPED = Path(__file__).resolve().parents[2] / "profiles" / "systems"
+
+
+def slow_scan(folder: Path) -> Path:
+    """The shipped system with a scan of 100 ms."""
+    text = (SHIPPED / "observatory.yaml").read_text()
+    assert text.count("cycle_ms: 10\n") == 1
+    path = folder / "observatory.yaml"
+    path.write_text(text.replace("cycle_ms: 10\n", "cycle_ms: 100\n"))
+    (folder / "observatory.prototype.yaml").write_text((SHIPPED / "observatory.prototype.yaml").read_text())
+    return path
+
+
+def test_hours_without_faults(tmp_path: Path) -> None:
+    options = VirtualOptions(str(slow_scan(tmp_path)), RUN_HOURS * 3600.0, commands=(1, 2, 0, -1))
+    results = run_seeds(options, range(1, HOURS // RUN_HOURS + 1), jobs=2)
+    failed = {r.seed: r.errors for r in results if not r.ok}
+    assert not failed
+    assert sum(r.wrong for r in results) == 0
+    assert sum(r.checked for r in results) > HOURS * 3600

@@ -15,6 +15,7 @@ from plc.program import Program
 from plc.st import tree as t
 from plc.st import types as ty
 from plc.st.declarations import Declarations
+from plc.st.located import without_addresses
 from plc.st.parse import parse
 from plc.st.scope import Environment, Parameter, Signature, Symbol, Writer, by_reference
 from plc.st.statements import Statements
@@ -57,7 +58,7 @@ def compile_text(text: str, path: str = "") -> CompiledUnit:
 
 def compile_unit(unit: t.Unit, path: str = "") -> CompiledUnit:
     try:
-        return _Unit(unit, path).compiled()
+        return _Unit(without_addresses(unit), path).compiled()
     except RecursionError as e:
         raise FileInvalid("nested too deep", path=path) from e
 

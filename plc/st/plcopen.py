@@ -7,6 +7,7 @@ vendors' additions are left out. Document types are refused, and with them every
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
@@ -18,6 +19,11 @@ _BLOCKS = {
     "localVars": "VAR", "inputVars": "VAR_INPUT", "outputVars": "VAR_OUTPUT", "inOutVars": "VAR_IN_OUT",
     "tempVars": "VAR_TEMP", "externalVars": "VAR_EXTERNAL", "globalVars": "VAR_GLOBAL",
 }  # fmt: skip
+_QUALIFIED = re.compile(
+    r"""\(\*.*?\*\)|//[^\n]*|'(?:\$.|[^'$])*'|"(?:\$.|[^"$])*"|(?<![\w.\#])(?P<name>[A-Za-z_]\w*)\.(?=[A-Za-z_])""",
+    re.DOTALL,
+)
+"""A name before a dot; comments and texts are passed over."""
 _POUS = {"program": "PROGRAM", "function": "FUNCTION", "functionBlock": "FUNCTION_BLOCK"}
 
 
@@ -94,6 +100,13 @@ class _Converter:
         self.project = project
         self.lines: list[list[str]] = [[] for _ in range(lines + 2)]
         self.last = 1
+        enums = [d for d in project.every("dataType") if any(b.find("enum") for b in d.children if b.tag == "baseType")]
+        self.qualifiers = {d.attributes.get("name", "").lower(): "#" for d in enums}
+        """What may stand before a dot as CODESYS writes it, and what the standard has for that dot: an enumeration's ``#``, and
+        nothing for a list of globals."""
+        self.qualifiers |= {
+            g.attributes["name"].lower(): "" for g in project.every("globalVars") if "name" in g.attributes
+        }
 
     def text(self) -> str:
         for data_type in self.project.every("dataType"):
@@ -234,10 +247,24 @@ class _Converter:
         if language is None or language.tag != "ST":
             got = language.tag if language else body.children[0].tag
             raise self._fail(body, f"the body of {self._name(pou)} is not Structured Text", expected="ST", got=got)
+        interface = pou.find("interface")
+        own = {v.attributes.get("name", "").lower() for v in interface.every("variable")} if interface else set()
         for line, text in _texts(language):
-            for offset, piece in enumerate(text.split("\n")):
+            for offset, piece in enumerate(self._unqualified(text, own).split("\n")):
                 if piece.strip():
                     self._put(line + offset, piece)
+
+    def _unqualified(self, text: str, own: set[str]) -> str:
+        """``Mode.Idle`` as ``Mode#Idle``, ``GVL.x`` as ``x``; nothing moves, so that errors name the right column."""
+
+        def standard(found: re.Match[str]) -> str:
+            name = found["name"]
+            if name is None or name.lower() in own or name.lower() not in self.qualifiers:
+                return found[0]
+            mark = self.qualifiers[name.lower()]
+            return name + mark + found[0][len(name) + 1 :] if mark else " " * len(found[0])
+
+        return _QUALIFIED.sub(standard, text)
 
 
 def _texts(element: _Element) -> Iterator[tuple[int, str]]:

@@ -10,7 +10,7 @@ from st_bench import program, run, scan
 from gateway.core.errors import FileInvalid
 from gateway.core.values import Quality, Reason, TagValue
 from plc.binding import BoundProgram
-from plc.program import ProgramFailed
+from plc.program import ProgramFailed, Role
 from plc.scan import _failed
 
 
@@ -191,7 +191,13 @@ def test_retained_variables_survive_as_plain_data() -> None:
     [
         ("PROGRAM p VAR a : INTT; END_VAR END_PROGRAM", 1, "did you mean INT?"),
         ("PROGRAM p VAR a : INT; A : BOOL; END_VAR END_PROGRAM", 1, "declared twice"),
-        ("PROGRAM p VAR a AT %IX0.0 : BOOL; END_VAR END_PROGRAM", 1, "bind it to a tag"),
+        ("VAR_GLOBAL a AT %IX0.0 : BOOL; END_VAR PROGRAM p END_PROGRAM", 1, "bind it to a tag"),
+        (
+            "FUNCTION_BLOCK f VAR a AT %MW0 : INT; END_VAR END_FUNCTION_BLOCK PROGRAM p END_PROGRAM",
+            1,
+            "bind it to a tag",
+        ),
+        ("PROGRAM p VAR n : INT; go AT %IX0.0 : BOOL; END_VAR\ngo := TRUE; END_PROGRAM", 2, "go cannot be assigned to"),
         ("PROGRAM p VAR CONSTANT c : INT := 1; END_VAR\nc := 2; END_PROGRAM", 2, "c cannot be assigned to"),
         ("PROGRAM p VAR_INPUT c : INT; END_VAR\nc := 2; END_PROGRAM", 2, "c cannot be assigned to"),
         ("PROGRAM p VAR t : TON; END_VAR\nt.Q := TRUE; END_PROGRAM", 2, "cannot be assigned to"),
@@ -224,6 +230,19 @@ def test_mistakes_are_refused_with_line_column_and_reason(text: str, line: int, 
     assert told in str(e.value)
     assert e.value.line == line
     assert e.value.column >= 1
+
+
+def test_what_stands_at_an_address_is_an_input_or_an_output() -> None:
+    made = program(
+        "PROGRAM p VAR go AT %IX0.0 : BOOL; n : INT; lamp AT %QX0.1 : BOOL; horn at %q* : BOOL; m AT %MW3 : INT := 4; END_VAR\n"
+        "lamp := go; m := m + 1; n := m; END_PROGRAM"
+    )
+    assert [(v.name, v.role) for v in made.variables.values()] == [
+        ("go", Role.INPUT), ("n", Role.LOCAL), ("lamp", Role.OUTPUT), ("horn", Role.OUTPUT), ("m", Role.LOCAL),
+    ]  # fmt: skip
+    made.go = True  # type: ignore[attr-defined]
+    scan(made)
+    assert (made.lamp, made.horn, made.m, made.n) == (True, False, 5, 5)  # type: ignore[attr-defined]
 
 
 def test_which_program_is_meant() -> None:

@@ -71,12 +71,12 @@ def test_tof_is_false_when_in_has_been_false_for_pt(steps: list[tuple[int, bool]
         start = since(history, False)
         timer(t * MS, IN=level, PT=pt * MS)
         assert timer.Q == (ever and (start is None or t - start < pt))
-        assert 0 <= timer.ET <= pt * MS
+        assert timer.ET == (0 if start is None or not ever else min(t - start, pt) * MS)
 
 
 @given(STEPS, PRESETS)
 def test_tp_is_one_pulse_of_pt_whatever_in_does(steps: list[tuple[int, bool]], pt: int) -> None:
-    timer, before, start = TP(), False, None
+    timer, before, start, et = TP(), False, None, 0
     for t, level in scans(steps):
         if start is not None and t - start >= pt:
             ended, start = True, None
@@ -88,9 +88,12 @@ def test_tp_is_one_pulse_of_pt_whatever_in_does(steps: list[tuple[int, bool]], p
             start = None  # the pulse ends in this scan; the rise came while it still ran
         timer(t * MS, IN=level, PT=pt * MS)
         assert timer.Q == (start is not None and t - start < pt)
+        et = min(t - start, pt) if start is not None else pt if ended else et
+        if not timer.Q and not level:
+            et = 0
+        assert timer.ET == et * MS
         if start is not None and pt == 0:
             start = None
-        assert 0 <= timer.ET <= pt * MS
         before = level
 
 
@@ -167,6 +170,27 @@ def test_ctud_reset_over_load_over_counting_and_rises_cancel() -> None:
     assert (c(0, **off | {"R": True, "LD": True}, PV=7).CV, c.QU, c.QD) == (0, False, True)
     assert c(0, **off, PV=7).CV == 0
     assert (c(0, **off | {"CD": True}, PV=7).CV, c.QD) == (-1, True)
+
+
+@given(st.lists(st.tuples(*[st.booleans()] * 4, st.integers(-3, 5)), max_size=40), st.sampled_from([0, 32766, -32767]))
+def test_ctud_is_what_the_standards_body_says(rows: list[tuple[bool, bool, bool, bool, int]], begin: int) -> None:
+    """IEC 61131-3, Table 45, CTUD, with its edges taken from the calls before."""
+    c = CTUD()
+    c.CV = cv = begin
+    up_before = down_before = False
+    for up, down, reset, load, pv in rows:
+        rises = up and not up_before, down and not down_before
+        up_before, down_before = up, down
+        if reset:
+            cv = 0
+        elif load:
+            cv = pv
+        elif rises == (True, False) and cv < 32767:
+            cv += 1
+        elif rises == (False, True) and cv > -32768:
+            cv -= 1
+        c(0, CU=up, CD=down, R=reset, LD=load, PV=pv)
+        assert (c.CV, c.QU, c.QD) == (cv, cv >= pv, cv <= 0)
 
 
 def test_every_block_declares_what_it_has() -> None:

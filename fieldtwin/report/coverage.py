@@ -7,8 +7,8 @@ from the profiles when the report is written. Bounded by what the system has, an
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Hashable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from fieldtwin.decoding.decoder import Decoder
@@ -16,7 +16,7 @@ from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.report.model import Counts, Machine
 from fieldtwin.scenarios.trace import Event, Kind
 from gateway.core.errors import ModbusExceptionReply
-from gateway.core.profile import Tag
+from gateway.core.profile import RegisterRange
 from gateway.devices.config import DeviceConfig
 from gateway.protocols.canopen.abort_codes import MEANINGS
 from twin.system import System
@@ -43,15 +43,18 @@ class Collector:
 
     def finish(self) -> Counts:
         """The run is over."""
-        for exchange in self._decoder.finish():
-            self._exchange(exchange)
+        self.add(self._decoder.finish())
         return self.counts
+
+    def add(self, exchanges: Iterable[Exchange]) -> None:
+        """Exchanges that the end of a trace ended."""
+        for exchange in exchanges:
+            self._exchange(exchange)
 
     def take(self, event: Event, exchanges: Iterable[Exchange]) -> None:
         """The same for who has decoded the event already."""
         if event.kind is Kind.FRAME:
-            for exchange in exchanges:
-                self._exchange(exchange)
+            self.add(exchanges)
         elif event.kind is Kind.STATE and event.where in self._machines:
             self._state(event.where, self._machines[event.where].name_of(event.data.get("value")))
         elif event.kind is Kind.FAULT:
@@ -138,17 +141,13 @@ def _device(config: DeviceConfig, counts: Counts) -> DeviceCoverage:
     touched = {key: n for key, n in counts.touched.items() if key[0] == config.name}
     refused = {key: n for key, n in counts.refused.items() if key[0] == config.name}
     places, known = [], set()
-    for tag in config.profile.tags.values():
-        read = {key: n for key, n in touched.items() if key[1] == "read" and _covers(key, tag)}
-        written = {key: n for key, n in touched.items() if key[1] == "write" and _covers(key, tag)}
+    for name, at, readable, writable in _things(config):
+        read = {key: n for key, n in touched.items() if key[1] == "read" and _covers(key, at)}
+        written = {key: n for key, n in touched.items() if key[1] == "write" and _covers(key, at)}
         known |= read.keys() | written.keys()
-        where = str(tag.at) if tag.at else "{:04X}h:{:02X}".format(*(tag.object or (0, 0)))
-        places.append(
-            Place(
-                tag.name, where, tag.readable, tag.name in config.writable, sum(read.values()), sum(written.values()),
-                sum(n for key, n in refused.items() if _covers(key, tag)),
-            )
-        )  # fmt: skip
+        failed = sum(n for key, n in refused.items() if _covers(key, at))
+        where = str(at) if isinstance(at, RegisterRange) else f"{at[0]:04X}h:{at[1]:02X}"
+        places.append(Place(name, where, readable, writable, sum(read.values()), sum(written.values()), failed))
     others = sorted((_where(key), n) for key, n in touched.items() if key not in known)
     return DeviceCoverage(config.name, config.profile.name, tuple(places), tuple(others))
 
@@ -156,11 +155,23 @@ def _device(config: DeviceConfig, counts: Counts) -> DeviceCoverage:
 _Key = tuple[str, str, str, int, int, int]
 
 
-def _covers(key: _Key, tag: Tag) -> bool:
+def _things(config: DeviceConfig) -> Iterator[tuple[str, RegisterRange | tuple[int, int], bool, bool]]:
+    """What a device has by name: tags, and mailboxes by their head. Name, place, can be read, may be written."""
+    profile = config.profile
+    for tag in profile.tags.values():
+        yield tag.name, tag.at or tag.object or (0, 0), tag.readable, tag.name in config.writable
+    for box in (profile.inbox, profile.outbox):
+        if box is not None:
+            incoming = box is profile.inbox
+            yield box.name, replace(box.at, count=2), incoming, box.name in config.writable
+            ack = f"{box.name}_ack"
+            yield ack, box.ack, not incoming, ack in config.writable
+
+
+def _covers(key: _Key, at: RegisterRange | tuple[int, int]) -> bool:
     _, _, table, address, count, subindex = key
-    if tag.object is not None:
-        return table == "object" and tag.object == (address, subindex)
-    at = tag.registers
+    if isinstance(at, tuple):
+        return table == "object" and at == (address, subindex)
     return table == at.table and address <= at.address and at.end <= address + count
 
 

@@ -43,7 +43,7 @@ def join(children: Child) -> Markup:
     return Markup("".join(join(child) for child in children))
 
 
-def el(name: str, *children: Child, **attributes: object) -> Markup:
+def el(name: str, /, *children: Child, **attributes: object) -> Markup:
     """An element. ``cls`` is the class, ``_`` in a name stands for ``-``; None leaves an attribute out, True: it has no value."""
     parts = [name]
     for key, value in attributes.items():

@@ -57,7 +57,6 @@ class FrameLine:
     sent: bool
     raw: str
     text: str
-    bad: bool
 
 
 @dataclass
@@ -75,6 +74,8 @@ class Window:
     faults: list[FaultBar] = field(default_factory=list)
     before: deque[FrameLine] = field(default_factory=lambda: deque(maxlen=MOST_FRAMES))
     after: list[FrameLine] = field(default_factory=list)
+    bad: dict[tuple[str, int], str] = field(default_factory=dict)
+    """What was wrong with the frame on a bus at a time."""
     frames: int = 0
     unseen: int = 0
     """Exchanges and changes that were too many."""
@@ -131,7 +132,11 @@ class Study:
                     begun.add(number)
                     self._begin(window)
             self._event(event, [w for w in windows if w.start_ns <= event.t_ns <= w.end_ns], windows)
-        for exchange in self._decoder.finish():
+            if len(self._off) > MOST_STEPS:
+                self._off = [b for b in self._off if any((b.off_ns or 0) >= w.start_ns for w in windows)][-MOST_STEPS:]
+        rest = self._decoder.finish()
+        self._collector.add(rest)
+        for exchange in rest:
             self._exchange(exchange, windows)
         for window in windows:
             bars = [*self._off, *self._on.values()]
@@ -147,13 +152,13 @@ class Study:
         window.states = {name: [step] for name, step in self._now[Kind.STATE].items()}
 
     def _event(self, event: Event, inside: list[Window], windows: list[Window]) -> None:
-        data, done = event.data, ()
+        data = event.data
+        done: tuple[Exchange, ...] = ()
         if event.kind is Kind.FRAME:
             if inside:
                 decoded = self._decoder.decode(event)
                 done = decoded.exchanges
-                bad = any(not e.ok for e in done)
-                line = FrameLine(event.t_ns, event.where, data.get("dir") == "sent", _raw(event), decoded.text, bad)
+                line = FrameLine(event.t_ns, event.where, data.get("dir") == "sent", _raw(event), decoded.text)
                 for window in inside:
                     _keep(window, line)
             else:
@@ -171,6 +176,8 @@ class Study:
             if exchange.t_ns <= window.end_ns and exchange.end_ns >= window.start_ns:
                 if len(window.exchanges) < MOST_EXCHANGES:
                     window.exchanges.append(exchange)
+                    if exchange.problem:
+                        window.bad[exchange.bus, exchange.end_ns] = exchange.problem
                 else:
                     window.unseen += 1
 

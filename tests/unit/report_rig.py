@@ -53,3 +53,41 @@ def note(t_ms: float, kind: Kind, where: str, **data: Any) -> Event:
 CTD_VALUES = b"\x04\x14" + struct.pack(">fffII", 12.5, 4.25, 3.5, 7, 70_000)
 """A reply to `READ_CTD`: pressure, temperature, conductivity, sample_count, instrument_time."""
 READ_CTD = "04 0000 000A"
+
+
+def run_trace(seconds: int = 20, lost: tuple[float, float] = (12.0, 15.0)) -> list[Event]:
+    """The observatory at work: polls, process data, heartbeats, states; `lost`: when the CTD is silent."""
+    events = [
+        note(0, Kind.STATE, "relay.state", value=0), note(0, Kind.STATE, "relay.period_s", value=0),
+        note(2010, Kind.STATE, "relay.period_s", value=1), note(2010, Kind.STATE, "relay.state", value=1),
+        note(16_000, Kind.STATE, "relay.state", value=2), note(18_000, Kind.STATE, "relay.state", value=0),
+        note(0, Kind.STEP, "1", text="the far end commands 1 s"), note(2020, Kind.STEP, "1", text="", verdict="passed"),
+        note(lost[0] * 1000, Kind.FAULT, "f1", name="drop", on=True, target="ctd"),
+        note(lost[1] * 1000, Kind.FAULT, "f1", name="drop", on=False, target="ctd"),
+    ]  # fmt: skip
+    for half in range(2 * seconds):
+        t_ms, bad = 500.0 * half + 3, lost[0] <= half / 2 < lost[1]
+        events.append(ask(t_ms, READ_CTD))
+        if bad:
+            events.append(note(t_ms + 300, Kind.TAG, "ctd.pressure", value=None, quality="bad", reason="timeout"))
+        else:
+            value = struct.unpack(">f", struct.pack(">f", 12.5 + half % 7 / 4))[0]
+            reply = b"\x04\x14" + struct.pack(">fffII", value, 4.25, 3.5, half, 500 * half)
+            events += [chunk(t_ms + 12, False, with_crc(b"\x01" + reply)[:16])]
+            events += [chunk(t_ms + 17.5, False, with_crc(b"\x01" + reply)[16:])]
+            for tag, held in (("pressure", value), ("temperature", 4.25), ("sample_count", half)):
+                events.append(note(t_ms + 18, Kind.TAG, f"ctd.{tag}", value=held, quality="good", reason="none"))
+        if half % 2 == 0:
+            events += [ask(t_ms + 400, "03 0000 0002"), answer(t_ms + 410, "03 04 0001 0001")]
+            events.append(can(t_ms + 50, "705#05"))
+        for tenth in range(5):
+            at = t_ms + 100 * tenth + 20
+            events.append(can(at, "185#" + struct.pack("<hh", 414 + tenth, 53 - half).hex()))
+            events.append(
+                note(
+                    at + 1, Kind.TAG, "inclinometer.slope_long", value=4.14 + tenth / 100, quality="good", reason="none"
+                )
+            )
+        events += [chunk(t_ms + 30, True, adu(half + 1, "03 0000 0022"), "lan")]
+        events += [chunk(t_ms + 31, False, adu(half + 1, "03 44" + "00" * 68), "lan")]
+    return sorted(events, key=lambda e: e.t_ns)

@@ -109,7 +109,14 @@ def _codes(title: str, seen: Counter[tuple[str, int]], show: object, missing: li
             el("h3", title),
             el("p", f"{known - len(missing)} of {known} of the standard seen.", cls="small"),
             el("div", chips or el("span", "none was seen", cls="none"), cls="chips"),
-            el("details", el("summary", f"{len(missing)} never seen"), el("div", gaps, cls="chips")) if missing else "",
+            el(
+                "details",
+                el("summary", f"{len(missing)} never seen"),
+                el("div", gaps, cls="chips"),
+                open=len(missing) <= len(ModbusExceptionReply.NAMES),
+            )
+            if missing
+            else "",
         ]
     )
 
@@ -126,7 +133,7 @@ def _problems(counts: Counts) -> Markup:
     head = el("tr", el("th", "device"), el("th", "what"), el("th", "times", cls="num"))
     return join(
         [
-            el("h3", "What went wrong on the wires"), el("table", el("thead", head), el("tbody", rows[:MOST_ROWS])),
+            el("h3", "What went wrong on the wires"), el("table", el("thead", head), el("tbody", rows[:MOST_ROWS]), cls="grid"),
             _more(len(rows) - MOST_ROWS, "rows"),
         ]
     )  # fmt: skip

@@ -170,7 +170,7 @@ def _short(exchange: Exchange) -> str:
     if exchange.problem == "abort" and exchange.abort is not None:
         return f"abort {exchange.abort:08X}h"
     if exchange.problem:
-        return exchange.problem
+        return f"{exchange.device or f'unit {exchange.unit}'}: {exchange.problem}"
     text = (
         exchange.text.partition(": ")[2]
         if exchange.device and exchange.text.startswith(exchange.device)

@@ -239,7 +239,7 @@ def _plain(scenarios: Sequence[tuple[int, ScenarioResult]]) -> Markup:
 def _legend() -> Markup:
     kinds = [
         ("asked", "read"), ("wrote", "written"), ("message", "message without answer"), ("doubt", "refused"),
-        ("fail", "no reply (dashed) or damaged"),
+        ("fail", "no reply (dashed) or damaged"), ("watch", "the time that was looked at"), ("faultbg", "fault"),
     ]  # fmt: skip
     return el("div", [el("span", el("i", style=f"background:var(--{k})"), said) for k, said in kinds], cls="legend")
 

@@ -1,0 +1,120 @@
+"""JUnit XML in pytest's dialect (``xunit2`` with properties), as Jenkins and GitLab read it.
+
+A scenario with a seed is a test case; its class is the system and the target. A failure's message is the first check that
+failed, its text all of them and the line that runs it again. INCONCLUSIVE is ``skipped`` with a type of its own: JUnit has
+no word for it, and it neither passed nor failed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from fieldtwin.report.markup import clean
+from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
+from gateway.core.errors import FileInvalid
+
+MOST_TEXT = 20_000
+"""Characters of the text of one test case."""
+
+
+def write_junit(report: Report, path: Path) -> None:
+    """Write the file; raises `FileInvalid` where that is not possible."""
+    try:
+        path.write_bytes(render_junit(report))
+    except OSError as e:
+        raise FileInvalid(f"cannot write the report: {e.strerror or e}", path=str(path)) from e
+
+
+def render_junit(report: Report) -> bytes:
+    """The file's content, UTF-8."""
+    counts, total = report.counts, sum(s.took_s for s in report.scenarios)
+    suites = ET.Element("testsuites", name=clean(report.title))
+    suite = ET.SubElement(
+        suites, "testsuite", name=clean(report.title), errors=str(counts[Verdict.ERROR]),
+        failures=str(counts[Verdict.FAILED]), skipped=str(counts[Verdict.SKIPPED] + counts[Verdict.INCONCLUSIVE]),
+        tests=str(len(report.scenarios)), time=f"{total:.3f}",
+    )  # fmt: skip
+    if report.started:
+        suite.set("timestamp", clean(report.started))
+    _properties(suite, _facts(report))
+    for scenario in report.scenarios:
+        _case(suite, report, scenario)
+    ET.indent(suites)
+    return b"<?xml version='1.0' encoding='utf-8'?>\n" + ET.tostring(suites, encoding="unicode").encode() + b"\n"
+
+
+def _facts(report: Report) -> list[tuple[str, str]]:
+    facts = [("target", report.target), ("seed", "" if report.seed is None else str(report.seed))]
+    if report.system is not None:
+        facts += [("system", report.system.name), ("system hash", report.system.hash)]
+    facts += [("reproduce", report.reproduce), *report.versions.items()]
+    return [(name, value) for name, value in facts if value]
+
+
+def _properties(parent: ET.Element, facts: list[tuple[str, str]]) -> None:
+    if facts:
+        properties = ET.SubElement(parent, "properties")
+        for name, value in facts:
+            ET.SubElement(properties, "property", name=clean(name), value=clean(value))
+
+
+def _case(suite: ET.Element, report: Report, scenario: ScenarioResult) -> None:
+    system = report.system.name if report.system is not None else "fieldtwin"
+    target = scenario.target or report.target
+    case = ET.SubElement(
+        suite, "testcase", classname=clean(f"{system}.{target}" if target else system), name=clean(scenario.title),
+        time=f"{scenario.took_s:.3f}",
+    )  # fmt: skip
+    if scenario.file:
+        case.set("file", clean(scenario.file))
+    if scenario.line:
+        case.set("line", str(scenario.line))
+    facts = [("requirement", id) for id in scenario.requirements]
+    facts += [("trace hash", scenario.trace_hash)] if scenario.trace_hash else []
+    _properties(case, facts)
+    verdict, message = scenario.verdict, clean(_message(scenario))
+    if verdict is Verdict.FAILED:
+        ET.SubElement(case, "failure", message=message, type="fieldtwin.failed").text = _text(scenario)
+    elif verdict is Verdict.ERROR:
+        ET.SubElement(case, "error", message=message, type="fieldtwin.error").text = _text(scenario)
+    elif verdict in (Verdict.SKIPPED, Verdict.INCONCLUSIVE):
+        said = message or verdict.value
+        ET.SubElement(case, "skipped", message=said, type=f"fieldtwin.{verdict.value}").text = _text(scenario)
+    lines = "\n".join(_line(c) for c in scenario.checks)
+    if lines:
+        ET.SubElement(case, "system-out").text = clean(_bounded(lines))
+
+
+def _message(scenario: ScenarioResult) -> str:
+    """The reason, or the first check that ended like the scenario."""
+    if scenario.reason:
+        return scenario.reason
+    first = next((c for c in scenario.checks if c.verdict is scenario.verdict), None)
+    return _line(first) if first else ""
+
+
+def _text(scenario: ScenarioResult) -> str:
+    lines = [_line(c) for c in scenario.checks if c.verdict is not Verdict.PASSED]
+    if scenario.reason:
+        lines.insert(0, scenario.reason)
+    if scenario.reproduce:
+        lines += ["", f"reproduce: {scenario.reproduce}"]
+    return clean(_bounded("\n".join(lines)))
+
+
+def _line(check: CheckResult) -> str:
+    """``4 failed at 13.300 s: ctd.pressure is good; expected good; got bad (file:31)``."""
+    at = f" at {check.t_ns / 1e9:.3f} s" if check.t_ns is not None else ""
+    said = f"{check.number} {check.verdict.value}{at}: {check.text}"
+    for name, value in (("expected", check.expected), ("got", check.got), ("because", check.reason)):
+        said += f"; {name} {value}" if value else ""
+    return said + (f" ({check.where})" if check.where else "")
+
+
+def _bounded(said: str) -> str:
+    """The beginning and the end: how to run it again stands there."""
+    if len(said) <= MOST_TEXT:
+        return said
+    half = MOST_TEXT // 2
+    return f"{said[:half]}\n[{len(said) - 2 * half} characters left out]\n{said[-half:]}"

@@ -110,7 +110,8 @@ def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(dese
     assert {key for key in told[0] if told[0][key] != told[1][key]} == {"mapping", "allow_writes"}
     plcs = [json.loads((ended.run_dir / "plc.json").read_text()) for ended in (prototype, plant)]
     for config in plcs:
-        del config["image_path"], config["control_path"], config["retain_path"]  # in the run directory
+        for path in ("image_path", "control_path", "retain_path", "audit_path"):  # in the run directory
+            del config[path]
     assert plcs[0] == plcs[1]
 
 

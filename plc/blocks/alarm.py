@@ -17,22 +17,26 @@ from plc.blocks.block import FunctionBlock
 class _Limit:
     """One limit's state: `sign` +1 for a high one, -1 for a low one."""
 
-    __slots__ = ("active", "sign", "since_ns", "unacknowledged", "violated")
+    __slots__ = ("_since_ns", "active", "sign", "unacknowledged", "violated")
 
     def __init__(self, sign: int) -> None:
         self.sign = sign
         self.violated = self.active = self.unacknowledged = False
-        self.since_ns = 0
+        self._since_ns: int | None = None
+        """Since when it is violated; None also after a restart that kept the rest: then the delay counts anew."""
 
     def watch(self, x: float, limit: float, hysteresis: float, delay_ns: int, now_ns: int) -> None:
         beyond = (x - limit) * self.sign
         if not self.violated:
             if beyond > 0:
-                self.violated, self.since_ns = True, now_ns
+                self.violated, self._since_ns = True, now_ns
         elif beyond < -hysteresis or (hysteresis == 0 and beyond <= 0):
             self.violated = self.active = False
-        if self.violated and not self.active and now_ns - self.since_ns >= delay_ns:
-            self.active = self.unacknowledged = True
+        if self.violated and not self.active:
+            if self._since_ns is None:
+                self._since_ns = now_ns
+            if now_ns - self._since_ns >= delay_ns:
+                self.active = self.unacknowledged = True
 
 
 class ALARM(FunctionBlock):
@@ -57,7 +61,7 @@ class ALARM(FunctionBlock):
         self.DELAY = 0
         self.ACK = self._ack_before = False
         self.Q = self.WARN = self.QLL = self.QL = self.QH = self.QHH = self.UNACK = False
-        self._limits = (_Limit(-1), _Limit(-1), _Limit(1), _Limit(1))
+        self._limits = [_Limit(-1), _Limit(-1), _Limit(1), _Limit(1)]
 
     def execute(self, now_ns: int) -> None:
         if self.ACK and not self._ack_before:

@@ -276,6 +276,8 @@ def _load(into: Any, kept: Any) -> Any:
             if name in kept:
                 setattr(into, name, _load(getattr(into, name), kept[name]))
         return into
+    if into is None and isinstance(kept, bool | int | float | str | None):  # a block's own, which had no value at first
+        return kept
     if type(into) is type(kept) or (isinstance(into, float) and isinstance(kept, int)):
         return float(kept) if isinstance(into, float) else kept
     raise FileInvalid("a retained value of another form", expected=type(into).__name__, got=type(kept).__name__)

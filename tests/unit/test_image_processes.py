@@ -38,8 +38,16 @@ while True:
 """
 
 
-@pytest.mark.slow
-def test_a_writer_at_full_speed_killed_again_and_again_never_tears_a_value(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("reads", "rounds"),
+    [
+        pytest.param(READS, ROUNDS, marks=pytest.mark.slow),
+        pytest.param(100 * READS, 10 * ROUNDS, marks=[pytest.mark.long, pytest.mark.timeout(900)]),
+    ],
+)
+def test_a_writer_at_full_speed_killed_again_and_again_never_tears_a_value(
+    tmp_path: Path, reads: int, rounds: int
+) -> None:
     kinds = [TagKind.INT, TagKind.REAL, TagKind.BOOL]
     tags = (message_tag("m", 20, DEPTH), *(TagSpec(f"t{i}", kinds[i % 3]) for i in range(3 * TAGS)))
     layout = ImageLayout((RegionLayout("r", tags),))
@@ -51,10 +59,10 @@ def test_a_writer_at_full_speed_killed_again_and_again_never_tears_a_value(tmp_p
         image = layout.attach(memory)
         reader = image.reader("r")
         looks = seen = 0
-        for turn in range(1, ROUNDS + 1):
+        for turn in range(1, rounds + 1):
             child = _start_writer(path, layout)
             try:
-                while looks * 3 * TAGS < READS * turn / ROUNDS:
+                while looks * 3 * TAGS < reads * turn / rounds:
                     seen, looks = _look(reader, seen), looks + 1
             finally:
                 child.kill()
@@ -63,7 +71,7 @@ def test_a_writer_at_full_speed_killed_again_and_again_never_tears_a_value(tmp_p
                 child.stdout.close()
             seen = _look(reader, seen)  # whole right after the kill, too
         assert seen > 100  # publications, however busy the computer is
-        assert looks * 3 * TAGS >= READS
+        assert looks * 3 * TAGS >= reads
         assert reader.gave_up == 0
         image.release()
         memory.release()

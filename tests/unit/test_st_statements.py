@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 
+import msgspec
 import pytest
 from st_bench import program, run, scan
 
 from gateway.core.errors import FileInvalid
 from gateway.core.values import Quality, Reason, TagValue
 from plc.binding import BoundProgram
+from plc.blocks import BLOCKS as STANDARD_BLOCKS
 from plc.program import ProgramFailed, Role
 from plc.scan import _failed
 
@@ -184,6 +186,31 @@ def test_retained_variables_survive_as_plain_data() -> None:
     assert (other.st_body.v_n, other.st_body.v_m, other.st_body.v_c.CV) == (4, 1, 2)
     with pytest.raises(FileInvalid, match="another form"):
         program(text).restore({"n": "text"})
+
+
+@pytest.mark.parametrize("block", sorted(STANDARD_BLOCKS))
+def test_every_block_can_be_retained(block: str) -> None:
+    text = f"PROGRAM p VAR RETAIN b : {block}; END_VAR b(); END_PROGRAM"
+    made, again = program(text), program(text)
+    scan(made)
+    kept = msgspec.msgpack.encode(made.retained())
+    assert len(kept) <= made.retain_bytes()
+    again.restore(msgspec.msgpack.decode(kept))
+    assert again.retained() == made.retained()
+    scan(again, 1, ms=1)
+
+
+def test_an_alarm_outlives_a_restart_and_its_delay_counts_anew() -> None:
+    text = "PROGRAM p VAR RETAIN a : ALARM; END_VAR a(X := 5.0, H := 3.0, DELAY := T#30ms); END_PROGRAM"
+    made, again = program(text), program(text)
+    for number in range(1, 3):
+        scan(made, number)
+    again.restore(msgspec.msgpack.decode(msgspec.msgpack.encode(made.retained())))
+    raised = []
+    for number in range(1, 6):  # the new process's clock began anew
+        scan(again, number)
+        raised.append(again.st_body.v_a.QH)
+    assert raised == [False, False, False, True, True]
 
 
 @pytest.mark.parametrize(

@@ -46,24 +46,28 @@ class _Signals:
 
     def __init__(self) -> None:
         self.scopes: dict[str, dict[str, _Signal]] = {}
+        self.plain: dict[str, str] = {}
+        """What each scope is called in the file."""
         self._names: dict[str, set[str]] = {}
         self._count = 0
 
     def get(self, scope: str, name: str, value: Any, bits: int = 0) -> _Signal:
-        signals = self.scopes.setdefault(scope, {})
+        if scope not in self.scopes:
+            self.scopes[scope], self.plain[scope] = {}, self._free("scopes", scope)
+        signals = self.scopes[scope]
         found = signals.get(name)
         kind = "reg" if bits else _kind(value)
         if found is None:
-            found = signals[name] = _Signal(kind, bits or _bits(kind), self._next_id(), self._free(scope, name))
+            found = signals[name] = _Signal(kind, bits or _bits(kind), self._next_id(), self._free(f".{scope}", name))
         elif kind == "reg" and found.kind != "reg" and not bits:
             found.kind, found.bits = "reg", _bits("reg")  # a word after numbers: all of it is words
         elif kind == "real" and found.kind == "wire":
             found.kind, found.bits = "real", 64
         return found
 
-    def _free(self, scope: str, name: str) -> str:
+    def _free(self, within: str, name: str) -> str:
         """The name as a viewer takes it, and another one where two become the same."""
-        taken = self._names.setdefault(scope, set())
+        taken = self._names.setdefault(within, set())
         plain = _plain(name)
         number = 2
         while plain in taken:
@@ -130,7 +134,7 @@ def _declare(file: TextIO, signals: _Signals, comment: str) -> None:
         file.write(f"$comment {said} $end\n")
     file.write("$version fieldtwin $end\n$timescale 1 ns $end\n$scope module run $end\n")
     for scope, members in signals.scopes.items():
-        file.write(f"$scope module {_plain(scope)} $end\n")
+        file.write(f"$scope module {signals.plain[scope]} $end\n")
         for signal in members.values():
             file.write(f"$var {signal.kind} {signal.bits} {signal.id} {signal.name} $end\n")
         file.write("$upscope $end\n")
@@ -191,7 +195,10 @@ def _change(signal: _Signal, value: Any) -> str | None:
     if signal.kind == "wire":
         return f"{int(bool(value))}{signal.id}"
     if signal.kind == "real":
-        number = float(value) if isinstance(value, int | float) else math.nan
+        try:
+            number = float(value) if isinstance(value, int | float) else math.nan
+        except OverflowError:
+            number = math.nan
         return f"r{number:.16g} {signal.id}" if math.isfinite(number) else None
     if signal.bits == _QUALITY_BITS:
         return f"b{int(value):b} {signal.id}"

@@ -121,7 +121,7 @@ class Study:
         """What the scenario's trace holds. The counts are those that a listener made, where it made some."""
         trace = self._scenario.trace
         end_ns = trace[-1].t_ns if trace else 0
-        windows = [w for w in (around(c, end_ns) for c in checks) if w is not None]
+        windows = [w for w in (around(c, end_ns) for c in checks) if w is not None and trace]
         first_ns = trace[0].t_ns if trace else 0
         for window in windows:
             window.lost = bool(self._scenario.dropped) and first_ns > window.start_ns

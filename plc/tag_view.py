@@ -17,6 +17,11 @@ from plc.forces import Force
 from plc.runner import Runner
 
 
+def matches(tag: str, pattern: str) -> bool:
+    """``ctd.pressure``, ``ctd.*``, ``*.state``, or ``ctd`` for all that is its."""
+    return fnmatchcase(tag, pattern) or tag.startswith(f"{pattern}.")
+
+
 class TagView:
     """Describes tags of an image that `runner` works on."""
 
@@ -26,13 +31,13 @@ class TagView:
         self._specs = {region.name: {tag.name: tag for tag in region.tags} for region in image.layout.regions}
 
     def describe(self, patterns: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
-        """JSON-able: the tags that match one of `patterns` (``ctd.*``; all, without any), inputs first.
+        """JSON-able: the tags that match one of `patterns` (see `matches`; all, without any), inputs first.
 
         `now_ns` is monotonic, the tags' clock, and `utc_ns` the same instant.
         """
 
         def wanted(tag: str) -> bool:
-            return not patterns or any(fnmatchcase(tag, p) for p in patterns)
+            return not patterns or any(matches(tag, p) for p in patterns)
 
         inputs = {tag: value for tag, value in self._runner.inputs().items() if wanted(tag)}
         snapshot = self._outputs.snapshot()

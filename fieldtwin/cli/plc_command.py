@@ -91,7 +91,8 @@ def status(instance: str, as_json: bool) -> int:
 @instance_option
 @json_option
 def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> int:
-    """Live values of TAGS (all, if none is named; a trailing * stands for any rest): quality, age, forces. Ctrl-C ends it."""
+    """Live: value, unit, limits, quality, age and force of TAGS: a tag, a device or program for all of its, a pattern as '*.state';
+    all, if none is named. Ctrl-C ends it."""
     import asyncio
 
     from fieldtwin.cli.plc_views import print_tags, tags_as_data, watch_live

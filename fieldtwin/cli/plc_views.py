@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from fieldtwin.cli.talk import data, talk
 from gateway.core.control import ControlClient
 from gateway.core.errors import UsageError
 from plc.prove import Proof, Result
+from plc.tag_view import matches
 
 REFRESH_S = 0.25
 ROOM_FOR_LIMITS = 100
@@ -33,7 +33,7 @@ async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row
     """The tags that match, outputs after inputs. Raises `UsageError` for a pattern that nothing matches."""
     rows: list[Row] = (await client.call("image", tags=list(patterns)))["tags"]
     for pattern in patterns:
-        if not any(fnmatchcase(row["tag"], pattern) for row in rows):
+        if not any(matches(row["tag"], pattern) for row in rows):
             known = [row["tag"] for row in (await client.call("image"))["tags"]]
             raise UsageError(f"no tag {pattern!r}", expected=", ".join(known[:12]) + (", ..." if known[12:] else ""))
     return rows

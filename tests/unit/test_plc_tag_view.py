@@ -78,7 +78,9 @@ def test_every_tag_has_what_an_engineer_asks_for(tmp_path: Path) -> None:
     assert (pump["unit"], pump["limits"]) == ("rpm", [0.0, 1500.0])
     load = rows["pump.load"]
     assert (load["value"], load["quality"], load["unit"], load["limits"]) == (None, "bad", "%", [0.0, 100.0])
-    assert list(rig.rows("pump.*")) == ["pump.speed", "pump.load"]
+    assert list(rig.rows("pump.*")) == list(rig.rows("pump")) == ["pump.speed", "pump.load"]
+    assert list(rig.rows("*.level", "pump.load")) == ["tank.level", "pump.load"]
+    assert not rig.rows("pum")
 
 
 @pytest.mark.parametrize(

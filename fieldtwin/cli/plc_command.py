@@ -91,8 +91,10 @@ def status(instance: str, as_json: bool) -> int:
 @instance_option
 @json_option
 def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> int:
-    """Live: value, unit, limits, quality, age and force of TAGS: a tag, a device or program for all of its, a pattern as '*.state';
-    all, if none is named. Ctrl-C ends it."""
+    """Live values of TAGS (all, if none is named), with unit, limits, quality, age and forces. Ctrl-C ends it.
+
+    Each is a tag, a device or a program for all of its tags, or a pattern such as '*.state'.
+    """
     import asyncio
 
     from fieldtwin.cli.plc_views import print_tags, tags_as_data, watch_live

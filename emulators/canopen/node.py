@@ -16,7 +16,7 @@ STOPPED            NMT, error control, LSS                                      
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 from emulators.canopen.aborts import Abort
@@ -107,7 +107,7 @@ class CanopenNode:
         self._guarding = NodeGuarding(core, self._emergency, react)
         self._consumer = HeartbeatConsumer(core, self._emergency, react)
         self._faults = BusFaults(core, self._emergency, react)
-        self._tpdos = Tpdos(core)
+        self._tpdos = Tpdos(core, lambda: self._sync.window_end_ns)
         self._sync = Sync(core, self._emergency, self._on_sync)
         self._rpdos = Rpdos(core, self._emergency, self._tpdos.changed, self._rpdo_wrote, self._sync.in_window)
         self._time = TimeService(core, context.time_period_ms * NS_PER_MS)
@@ -217,6 +217,18 @@ class CanopenNode:
         """The CAN controller lost received frames: EMCY 8110h."""
         if self._powered:
             self._faults.overrun(now_ns)
+        return self.tick(now_ns)
+
+    def take_overdue(self) -> frozenset[int]:
+        """Identifiers of synchronous TPDOs whose window (1007h) ended. What still waits for the bus under them is to be taken
+        back, as a controller aborts its mailboxes, and told with `dropped`. Each SYNC's are given once."""
+        return self._tpdos.take_overdue()
+
+    def dropped(self, frames: Collection[CanFrame], now_ns: int) -> list[CanFrame]:
+        """Frames of this node that were taken back: counted, and EMCY 8100h once a SYNC."""
+        if frames:
+            self._tpdos.dropped(frames)
+            self._sync.late(now_ns)
         return self.tick(now_ns)
 
     def set_time(self, time: TimeOfDay, now_ns: int) -> list[CanFrame]:

@@ -6,7 +6,8 @@ It must never know the protocol: it moves frames and waits.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from typing import Protocol, runtime_checkable
 
 from emulators.canopen.node import CanopenNode
 from gateway.core.canframe import CanFrame
@@ -18,13 +19,22 @@ Poke = Callable[[int], list[CanFrame]]
 """Something that happens in the device: called with the time, returns what the node then sends."""
 
 
+@runtime_checkable
+class TakesBack(Protocol):
+    """A connection that can still take back what waits for the bus. A kernel's interface cannot."""
+
+    def withdraw(self, can_ids: Collection[int], /) -> list[CanFrame]:
+        """The frames that were taken back, in order."""
+        ...
+
+
 async def serve_node(
     connection: CanConnection, node: CanopenNode, clock: Clock, pokes: asyncio.Queue[Poke] | None = None
 ) -> None:
     """Power the node on and serve it until cancelled. What is put into `pokes` is done in between (`node.set_value`...).
 
     Raises `ConnectionLost` when the bus goes away, and what the node raises. The connection stays open: it is the
-    caller's.
+    caller's. Synchronous TPDOs that are late are taken back where the connection can (`TakesBack`).
     """
     connection.accept = node.accepts
     shell = _Shell(connection, node, clock)
@@ -71,9 +81,16 @@ class _Shell:
 
     async def _do(self, what: Poke) -> None:
         async with self._turn:
-            for frame in what(self._clock.monotonic_ns()):
-                await self._connection.send(frame)
+            await self._send(what(self._clock.monotonic_ns()))
+            overdue = self._node.take_overdue()
+            if overdue and isinstance(self._connection, TakesBack):
+                dropped = self._connection.withdraw(overdue)
+                await self._send(self._node.dropped(dropped, self._clock.monotonic_ns()))
             self._set_timer()
+
+    async def _send(self, frames: list[CanFrame]) -> None:
+        for frame in frames:
+            await self._connection.send(frame)
 
     def _set_timer(self) -> None:
         wake_ns = self._node.wake_at_ns()

@@ -32,7 +32,8 @@ class NodeCounters:
     `sdo_requests` are request frames that were taken (a client's abort is none), `sdo_replies` the frames that answered
     them, aborts among them: without block transfers the two are equal. `sdo_aborts` are all aborts sent, those after a
     timeout included, which answer nothing. `ignored` are frames for this node that the standard tells it to ignore,
-    `frames_muted` those that it could not send in bus-off or while its bit rate changes.
+    `frames_muted` those that it could not send in bus-off or while its bit rate changes. `tpdos_late` were taken back: they had
+    not got onto the bus when the synchronous window was over.
     """
 
     frames_in: int = 0
@@ -44,6 +45,7 @@ class NodeCounters:
     sdo_replies: int = 0
     sdo_aborts: int = 0
     tpdos: int = 0
+    tpdos_late: int = 0
     rpdos: int = 0
     rpdos_refused: int = 0
     syncs: int = 0

@@ -1,7 +1,8 @@
 """SYNC: consumer, producer, counter and window (CiA 301 v4.2, 7.2.5; 1005h, 1006h, 1007h, 1019h).
 
 A node that is told a cycle (1006h) and hears no SYNC for one and a half of it reports 8100h until SYNC is back; the
-standard has no code of its own for that. Synchronous PDOs that come after the window (1007h) wait for nothing.
+standard has no code of its own for that. Synchronous PDOs have the window (1007h) to go by: an RPDO that comes after it
+waits for nothing, a TPDO that has not got onto the bus by then is dropped.
 """
 
 from __future__ import annotations
@@ -89,13 +90,23 @@ class Sync(Service):
 
     def in_window(self, now_ns: int) -> bool:
         """Whether a synchronous PDO still counts for this cycle; the first that does not is reported."""
-        window_ns = self._core.data.number(WINDOW) * _NS_PER_US
-        if not window_ns or self._last_ns is None or now_ns - self._last_ns <= window_ns:
+        end_ns = self.window_end_ns
+        if end_ns is None or now_ns <= end_ns:
             return True
+        self.late(now_ns)
+        return False
+
+    def late(self, now_ns: int) -> None:
+        """A synchronous PDO missed the window; said once a cycle."""
         if not self._late_told:
             self._late_told = True
             self._emergency.report(emcy.COMMUNICATION_ERROR, now_ns, register=emcy.COMMUNICATION)
-        return False
+
+    @property
+    def window_end_ns(self) -> int | None:
+        """When the window of the last SYNC ends; None without a window."""
+        window_ns = self._core.data.number(WINDOW) * _NS_PER_US
+        return None if not window_ns or self._last_ns is None else self._last_ns + window_ns
 
     def tick(self, now_ns: int) -> None:
         if self._missing_at_ns is not None and now_ns >= self._missing_at_ns:

@@ -3,16 +3,21 @@
 Transmission types: 0 at the SYNC after an event, 1 to 240 every n-th SYNC, 252 sampled at SYNC and 253 fresh on a remote
 frame, 254 and 255 on an event. Events are: the event timer, a mapped value changed, the PDO became active. Inhibit time
 and event timer bind event-driven PDOs only, and both are kept.
+
+What SYNC made the node send is late when it still waits for the bus at the end of the synchronous window (1007h):
+`take_overdue` names it, and whoever holds the transmit queue takes it back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 
 from emulators.canopen.dictionary import Key
 from emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, TYPE, PdoParameters, pdo_indices
 from emulators.canopen.service import Core, SentPdo, Service
+from gateway.core.canframe import CanFrame
 
 SAMPLED, REMOTE = 252, 253
 _FIRST = 0x1800
@@ -46,8 +51,11 @@ class _Tpdo:
 class Tpdos(Service):
     """All TPDOs of a node."""
 
-    def __init__(self, core: Core) -> None:
+    def __init__(self, core: Core, window_end_ns: Callable[[], int | None]) -> None:
         self._core = core
+        self._window_end_ns = window_end_ns
+        self._of_sync: set[int] = set()  # identifiers that the last SYNC had sent, until its window ends
+        self._overdue: frozenset[int] = frozenset()
         self._tpdos = [_Tpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
     def owns(self, index: int) -> bool:
@@ -71,6 +79,8 @@ class Tpdos(Service):
                 tpdo.event_at_ns = now_ns + event_ns if event_ns and self._core.operational else None
 
     def reset(self, now_ns: int) -> None:
+        self._of_sync.clear()
+        self._overdue = frozenset()
         for tpdo in self._tpdos:
             tpdo.free_at_ns = 0
             self._activate(tpdo, now_ns)
@@ -87,6 +97,10 @@ class Tpdos(Service):
                 tpdo.pending = True
 
     def tick(self, now_ns: int) -> None:
+        end_ns = self._end_of_window()
+        if end_ns is not None and now_ns > end_ns:
+            self._overdue = frozenset(self._of_sync)
+            self._of_sync.clear()
         if not self._core.operational or self._core.mutes:
             return
         for tpdo in self._tpdos:
@@ -95,12 +109,30 @@ class Tpdos(Service):
                 self._send_event(tpdo, now_ns)
 
     def wake_at_ns(self) -> int | None:
-        if not self._core.operational or self._core.mutes:
-            return None
-        return min((due for tpdo in self._tpdos if (due := tpdo.due_ns()) is not None), default=None)
+        end_ns = self._end_of_window()
+        due = [] if end_ns is None else [end_ns + 1]
+        if self._core.operational and not self._core.mutes:
+            due += [due_ns for tpdo in self._tpdos if (due_ns := tpdo.due_ns()) is not None]
+        return min(due, default=None)
+
+    def take_overdue(self) -> frozenset[int]:
+        """Identifiers of what the last SYNC had sent, once its window is over; each SYNC's once."""
+        overdue, self._overdue = self._overdue, frozenset()
+        return overdue
+
+    def dropped(self, frames: Iterable[CanFrame]) -> None:
+        """These, as `CanopenNode` gave them, never got onto the bus."""
+        for frame in frames:
+            self._core.counters.tpdos_late += 1
+            self._core.counters.tpdos -= 1
+            self._core.counters.frames_out -= 1
+            with suppress(ValueError):  # the journal is bounded
+                self._core.journal.remove(SentPdo(frame.t_ns, frame.can_id, frame.data))
 
     def on_sync(self, counter: int | None, now_ns: int) -> None:
         """A SYNC in OPERATIONAL; `counter` is its own where it carries one."""
+        self._of_sync.clear()
+        self._overdue = frozenset()
         for tpdo in self._tpdos:
             if tpdo.parameters.valid:
                 self._on_sync(tpdo, counter, now_ns)
@@ -129,7 +161,7 @@ class Tpdos(Service):
         if kind == 0:
             if tpdo.pending:
                 tpdo.pending = False
-                self._transmit(tpdo, None, now_ns)
+                self._transmit_for_sync(tpdo, now_ns)
         elif kind == SAMPLED:
             tpdo.sample = self._build(tpdo, now_ns)
         elif kind <= 240:
@@ -140,7 +172,14 @@ class Tpdos(Service):
             tpdo.syncs += 1
             if tpdo.syncs >= kind:
                 tpdo.syncs = 0
-                self._transmit(tpdo, None, now_ns)
+                self._transmit_for_sync(tpdo, now_ns)
+
+    def _end_of_window(self) -> int | None:
+        return self._window_end_ns() if self._of_sync else None
+
+    def _transmit_for_sync(self, tpdo: _Tpdo, now_ns: int) -> None:
+        self._of_sync.add(tpdo.parameters.can_id)
+        self._transmit(tpdo, None, now_ns)
 
     def _send_event(self, tpdo: _Tpdo, now_ns: int) -> None:
         event_ns = tpdo.parameters.event_ns

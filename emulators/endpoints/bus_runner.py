@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import heapq
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple, Protocol
 
 from emulators.endpoints.overrun import TellsOverrun
@@ -118,6 +118,12 @@ class BusRunner:
         taken = self._bus.submit(node, frame, self.now_ns())
         if not more:
             self._schedule()
+        return taken
+
+    def withdraw(self, node: int, can_ids: Collection[int]) -> list[CanFrame]:
+        """Take back what the node has queued under `can_ids` and is not on the wire yet."""
+        taken = self._bus.withdraw(node, can_ids, self.now_ns())
+        self._schedule()
         return taken
 
     def settle(self) -> None:
@@ -247,6 +253,15 @@ class AttachedConnection(TellsOverrun):
                     return
                 self._room.clear()
                 await self._room.wait()
+
+    def withdraw(self, can_ids: Collection[int]) -> list[CanFrame]:
+        """Take back what was sent under `can_ids` and is not on the wire yet, as a controller aborts its mailboxes."""
+        if self.lost is not None:
+            return []
+        taken = self._runner.withdraw(self._node, can_ids)
+        if taken:
+            self._room.set()
+        return taken
 
     async def aclose(self) -> None:
         self._runner.leave(self._node)

@@ -172,3 +172,32 @@ def test_co_062_a_node_whose_receive_queue_overflows_says_8110h() -> None:
             await tester.send(CanFrame(0x000, b"\x01\x10"))
 
     assert [line.split()[1] for line in on_bus(small, happens, paced=False)] == ["705#00", "085#1081110000000000"]
+
+
+# -- synchronous TPDOs that do not get onto the bus within their window ----------------------------------------------
+
+
+@pytest.mark.parametrize(("window_us", "in_front", "said"), [
+    (0, 4, ["185#05000000"]),
+    (5000, 4, ["185#05000000"]),
+    (3000, 4, ["085#0081110000000000"]),
+    (3000, 3, ["185#05000000"]),
+], ids=["no window", "inside", "late", "on the wire when it ends"])  # fmt: skip
+def test_co_048_a_synchronous_tpdo_that_waits_beyond_the_window_is_never_sent(
+    window_us: int, in_front: int, said: list[str]
+) -> None:
+    """Each frame in front takes about 0.9 ms of the bus, and wins against the TPDO."""
+
+    async def happens(bus: BusRunner, tester: AttachedConnection) -> None:
+        window = window_us.to_bytes(4, "little").hex()
+        for setting in (f"23071000{window}", "2F00180201000000", "2B00200005000000"):
+            await tester.send(CanFrame(0x605, bytes.fromhex(setting)))
+        await tester.send(CanFrame(0x000, b"\x01\x05"))
+        await asyncio.sleep(0.05)
+        await tester.send(CanFrame(0x080))
+        for _ in range(in_front):
+            await tester.send(CanFrame(0x001, bytes(range(8))))
+
+    heard = [line.split()[1] for line in on_bus(plain, happens)]
+    assert heard[-len(said) :] == said, heard
+    assert [frame for frame in heard if frame.startswith("185")] == [frame for frame in said if frame.startswith("185")]

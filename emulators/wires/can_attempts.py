@@ -1,0 +1,221 @@
+"""What one attempt to send does to a modelled CAN bus: whether it is a frame or an error, and what all nodes make of it.
+
+Here are the nodes with their transmit queues and error counters, and when the bus is free again; `can_bus` says when an attempt
+is due and who takes part in its arbitration. Pure, and without any time but that of the attempts.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+
+from emulators.wires import can_verdict
+from emulators.wires.can_events import Delivery, Notice, WireFault
+from emulators.wires.can_faults import SUSPEND_BITS, Disturbance, Rule
+from emulators.wires.can_load import BusLoad
+from emulators.wires.can_nodes import BusOff, Node, Start
+from emulators.wires.can_timing import bits_on_wire, bits_to_end
+from emulators.wires.can_verdict import Verdict
+from gateway.core.can_error import CanErrorState
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+
+MAX_NOTICES = 4096
+"""Notices and errors kept until somebody takes them; older ones go first."""
+
+
+class Attempts:
+    """The nodes of one bus, and `attempt`. What happened is gathered in `done`, `notices` and `faults`, each in its order.
+
+    `instant` and `monitored` are those of `CanBus`. `waiting` are the nodes with something to send that are on the bus, `off`
+    those in bus-off; `free_ns` is when the interframe space of the last attempt ends.
+    """
+
+    def __init__(self, bitrate: int, *, instant: bool, monitored: bool) -> None:
+        self.bitrate = bitrate
+        self.instant = instant
+        self.monitored = monitored
+        self.conflicts = 0
+        self.error_frames = 0
+        self.free_ns = 0
+        self.load = BusLoad(bitrate)
+        self.nodes: dict[int, Node] = {}
+        self.waiting: dict[int, Node] = {}
+        self.off = BusOff()
+        self.rules: list[Rule] = []
+        self.done: list[Delivery] = []
+        self.notices: deque[Notice] = deque(maxlen=MAX_NOTICES)
+        self.faults: deque[WireFault] = deque(maxlen=MAX_NOTICES)
+
+    def duration_ns(self, bits: int) -> int:
+        """How long so many bits take: nothing where frames are instant."""
+        return 0 if self.instant else (bits * NS_PER_S + self.bitrate // 2) // self.bitrate
+
+    def attempt(self, start: Start) -> None:
+        """An attempt's regular end has come: it was a frame, or an error. Who is in bus-off by it counts from its end on."""
+        self._judge(start)
+        for number in start.rivals:
+            node = self.nodes.get(number)
+            if node is not None and node.faults.state is CanErrorState.BUS_OFF:
+                self._go_off(number)
+            elif node is not None and node.faults.state is CanErrorState.PASSIVE:
+                node.hold_ns = self.free_ns + self.duration_ns(SUSPEND_BITS)
+
+    def _judge(self, start: Start) -> None:
+        if len(start.rivals) == 1:
+            frame, senders = start.winner.frame, start.rivals
+        else:
+            resolved = self._contend(start)
+            if resolved is None:
+                return
+            frame, senders = resolved
+        receivers = self._receivers(start, start.rivals)
+        if self.rules and (what := self._asked(frame, start.start_ns, tuple(senders))) is not None:
+            if self._spoilt(what, frame, start, senders, receivers):
+                return
+            receivers = [number for number in receivers if number not in what.seen_by]
+        if self.monitored or self.instant or any(not self.nodes[number].listen_only for number in receivers):
+            self._deliver(frame, start, senders, receivers)
+        else:
+            self._unacknowledged(frame, start, senders)
+
+    def _receivers(self, start: Start, but: Collection[int]) -> list[int]:
+        since_ns = start.start_ns
+        there = [n for n, node in self.nodes.items() if n not in but and not node.left and node.joined_ns <= since_ns]
+        return [number for number in there if number not in self.off] if self.off else there
+
+    def _contend(self, start: Start) -> tuple[CanFrame, list[int]] | None:
+        """Several nodes won the arbitration together. The frame that stays and who sends it; None: it came to an error."""
+        heads = {number: self.waiting[number].queue[0] for number in start.rivals}
+        by_age = sorted(start.rivals, key=lambda number: heads[number].sequence)
+        content = start.winner.frame.key()
+        same = [number for number in by_age if heads[number].frame.key() == content]
+        if len(same) == len(by_age):
+            return start.winner.frame, same
+        self.conflicts += 1
+        if self.instant:
+            return start.winner.frame, same
+        outcome = can_verdict.collide(
+            {number: heads[number].frame for number in by_age},
+            lambda number: self.nodes[number].flags_are_dominant,
+        )
+        frame = heads[outcome.senders[0]].frame
+        if outcome.error_bit is not None:
+            verdict = can_verdict.collided(frame, outcome.error_bit)
+            self._fail(verdict, frame, start, by_age, self._receivers(start, by_age))
+            return None
+        at_ns = start.start_ns + self.duration_ns(outcome.lost_bit + 1)
+        for number in outcome.losers:  # error-passive: they give way without spoiling the frame
+            node = self.nodes[number]
+            self.change(number, at_ns, node.faults.send_failed)
+            node.errors += 1
+        return frame, list(outcome.senders)
+
+    def _asked(self, frame: CanFrame, start_ns: int, senders: tuple[int, ...]) -> Disturbance | None:
+        for rule in self.rules:
+            if (what := rule(frame, start_ns, senders)) is not None:
+                return what
+        return None
+
+    def _spoilt(
+        self, what: Disturbance, frame: CanFrame, start: Start, senders: list[int], receivers: list[int]
+    ) -> bool:
+        """Whether the disturbance destroyed the frame; if not, some error-passive receivers went without it."""
+        victims = what.seen_by & set(receivers)
+        at_sender = not what.seen_by or bool(what.seen_by & set(senders))
+        if not at_sender and not any(self.nodes[n].flags_are_dominant for n in victims):
+            for number in victims:
+                at_ns = start.start_ns + self.duration_ns(bits_to_end(frame))
+                self.change(number, at_ns, partial(self.nodes[number].faults.receive_failed, first=False))
+                self.nodes[number].errors += 1
+            return False
+        verdict = can_verdict.disturbed(what, frame, victims, at_sender=at_sender)
+        self._fail(verdict, frame, start, senders, receivers)
+        return True
+
+    def _unacknowledged(self, frame: CanFrame, start: Start, senders: list[int]) -> None:
+        self._fail(can_verdict.unacknowledged(frame), frame, start, senders, [])
+        for number in senders:
+            if self.nodes[number].left:  # its process is gone: nobody tries for ever on its behalf
+                self.nodes[number].queue.clear()
+                self.stop_waiting(number)
+                self.forget_if_done(number)
+
+    def _fail(
+        self, verdict: Verdict, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
+    ) -> None:
+        """An error frame, that all who take part count; what was to be sent stays at the head of its queue."""
+        at_ns = start.start_ns + self.duration_ns(verdict.flag_at)
+        self._pass(start.start_ns, verdict.bits)
+        for number in senders:
+            faults = self.nodes[number].faults
+            self.change(number, at_ns, faults.not_acknowledged if verdict.kind == "ack" else faults.send_failed)
+        for number in receivers:
+            first = number in verdict.first
+            self.change(number, at_ns, partial(self.nodes[number].faults.receive_failed, first=first))
+        self.error_frames += 1
+        self.load.count(frame, verdict.bits, at_ns, tuple(senders), whole=False)
+        counters = []
+        for number in (*senders, *receivers):
+            node = self.nodes[number]
+            node.errors += 1
+            counters.append((number, node.faults.tec, node.faults.rec))
+        self.faults.append(
+            WireFault(at_ns, verdict.kind, frame, start.start_ns, verdict.bits, tuple(senders), tuple(counters))
+        )
+
+    def _deliver(self, frame: CanFrame, start: Start, senders: list[int], receivers: list[int]) -> None:
+        bits = bits_on_wire(frame)
+        end_ns = start.start_ns + self.duration_ns(bits_to_end(frame))
+        self._pass(start.start_ns, bits)
+        self.load.count(frame, bits, end_ns, tuple(senders), whole=True)
+        ended = CanFrame(frame.can_id, frame.data, frame.extended, frame.remote, dlc=frame.dlc, t_ns=end_ns)
+        self.done.append(Delivery(ended, start.start_ns, bits, tuple(senders), tuple(receivers)))
+        for number in receivers:
+            node = self.nodes[number]
+            node.received += 1
+            if node.faults.rec:
+                self.change(number, end_ns, node.faults.received)
+        for number in senders:
+            node = self.nodes[number]
+            node.queue.popleft()
+            node.sent += 1
+            if node.faults.tec:
+                self.change(number, end_ns, node.faults.sent)
+            if not node.queue:
+                self.stop_waiting(number)
+                self.forget_if_done(number)
+
+    # -- error states ---------------------------------------------------------------------------------------------
+
+    def change(self, number: int, at_ns: int, what: Callable[[], None]) -> None:
+        faults = self.nodes[number].faults
+        before = faults.state
+        what()
+        if faults.state is not before:
+            self.notices.append(Notice(at_ns, number, before, faults.state, faults.tec, faults.rec))
+
+    def _pass(self, start_ns: int, bits: int) -> None:
+        """An attempt took the bus: it is free again after `bits`. Nodes in bus-off count the recessive sequences."""
+        if self.off:
+            idle_bits = 0 if self.instant else (start_ns - self.free_ns) * self.bitrate // NS_PER_S
+            self.off.attempt_passed(idle_bits)
+        self.free_ns = start_ns + self.duration_ns(bits)
+
+    def _go_off(self, number: int) -> None:
+        self.off.enter(number)
+        self.stop_waiting(number)
+        if self.nodes[number].left:
+            self.nodes[number].queue.clear()
+            self.forget_if_done(number)
+
+    def stop_waiting(self, number: int) -> None:
+        """It takes part in no arbitration until it is put into `waiting` again."""
+        self.waiting.pop(number, None)
+
+    def forget_if_done(self, number: int) -> None:
+        """A node that left is kept until its queue is empty."""
+        if self.nodes[number].left and not self.nodes[number].queue:
+            del self.nodes[number]
+            self.off.forget(number)

@@ -1,0 +1,30 @@
+"""A node that boots again and again."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.can_fault import HEARTBEAT, CanFault, CanPiece, as_is
+from emulators.faults.fault import Parameters
+from gateway.core.canframe import CanFrame
+
+
+class Form(Parameters):
+    count: int = Field(default=10, ge=1, le=1000)
+    every_ms: float = Field(default=50.0, ge=0, le=60_000)
+
+
+class BootStorm(CanFault):
+    name = "boot-storm"
+    summary = "the node sends `count` boot-up messages, `every_ms` apart"
+    form = Form
+
+    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+        return as_is(frame)
+
+    def appears(self, node: int, random: Random) -> tuple[CanPiece, ...]:
+        p = self.parameters
+        boot = CanFrame(HEARTBEAT + node, b"\0")
+        return tuple(CanPiece(boot, n * p.every_ms / 1000) for n in range(p.count))

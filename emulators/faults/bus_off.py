@@ -1,0 +1,11 @@
+"""A node that comes to so many errors that its controller leaves the bus."""
+
+from __future__ import annotations
+
+from emulators.faults.can_fault import BusFault
+
+
+class BusOff(BusFault):
+    name = "bus-off"
+    summary = "each attempt of the node to send is destroyed until its controller is in bus-off (a modelled bus only)"
+    attempts = 32

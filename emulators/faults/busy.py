@@ -1,0 +1,17 @@
+"""A device that has no time: exception 06 instead of an answer."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import Outcome, WireFault, passed
+from emulators.faults.frames import Frame
+from emulators.faults.remake import remade
+
+
+class Busy(WireFault):
+    name = "busy"
+    summary = "the reply is exception 06, server device busy"
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return passed(remade(frame, pdu=bytes((frame.pdu[0] | 0x80, 6)))) if frame.pdu else passed(frame.data)

@@ -1,0 +1,23 @@
+"""Frames that arrive together, as a busy stack or a USB adapter hands them over."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    every_ms: float = Field(default=20.0, gt=0, le=60_000)
+
+
+class Coalesce(WireFault):
+    name = "coalesce"
+    summary = "frames are kept for `every_ms` and arrive in one piece"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return Outcome((Piece(frame.data, self.parameters.every_ms / 1000, gather=True),))

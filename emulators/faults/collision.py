@@ -1,0 +1,26 @@
+"""Two that talk at once on a line: what is heard is neither."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    at: int = Field(default=2, ge=0, le=1024)
+
+
+class Collision(WireFault):
+    name = "collision"
+    summary = "another sender talks over the frame from byte `at` on: each byte is the AND of both, as on RS485"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        at = self.parameters.at
+        over = random.randbytes(max(0, len(frame.data) - at))
+        mixed = bytes(a & b for a, b in zip(frame.data[at:], over, strict=True))
+        return passed(frame.data[:at] + mixed)

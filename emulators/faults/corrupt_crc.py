@@ -1,0 +1,22 @@
+"""A check sum that does not fit."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import Outcome, WireFault, passed
+from emulators.faults.frames import Frame, Framing
+
+
+class CorruptCrc(WireFault):
+    name = "corrupt-crc"
+    summary = "the check sum (CRC of RTU, LRC of ASCII) is wrong; over TCP, which has none, nothing happens"
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        data = frame.data
+        if frame.framing is Framing.RTU:
+            return passed(data[:-1] + bytes((data[-1] ^ 0x5A,)))
+        if frame.framing is Framing.ASCII and len(data) > 5:
+            last = data[-3:-2]
+            return passed(data[:-3] + (b"0" if last != b"0" else b"1") + data[-2:])
+        return passed(data)

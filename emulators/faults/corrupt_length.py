@@ -1,0 +1,32 @@
+"""A length that does not fit what follows."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame, Framing
+from emulators.faults.remake import remade
+
+
+class Form(Parameters):
+    by: int = Field(default=2, ge=-250, le=250)
+
+
+class CorruptLength(WireFault):
+    name = "corrupt-length"
+    summary = (
+        "the length says `by` more than there is: MBAP's, or on a line a read reply's byte count (its check sum fits)"
+    )
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        by = self.parameters.by
+        if frame.framing is Framing.MBAP:
+            length = (int.from_bytes(frame.data[4:6]) + by) & 0xFFFF
+            return passed(frame.data[:4] + length.to_bytes(2) + frame.data[6:])
+        if len(frame.pdu) < 3:
+            return passed(frame.data)
+        return passed(remade(frame, pdu=frame.pdu[:1] + bytes(((frame.pdu[1] + by) & 0xFF,)) + frame.pdu[2:]))

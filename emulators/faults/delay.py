@@ -1,0 +1,23 @@
+"""A frame that arrives later than it was sent."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    by_ms: float = Field(default=50.0, gt=0, le=600_000)
+
+
+class Delay(WireFault):
+    name = "delay"
+    summary = "the frame arrives `by_ms` later, and what follows waits behind it"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return Outcome((Piece(frame.data, self.parameters.by_ms / 1000),))

@@ -1,0 +1,23 @@
+"""A device that goes away, and comes back when the fault is over."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import LOST, Hang, Outcome, WireFault
+from emulators.faults.frames import Frame, Way
+
+
+class Disconnect(WireFault):
+    name = "disconnect"
+    summary = (
+        "connections are ended at once, and new ones refused, until the fault is over; a serial line is dead meanwhile"
+    )
+    ways = frozenset(Way)
+    refuses = True
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return LOST
+
+    def appears(self) -> Hang:
+        return Hang.CLOSE

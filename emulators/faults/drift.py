@@ -1,0 +1,20 @@
+"""A sensor that wanders off."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import Parameters, ValueFault
+
+
+class Form(Parameters):
+    per_s: float = 0.1
+
+
+class Drift(ValueFault):
+    name = "drift"
+    summary = "the value moves away by `per_s` a second"
+    form = Form
+
+    def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
+        return value + self.parameters.per_s * since_s

@@ -1,0 +1,17 @@
+"""A frame that never arrives."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import LOST, Outcome, WireFault
+from emulators.faults.frames import Frame, Way
+
+
+class Drop(WireFault):
+    name = "drop"
+    summary = "the frame is lost"
+    ways = frozenset(Way)
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return LOST

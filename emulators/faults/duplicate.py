@@ -1,0 +1,25 @@
+"""A frame that arrives twice."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    times: int = Field(default=1, ge=1, le=100)
+    after_ms: float = Field(default=0.0, ge=0, le=60_000)
+
+
+class Duplicate(WireFault):
+    name = "duplicate"
+    summary = "the frame arrives again, `after_ms` behind itself"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        again = Piece(frame.data, self.parameters.after_ms / 1000)
+        return Outcome((Piece(frame.data), *[again] * self.parameters.times))

@@ -1,0 +1,21 @@
+"""Two nodes with one id: the other answers and beats too."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.can_fault import HEARTBEAT, SDO_REPLY, CanFault, CanPiece
+from gateway.core.canframe import CanFrame
+
+
+class DuplicateNode(CanFault):
+    name = "duplicate-node"
+    summary = "a second node with this id answers each SDO request and beats, in another state"
+
+    def aims_at(self, frame: CanFrame, node: int) -> bool:
+        return frame.can_id in (HEARTBEAT + node, SDO_REPLY + node)
+
+    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+        if frame.can_id == HEARTBEAT + node:
+            return CanPiece(frame), CanPiece(CanFrame(frame.can_id, b"\x7f"), 0.001)
+        return CanPiece(frame), CanPiece(frame, 0.001)

@@ -1,0 +1,17 @@
+"""A two-wire adapter that hears itself."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import Outcome, Piece, WireFault
+from emulators.faults.frames import Frame, Way
+
+
+class Echo(WireFault):
+    name = "echo"
+    summary = "the sender gets its own frame back, before anything else"
+    ways = frozenset((Way.REQUEST,))
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return Outcome((Piece(frame.data, back=True), Piece(frame.data)))

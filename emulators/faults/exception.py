@@ -1,0 +1,26 @@
+"""A device that refuses."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame
+from emulators.faults.remake import remade
+
+
+class Form(Parameters):
+    code: int = Field(default=4, ge=1, le=255)
+
+
+class ExceptionReply(WireFault):
+    name = "exception"
+    summary = "the reply is exception `code` (APP V1.1b3, 7)"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        if not frame.pdu:
+            return passed(frame.data)
+        return passed(remade(frame, pdu=bytes((frame.pdu[0] | 0x80, self.parameters.code))))

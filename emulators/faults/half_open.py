@@ -1,0 +1,16 @@
+"""A connection whose other side is gone without a word."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import Hang, Outcome, WireFault
+from emulators.faults.frames import Frame
+
+
+class HalfOpen(WireFault):
+    name = "half-open"
+    summary = "from the frame on nothing passes on this connection, and nobody is told"
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return Outcome(hang=Hang.HALF_OPEN)

@@ -1,0 +1,19 @@
+"""A node that forgets its heartbeat."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.can_fault import HEARTBEAT, CanFault, CanPiece
+from gateway.core.canframe import CanFrame
+
+
+class HeartbeatLoss(CanFault):
+    name = "heartbeat-loss"
+    summary = "the node sends no heartbeat; all else goes on"
+
+    def aims_at(self, frame: CanFrame, node: int) -> bool:
+        return frame.can_id == HEARTBEAT + node
+
+    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+        return ()

@@ -1,0 +1,23 @@
+"""Frames that arrive a little later, each by another time."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    most_ms: float = Field(default=20.0, gt=0, le=600_000)
+
+
+class Jitter(WireFault):
+    name = "jitter"
+    summary = "the frame arrives up to `most_ms` later, evenly spread"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return Outcome((Piece(frame.data, random.uniform(0.0, self.parameters.most_ms / 1000)),))

@@ -1,0 +1,23 @@
+"""A reply that comes when nobody waits for it any more."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    by_ms: float = Field(default=400.0, gt=0, le=600_000)
+
+
+class LateReply(WireFault):
+    name = "late-reply"
+    summary = "the reply comes `by_ms` late, past whatever was answered meanwhile"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return Outcome((Piece(frame.data, self.parameters.by_ms / 1000, overtake=True),))

@@ -1,0 +1,16 @@
+"""A frame of a node that nobody receives."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.can_fault import CanFault, CanPiece
+from gateway.core.canframe import CanFrame
+
+
+class LostFrame(CanFault):
+    name = "lost-frame"
+    summary = "a frame of the node is lost (narrow it with `cob_id`)"
+
+    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+        return ()

@@ -1,0 +1,24 @@
+"""A silence inside a frame, longer than any receiver may wait (SL 2.5.1.1: t1.5)."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    pause_ms: float = Field(default=40.0, gt=0, le=60_000)
+
+
+class Pause(WireFault):
+    name = "pause"
+    summary = "a silence of `pause_ms` in the middle of the frame"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        half = len(frame.data) // 2
+        return Outcome((Piece(frame.data[:half]), Piece(frame.data[half:], self.parameters.pause_ms / 1000)))

@@ -1,0 +1,44 @@
+"""Every fault by its name."""
+
+from __future__ import annotations
+
+import difflib
+from importlib import import_module
+
+from emulators.faults.fault import Fault
+from gateway.core.errors import UsageError
+
+_FILES = """
+drop delay jitter duplicate reorder split pause coalesce corrupt_bits corrupt_crc corrupt_length wrong_unit wrong_function
+wrong_transaction truncate garbage noise echo late_reply exception busy silence half_open reset disconnect wrong_baud wrong_parity
+collision lost_frame error_frame bus_off duplicate_node sdo_abort sdo_toggle lost_segment heartbeat_loss heartbeat_late emcy_burst
+sync_jitter boot_storm stuck drift spike nan out_of_range set_value
+"""
+
+
+def _load() -> dict[str, type[Fault]]:
+    found: dict[str, type[Fault]] = {}
+    for file in _FILES.split():
+        module = import_module(f"emulators.faults.{file}")
+        made = [
+            c
+            for c in vars(module).values()
+            if isinstance(c, type) and issubclass(c, Fault) and c.__module__ == module.__name__
+        ]
+        for kind in made:
+            found[kind.name] = kind
+    return found
+
+
+FAULTS: dict[str, type[Fault]] = _load()
+"""In the order of the catalogue."""
+
+
+def fault_class(name: str) -> type[Fault]:
+    """Raises `UsageError` that names the nearest."""
+    found = FAULTS.get(name)
+    if found is None:
+        near = difflib.get_close_matches(name, FAULTS, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else "`fieldtwin faults` lists them"
+        raise UsageError(f"no fault {name!r}", expected=", ".join(FAULTS), hint=hint)
+    return found

@@ -1,0 +1,19 @@
+"""A frame with another unit id or PDU, its check sum or length as it should be."""
+
+from __future__ import annotations
+
+from emulators.faults.frames import Frame, Framing
+from emulators.modbus.ascii import lrc
+from emulators.modbus.rtu_shapes import with_crc
+
+
+def remade(frame: Frame, *, unit: int | None = None, pdu: bytes | None = None) -> bytes:
+    """The bytes of `frame` with these parts instead. What was not understood stays as it is."""
+    if not frame.pdu:
+        return frame.data
+    adu = bytes((frame.unit if unit is None else unit,)) + (frame.pdu if pdu is None else pdu)
+    if frame.framing is Framing.MBAP:
+        return frame.data[:4] + len(adu).to_bytes(2) + adu
+    if frame.framing is Framing.ASCII:
+        return b":" + (adu + bytes((lrc(adu),))).hex().upper().encode() + b"\r\n"
+    return with_crc(adu)

@@ -1,0 +1,31 @@
+"""A frame that is overtaken by the one behind it."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    most_ms: float = Field(default=100.0, gt=0, le=60_000)
+
+
+class Reorder(WireFault):
+    name = "reorder"
+    summary = "the frame is held back until the next one in its direction has gone, or for `most_ms`"
+    form = Form
+
+    def __init__(self, parameters: Parameters) -> None:
+        super().__init__(parameters)
+        self._held: Frame | None = None
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        if self._held is None:
+            self._held = frame
+            return Outcome((Piece(frame.data, self.parameters.most_ms / 1000, overtake=True),))
+        self._held = None
+        return Outcome((Piece(frame.data, overtake=True),))

@@ -1,0 +1,23 @@
+"""A connection that is torn down inside a frame (RST)."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Hang, Outcome, Parameters, Piece, WireFault
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    at: int = Field(default=4, ge=0, le=1024)
+
+
+class Reset(WireFault):
+    name = "reset"
+    summary = "the connection is torn down behind the first `at` bytes of the frame"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return Outcome((Piece(frame.data[: self.parameters.at]),) if self.parameters.at else (), Hang.RESET)

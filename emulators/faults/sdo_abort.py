@@ -1,0 +1,34 @@
+"""An SDO server that refuses."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.can_fault import SDO_REPLY, CanFault, CanPiece
+from emulators.faults.fault import Parameters
+from gateway.core.canframe import CanFrame
+
+
+class Form(Parameters):
+    code: int = Field(default=0x08000000, ge=0, le=0xFFFFFFFF)
+
+
+class SdoAbort(CanFault):
+    name = "sdo-abort"
+    summary = "the node answers SDO requests with abort `code` (CiA 301, 7.2.4.3.17)"
+    form = Form
+
+    def __init__(self, parameters: Parameters) -> None:
+        super().__init__(parameters)
+        self._object = bytes(3)
+
+    def aims_at(self, frame: CanFrame, node: int) -> bool:
+        return frame.can_id == SDO_REPLY + node and len(frame.data) == 8 and frame.data[0] != 0x80
+
+    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+        if frame.data[0] >> 5 in (2, 3):  # an initiate: it names the object, a segment does not
+            self._object = frame.data[1:4]
+        data = b"\x80" + self._object + int(self.parameters.code).to_bytes(4, "little")
+        return (CanPiece(CanFrame(frame.can_id, data)),)

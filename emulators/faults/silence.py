@@ -1,0 +1,17 @@
+"""A device that does not answer."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import LOST, Outcome, WireFault
+from emulators.faults.frames import Frame, Way
+
+
+class Silence(WireFault):
+    name = "silence"
+    summary = "the device never answers: its requests do not reach it"
+    ways = frozenset((Way.REQUEST,))
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return LOST

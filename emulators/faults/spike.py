@@ -1,0 +1,23 @@
+"""A sensor that jumps now and then."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Parameters, ValueFault
+
+
+class Form(Parameters):
+    by: float = 100.0
+    probability_each: float = Field(default=0.1, ge=0.0, le=1.0)
+
+
+class Spike(ValueFault):
+    name = "spike"
+    summary = "with `probability_each` the value is `by` away for one reading"
+    form = Form
+
+    def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
+        return value + self.parameters.by if random.random() < self.parameters.probability_each else value

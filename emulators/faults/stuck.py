@@ -1,0 +1,15 @@
+"""A sensor that hangs."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import ValueFault
+
+
+class Stuck(ValueFault):
+    name = "stuck"
+    summary = "the value stays what it was when the fault began"
+
+    def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
+        return held

@@ -1,0 +1,23 @@
+"""A frame that ends too early."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    count: int = Field(default=2, ge=1, le=1024)
+
+
+class Truncate(WireFault):
+    name = "truncate"
+    summary = "the last `count` bytes of the frame are missing"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return passed(frame.data[: max(1, len(frame.data) - self.parameters.count)])

@@ -1,0 +1,30 @@
+"""A device at another baud rate: framing errors and bytes that were never sent."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import LOST, Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame
+
+
+class Form(Parameters):
+    factor: float = Field(default=0.5, gt=0, le=16)
+
+
+class WrongBaud(WireFault):
+    name = "wrong-baud"
+    summary = "each byte arrives as others, or not at all, as at a baud rate that differs by a factor of `factor`"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        heard = bytearray()
+        credit = 0.0
+        for byte in frame.data:
+            credit += self.parameters.factor
+            while credit >= 1.0:
+                credit -= 1.0
+                heard.append((byte * 0x55 ^ random.getrandbits(8)) & 0xFF)
+        return passed(bytes(heard)) if heard else LOST

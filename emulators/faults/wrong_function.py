@@ -1,0 +1,26 @@
+"""A frame with another function code."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame
+from emulators.faults.remake import remade
+
+
+class Form(Parameters):
+    code: int = Field(default=4, ge=0, le=255)
+
+
+class WrongFunction(WireFault):
+    name = "wrong-function"
+    summary = "the frame carries function `code` (its check sum fits)"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        if not frame.pdu:
+            return passed(frame.data)
+        return passed(remade(frame, pdu=bytes((self.parameters.code,)) + frame.pdu[1:]))

@@ -1,0 +1,17 @@
+"""A device with another parity: about half of the bytes are errors, and dropped by the port."""
+
+from __future__ import annotations
+
+from random import Random
+
+from emulators.faults.fault import LOST, Outcome, WireFault, passed
+from emulators.faults.frames import Frame
+
+
+class WrongParity(WireFault):
+    name = "wrong-parity"
+    summary = "bytes whose parity bit does not fit are dropped; which, depends on their bits"
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        heard = bytes(byte for byte in frame.data if byte.bit_count() % 2 == 0)
+        return passed(heard) if heard else LOST

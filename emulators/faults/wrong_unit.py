@@ -1,0 +1,24 @@
+"""A frame under another unit id."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame
+from emulators.faults.remake import remade
+
+
+class Form(Parameters):
+    unit_id: int = Field(default=99, ge=0, le=255)
+
+
+class WrongUnit(WireFault):
+    name = "wrong-unit"
+    summary = "the frame carries unit id `unit_id` (its check sum fits)"
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        return passed(remade(frame, unit=self.parameters.unit_id))

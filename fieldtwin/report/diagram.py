@@ -14,7 +14,7 @@ from itertools import pairwise
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.decoding.tags import show_value
 from fieldtwin.report.markup import Markup, el
-from fieldtwin.report.window import SECOND_NS, FaultBar, Step, Window
+from fieldtwin.report.window import SECOND_NS, FaultBar, Step, Window, thin_steps
 from twin.system import System
 
 WIDTH = 1180.0
@@ -147,9 +147,10 @@ def _wire_lane(axis: _Axis, window: Window, bus: str, system: System | None) -> 
         if x1 >= edges[_row(exchange)] and x1 + len(words) * _CHAR < WIDTH:
             marks.append(el("text", words, cls=f"words {kind}", x=x1, y=top - 4))
             edges[_row(exchange)] = x1 + len(words) * _CHAR + 10
-    if step > 1:
-        marks.append(el("text", f"1 of {step} drawn", cls="sub", x=8.0, y=41.0))
-    return max(36.0, 4.0 + 32 * len(rows)) + (10 if step > 1 else 0), marks
+    thinned = step > 1 or bus in window.thinned
+    if thinned:
+        marks.append(el("text", "thinned: too many", cls="sub", x=8.0, y=41.0))
+    return max(36.0, 4.0 + 32 * len(rows)) + (10 if thinned else 0), marks
 
 
 def _row(exchange: Exchange) -> int:
@@ -209,35 +210,32 @@ def _tag_lane(axis: _Axis, window: Window, name: str, system: System | None) -> 
     def y(value: float) -> float:
         return 8.0 + room * (0.5 if high == low else 1 - (value - low) / (high - low))
 
-    marks = _label(
-        name, f"{_number(low)} … {_number(high)} {unit}".strip() if high != low else f"{_number(low)} {unit}"
-    )
+    bounds = f"{_number(low)} … {_number(high)} {unit}" if high != low else f"{_number(low)} {unit}"
+    thinned = name in window.thinned or len(steps) < len(window.tags[name])
+    marks = [*_label(name, bounds), *([el("text", "thinned", cls="sub", x=8.0, y=40.0)] if thinned else [])]
     lines: list[Markup] = []
-    texts_to = 0.0
     paths: dict[str, list[str]] = {}
     for step, end_ns in _spans(window, steps):
-        x1, x2, kind = axis.x(step.t_ns), axis.x(end_ns), _quality(step)
-        if kind != "good":
-            why = f"{step.quality}" + (f": {step.reason}" if step.reason not in ("", "none") else "")
-            band = el(
-                "rect", el("title", f"{_seconds(step.t_ns)}  {name} {why}"), cls=f"q {kind}", x=x1, y=3.0,
-                width=max(1.0, x2 - x1), height=height - 6,
-            )  # fmt: skip
-            marks.append(band)
-            if x1 >= texts_to and (words := _fitted(why, x1, x2, 14.0, f"qtext {kind}")):
-                lines += words
-                texts_to = x1 + len(why) * _CHAR + 14
         if _is_number(step.value):
-            paths.setdefault(kind, []).append(f"M{x1:.1f} {y(step.value):.1f}H{max(x2, x1 + 1):.1f}")
+            x1, x2 = axis.x(step.t_ns), axis.x(end_ns)
+            paths.setdefault(_quality(step), []).append(f"M{x1:.1f} {y(step.value):.1f}H{max(x2, x1 + 1):.1f}")
+    for step, end_ns in _merged(window, steps, by_quality=True):
+        x1, x2, kind = axis.x(step.t_ns), axis.x(end_ns), _quality(step)
+        if kind == "good":
+            continue
+        why = f"{step.quality}" + (f": {step.reason}" if step.reason not in ("", "none") else "")
+        size = {"x": x1, "y": 3.0, "width": max(1.0, x2 - x1), "height": height - 6}
+        marks.append(el("rect", el("title", f"{_seconds(step.t_ns)}  {name} {why}"), cls=f"q {kind}", **size))
+        lines += _fitted(why, x1, x2, 14.0, f"qtext {kind}", cut=True)
     lines += [el("path", cls=f"line {kind}", d="".join(d)) for kind, d in paths.items()]
     lines.append(_risers(axis, steps, y))
     return height, marks + lines
 
 
 def _thinned(steps: list[Step]) -> list[Step]:
-    """At most `MOST_POINTS` or so: changes of quality stay, of the rest every nth."""
-    every = math.ceil(len(steps) / MOST_POINTS)
-    return [s for i, s in enumerate(steps) if i % every == 0 or s.quality != steps[i - 1].quality]
+    while len(steps) > MOST_POINTS:
+        steps = thin_steps(steps)
+    return steps
 
 
 def _risers(axis: _Axis, steps: Sequence[Step], y: object) -> Markup:
@@ -265,11 +263,17 @@ def _boxes(axis: _Axis, window: Window, steps: Sequence[Step], top: float, cls: 
     return marks
 
 
-def _merged(window: Window, steps: Sequence[Step]) -> Iterable[tuple[Step, int]]:
-    """Spans, with neighbours of the same value as one."""
+def _merged(window: Window, steps: Sequence[Step], *, by_quality: bool = False) -> Iterable[tuple[Step, int]]:
+    """Spans, with neighbours of the same value (or of the same quality and reason) as one."""
+
+    def same(a: Step, b: Step) -> bool:
+        if by_quality:
+            return (a.quality, a.reason) == (b.quality, b.reason)
+        return (a.value, a.quality) == (b.value, b.quality)
+
     held: tuple[Step, int] | None = None
     for step, end_ns in _spans(window, steps):
-        if held is not None and (held[0].value, held[0].quality) == (step.value, step.quality):
+        if held is not None and same(held[0], step):
             held = held[0], end_ns
             continue
         if held is not None:

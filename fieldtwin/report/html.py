@@ -195,7 +195,11 @@ def _failure(report: Report, number: int, scenario: ScenarioResult, windows: lis
         parts.append(_check_table(failing[:20]))
     if scenario.reproduce:
         parts += [el("p", "This runs it again:", cls="small"), el("pre", scenario.reproduce)]
+    drawn: set[tuple[int, int, tuple[str, ...]]] = set()
     for window in windows:
+        if (same := (window.start_ns, window.end_ns, window.check.names)) in drawn:
+            continue
+        drawn.add(same)
         title = f"{scenario.title}, {window.check.number}: {window.check.text}"
         parts.append(el("h4", f"Around {window.at_ns / SECOND_NS:.3f} s: {window.check.text}"))
         if window.lost:

@@ -77,8 +77,8 @@ class Window:
     bad: dict[tuple[str, int], str] = field(default_factory=dict)
     """What was wrong with the frame on a bus at a time."""
     frames: int = 0
-    unseen: int = 0
-    """Exchanges and changes that were too many."""
+    thinned: set[str] = field(default_factory=set)
+    """Buses, tags and variables of which not all is kept: there was too much of it."""
 
     @property
     def lines(self) -> list[FrameLine]:
@@ -174,12 +174,11 @@ class Study:
     def _exchange(self, exchange: Exchange, windows: list[Window]) -> None:
         for window in windows:
             if exchange.t_ns <= window.end_ns and exchange.end_ns >= window.start_ns:
-                if len(window.exchanges) < MOST_EXCHANGES:
-                    window.exchanges.append(exchange)
-                    if exchange.problem:
-                        window.bad[exchange.bus, exchange.end_ns] = exchange.problem
-                else:
-                    window.unseen += 1
+                window.exchanges.append(exchange)
+                if exchange.problem and len(window.bad) < MOST_EXCHANGES:
+                    window.bad[exchange.bus, exchange.end_ns] = exchange.problem
+                if len(window.exchanges) > MOST_EXCHANGES:
+                    _thin_exchanges(window)
 
     def _changed(self, event: Event, inside: list[Window]) -> None:
         data, name, value = event.data, event.where, event.data.get("value")
@@ -190,10 +189,10 @@ class Study:
         self._now[event.kind][name] = step
         for window in inside:
             steps = (window.tags if event.kind is Kind.TAG else window.states).setdefault(name, [])
-            if len(steps) < MOST_STEPS:
-                steps.append(step)
-            else:
-                window.unseen += 1
+            steps.append(step)
+            if len(steps) > MOST_STEPS:
+                window.thinned.add(name)
+                steps[:] = thin_steps(steps)
 
     def _fault(self, event: Event) -> None:
         id, on = event.where, bool(event.data.get("on"))
@@ -203,6 +202,33 @@ class Study:
         if on:
             target = event.data.get("target") or ""
             self._on[id] = FaultBar(id, str(event.data.get("name", id)), str(target), event.t_ns, None)
+
+
+def _thin_exchanges(window: Window) -> None:
+    """Half of what went well goes; if all went wrong, the older half."""
+    held = window.exchanges
+    window.thinned |= {e.bus for e in held if e.ok}
+    held[:] = [e for number, e in enumerate(held) if e.problem or number % 2]
+    if len(held) > MOST_EXCHANGES * 3 // 4:
+        window.thinned |= {e.bus for e in held}
+        del held[: len(held) // 2]
+
+
+def thin_steps(steps: list[Step]) -> list[Step]:
+    """About half: of every four changes the lowest and the highest, and all that change the quality; if that is most of them,
+    the newer half. What is left has the extremes of what was there."""
+    kept = set()
+    for first in range(0, len(steps), 4):
+        four = range(first, min(first + 4, len(steps)))
+        kept |= {min(four, key=lambda i: _height(steps[i])), max(four, key=lambda i: _height(steps[i]))}
+    kept |= {i for i, s in enumerate(steps) if s.quality != steps[i - 1].quality} | {len(steps) - 1}
+    thin = [steps[i] for i in sorted(kept)]
+    return thin if len(thin) < len(steps) * 3 // 4 else thin[len(thin) // 2 :]
+
+
+def _height(step: Step) -> float:
+    value = step.value
+    return value if isinstance(value, int | float) and value == value else 0.0
 
 
 def _keep(window: Window, line: FrameLine) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -18,7 +17,7 @@ from fieldtwin.report.machines import machines_of
 from fieldtwin.report.markup import Markup, el, text
 from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, Verdict
 from fieldtwin.report.requirements import requirement_verdicts
-from fieldtwin.report.window import LONGEST_NS, MOST_FRAMES, Study
+from fieldtwin.report.window import LONGEST_NS, MOST_EXCHANGES, MOST_FRAMES, MOST_STEPS, Study
 from fieldtwin.scenarios.trace import Event, Kind
 from gateway.core.errors import FileInvalid
 
@@ -188,7 +187,7 @@ def test_many_events_give_a_small_file() -> None:
     html = render_html(report(scenario(trace=crowd)))
     assert html.count("<svg") == 1
     assert len(html) < 700_000
-    assert re.search(r"1 of \d+ drawn", html)
+    assert "thinned: too many" in html
     assert f"{MOST_FRAMES + MOST_FRAMES // 4} frames, " in html
 
 
@@ -253,3 +252,18 @@ def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     assert (tmp_path / "r.html").read_text(encoding="utf-8").startswith("<!doctype html>")
     with pytest.raises(FileInvalid, match="cannot write the report"):
         write_html(report(), tmp_path / "no" / "r.html")
+
+
+def test_what_is_thinned_still_reaches_the_failure() -> None:
+    """However much happens in a window, its end is not left out: that is where the failure is."""
+    crowd: list[Event] = []
+    for n in range(5000):
+        at = 12_200 + n / 5
+        crowd.append(can(at, "185#9E013500"))
+        crowd.append(note(at, Kind.TAG, "ctd.pressure", value=n % 97 / 7, quality="bad" if n == 77 else "good"))
+    (window,) = Study(observatory(), (), scenario(trace=crowd)).run([FAILED])[1]
+    assert window.thinned == {"can0", "ctd.pressure"}
+    for kept, most in ((window.exchanges, MOST_EXCHANGES), (window.tags["ctd.pressure"], MOST_STEPS)):
+        assert most // 4 < len(kept) <= most
+        assert kept[-1].t_ns > 13_195 * MS
+    assert "bad" in {s.quality for s in window.tags["ctd.pressure"]}

@@ -17,4 +17,4 @@ class Drift(ValueFault):
     form = Form
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
-        return value + self.parameters.per_s * since_s
+        return value + float(self.parameters.per_s) * since_s

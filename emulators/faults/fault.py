@@ -162,18 +162,12 @@ class Active:
         aim = self.aim
         if now_ns < self.from_ns or (self.until_ns is not None and now_ns >= self.until_ns):
             return False
-        ways = (
-            frozenset(Way)
-            if aim.direction == "both"
-            else frozenset({Way(aim.direction)} if aim.direction else self.fault.ways)
-        )
-        if frame.way not in ways:
+        if aim.direction not in ("both", "") and frame.way is not Way(aim.direction):
             return False
-        if (
-            self.units
-            and frame.unit not in self.units
-            and not (frame.unit == -1 and aim.unit is None and not aim.device)
-        ):
+        if not aim.direction and frame.way not in self.fault.ways:
+            return False
+        nobody_knows = frame.unit == -1 and aim.unit is None and not aim.device
+        if self.units and frame.unit not in self.units and not nobody_knows:
             return False
         if aim.function is not None and frame.function != aim.function:
             return False

@@ -20,13 +20,9 @@ def _load() -> dict[str, type[Fault]]:
     found: dict[str, type[Fault]] = {}
     for file in _FILES.split():
         module = import_module(f"emulators.faults.{file}")
-        made = [
-            c
-            for c in vars(module).values()
-            if isinstance(c, type) and issubclass(c, Fault) and c.__module__ == module.__name__
-        ]
-        for kind in made:
-            found[kind.name] = kind
+        for kind in vars(module).values():
+            if isinstance(kind, type) and issubclass(kind, Fault) and kind.__module__ == module.__name__:
+                found[kind.name] = kind
     return found
 
 

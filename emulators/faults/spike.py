@@ -20,4 +20,4 @@ class Spike(ValueFault):
     form = Form
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
-        return value + self.parameters.by if random.random() < self.parameters.probability_each else value
+        return value + float(self.parameters.by) if random.random() < self.parameters.probability_each else value

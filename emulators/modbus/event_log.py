@@ -35,11 +35,14 @@ class EventLog:
 
     def note_received(self, *, listening: bool = False, broadcast: bool = False, damaged: bool = False) -> None:
         """A message arrived; to be called before it is executed."""
-        self.note(RECEIVED | listening * WHILE_LISTENING | broadcast * BROADCAST | damaged * DAMAGED)
+        event = RECEIVED
+        if listening or broadcast or damaged:
+            event |= listening * WHILE_LISTENING | broadcast * BROADCAST | damaged * DAMAGED
+        self._events.appendleft(event)
 
     def note_sent(self, response: bytes) -> None:
         """A response went out; an exception response says which kind."""
-        self.note(SENT | (_SENT_FLAGS.get(response[1], 0) if response[0] & 0x80 else 0))
+        self._events.appendleft(SENT if response[0] < 0x80 else SENT | _SENT_FLAGS.get(response[1], 0))
 
     def clear(self) -> None:
         """Forget all events."""

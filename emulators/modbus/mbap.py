@@ -75,6 +75,16 @@ class MbapSlave:
             exchanges.append(self._exchange(adu, busy, now_ns))
         return exchanges
 
+    def answer(self, data: bytes, now_ns: int) -> bytes:
+        """Like `feed`, the responses in one piece. What comes is one whole ADU as a rule: that is not copied together first."""
+        length = len(data) - HEADER
+        if MIN_LENGTH <= length <= MAX_LENGTH and data[5] == length and data[2:5] == b"\0\0\0" and not self._buffer:
+            if self.desync is not None:
+                return b""
+            self.requests += 1
+            return self._reply(self._route(data[6]), data, False, now_ns)
+        return b"".join(self.feed(data, now_ns))
+
     def receive_datagram(self, data: bytes, now_ns: int) -> list[Exchange]:
         """Like `receive`, for a datagram: what is not whole at its end is dropped, and nothing outlives it."""
         exchanges = self.receive(data, now_ns)
@@ -104,21 +114,25 @@ class MbapSlave:
         return adu
 
     def _exchange(self, adu: bytes, busy: bool, now_ns: int) -> Exchange:
-        unit_id, pdu = adu[6], adu[7:]
-        unit = self._route(unit_id)
+        unit = self._route(adu[6])
+        reply = self._reply(unit, adu, busy, now_ns)
+        return Exchange(adu, reply, unit.latency_s if unit is not None and reply else 0.0)
+
+    def _reply(self, unit: ModbusUnit | None, adu: bytes, busy: bool, now_ns: int) -> bytes:
+        """The whole response, empty for silence."""
+        pdu = adu[7:]
         response: bytes | None
         if unit is None:
             response = bytes((pdu[0] | 0x80, NO_PATH)) if pdu[0] < 0x80 else None
         else:
-            unit.heard(messages=1)
-            if self._allow is not None and not self._allow(unit_id, pdu):
+            unit.counters.bus_messages += 1
+            if self._allow is not None and not self._allow(adu[6], pdu):
                 response = unit.refuse_function(pdu)
             else:
                 response = unit.refuse_busy(pdu) if busy else unit.respond(pdu, now_ns)
         if response is None:
-            return Exchange(adu)
-        reply = adu[:4] + (len(response) + 1).to_bytes(2, "big") + adu[6:7] + response
-        return Exchange(adu, reply, unit.latency_s if unit is not None else 0.0)
+            return b""
+        return adu[:4] + (len(response) + 1).to_bytes(2, "big") + adu[6:7] + response
 
     def _route(self, unit_id: int) -> ModbusUnit | None:
         if unit_id in self.units:

@@ -92,8 +92,7 @@ async def serve_mbap(
 
 def _at_once(slave: MbapSlave, data: bytes, clock: Clock) -> tuple[bytes, bool]:
     """The replies to a chunk, and whether the stream makes no sense behind it."""
-    exchanges = slave.receive(data, clock.monotonic_ns())
-    return b"".join([exchange.reply for exchange in exchanges]), slave.desync is not None
+    return slave.answer(data, clock.monotonic_ns()), slave.desync is not None
 
 
 async def serve_udp(

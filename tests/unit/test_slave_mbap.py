@@ -63,6 +63,11 @@ def test_whole_bytewise_and_with_a_tail(heard: bytes, expected: list[bytes]) -> 
     slave = make_slave()
     assert slave.feed(heard + OURS[:7], 0) == expected
     assert slave.feed(OURS[7:], 0) == [ANSWER]
+    one, other = make_slave(), make_slave()
+    assert one.answer(heard + OURS[:7], 0) + one.answer(OURS[7:], 0) == b"".join([*expected, ANSWER])
+    assert other.answer(heard, 0) + other.answer(OURS, 0) == b"".join([*expected, ANSWER])
+    assert one.requests == other.requests
+    assert one.units[1].counters == other.units[1].counters
 
 
 def test_mb_053_more_at_once_than_allowed() -> None:
@@ -82,6 +87,7 @@ def test_mb_055_a_length_that_cannot_be(length: int) -> None:
     assert slave.desync is not None
     assert "2 to 254" in str(slave.desync)
     assert slave.feed(OURS, 0) == [], "nothing after it can be trusted"
+    assert slave.answer(OURS, 0) == b""
 
 
 def test_mb_054_and_055_are_counted() -> None:

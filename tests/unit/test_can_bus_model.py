@@ -54,6 +54,31 @@ def test_a_frame_on_the_wire_is_not_interrupted() -> None:
     assert done[1].start_ns == 400 * US
 
 
+def test_what_waits_can_be_taken_back_and_what_is_on_the_wire_cannot() -> None:
+    bus = CanBus(125_000)
+    a, b = bus.join(0), bus.join(0)
+    again, other = CanFrame(0x001, b"\x01"), CanFrame(0x002)
+    for frame in (ONE, again, other):
+        assert bus.submit(a, frame, 0)
+    assert bus.submit(b, CanFrame(0x003), 0)
+    assert bus.withdraw(a, {0x001}, 100 * US) == [again], "001h has been on the wire since 0"
+    assert bus.withdraw(b, {0x003}, 100 * US) == [CanFrame(0x003)], "it lost the arbitration and waits"
+    assert bus.withdraw(b, {0x003}, 100 * US) == []
+    assert keys(bus.advance(END)) == [0x001, 0x002]
+    assert (bus.queued(a), bus.queued(b)) == (0, 0)
+
+
+def test_what_is_taken_back_in_time_takes_no_part_in_the_arbitration() -> None:
+    bus = CanBus(125_000)
+    a, b = bus.join(0), bus.join(0)
+    bus.submit(a, ZERO, 0)
+    bus.submit(b, ONE, 0)
+    assert bus.next_event_ns() == 400 * US
+    assert bus.withdraw(a, {0x000}, 0) == [ZERO]
+    assert bus.next_event_ns() == 376 * US
+    assert keys(bus.advance(END)) == [0x001]
+
+
 def test_who_comes_before_the_start_takes_part_whoever_has_looked() -> None:
     bus = CanBus(125_000)
     a, b = bus.join(0), bus.join(0)

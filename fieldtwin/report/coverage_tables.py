@@ -127,9 +127,8 @@ def _problems(counts: Counts) -> Markup:
         for (device, problem), n in sorted(counts.problems.items())
     ]
     if not rows:
-        return join(
-            [el("h3", "What went wrong on the wires"), el("p", "Nothing: every request was answered as asked.")]
-        )
+        said = "Nothing: every request was answered as asked." if counts.services else "No frame was seen."
+        return join([el("h3", "What went wrong on the wires"), el("p", said)])
     head = el("tr", el("th", "device"), el("th", "what"), el("th", "times", cls="num"))
     return join(
         [

@@ -127,7 +127,7 @@ def _verdict_table(report: Report) -> Markup:
         passed = sum(c.verdict is Verdict.PASSED for c in scenario.checks)
         rows.append(
             el(
-                "tr", el("td", pill(scenario.verdict)), el("td", name, cls="name"), el("td", _why(scenario)),
+                "tr", el("td", pill(scenario.verdict)), el("td", name, cls="name"), el("td", _why(scenario), cls="long check"),
                 el("td", f"{passed}/{len(scenario.checks)}", cls="num"), el("td", ", ".join(scenario.requirements)),
                 el("td", _time(scenario.simulated_s), cls="num"), el("td", _time(scenario.took_s), cls="num"),
                 id=None if scenario.verdict.bad else f"s{number}",
@@ -262,7 +262,7 @@ def _frames(window: Window, opened: bool) -> Markup:
             el(
                 "tr", el("td", f"{line.t_ns / SECOND_NS:.6f}", cls="mono"), el("td", line.bus),
                 el("td", "→" if line.sent else "←", title="sent" if line.sent else "received"),
-                el("td", _cut(said, 400)), el("td", _cut(line.raw, 130), cls="mono raw"),
+                el("td", _cut(said, 400), cls="long check"), el("td", _cut(line.raw, 130), cls="mono raw"),
                 cls="bad" if bad else None,
             )
         )  # fmt: skip
@@ -315,8 +315,8 @@ def _check_table(checks: Iterable[CheckResult]) -> Markup:
         ]  # fmt: skip
         rows.append(
             el(
-                "tr", el("td", pill(check.verdict)), el("td", check.number), el("td", _cut(check.text, 400)),
-                el("td", at, cls="num"), el("td", found), el("td", check.where, cls="mono"),
+                "tr", el("td", pill(check.verdict)), el("td", check.number), el("td", _cut(check.text, 400), cls="long check"),
+                el("td", at, cls="num"), el("td", found, cls="long"), el("td", check.where, cls="mono"),
             )
         )  # fmt: skip
     head = [el("th", t) for t in ("", "no.", "check")] + [el("th", "at s", cls="num"), el("th", ""), el("th", "where")]

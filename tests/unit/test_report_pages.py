@@ -153,6 +153,7 @@ def test_a_run_of_nothing() -> None:
     said = page(empty).said
     assert "No scenario was run" in said
     assert "No scenario names a requirement" in said
+    assert page(report()).said.count("No frame was seen") == 1
 
 
 def test_a_failure_without_a_trace() -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import random
+import shutil
 from pathlib import Path
 
 import pytest
 
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 from gateway.core.image import Message
 from plc.binding import load_program
 from plc.program import Outbox, ScanInfo
@@ -44,3 +46,24 @@ def test_same_seed_same_trace(seed: int) -> None:
     assert python.logged > 1000  # so that the log went round, and entries were lost
     assert python.dropped > 100
     assert python.bad_commands > 10
+
+
+def hash_of(source: str, folder: Path, seed: int) -> tuple[str, int, list[str]]:
+    """The observatory in virtual time with this relay: the hash of all frames, values and states, how many, and the states."""
+    folder.mkdir()
+    for file in SYSTEMS.glob("observatory*.yaml"):
+        text = file.read_text(encoding="utf-8")
+        (folder / file.name).write_text(text.replace('"python: plc.relay:Relay"', source), encoding="utf-8")
+    shutil.copy(SYSTEMS / "relay.st", folder)
+    run = VirtualRun(VirtualOptions(str(folder / "observatory.yaml"), 12.0, seed=seed, commands=(1, -1)))
+    run.run()
+    assert run.errors == []
+    return run.trace.hexdigest(), run.trace.count, run.states.sequence("relay")
+
+
+def test_the_observatory_cannot_tell_them_apart(tmp_path: Path) -> None:
+    python = hash_of('"python: plc.relay:Relay"', tmp_path / "python", 7)
+    text = hash_of("relay.st", tmp_path / "text", 7)
+    assert text == python
+    assert python[1:] == (python[1], ["STANDBY", "ACTIVE", "OFF"])
+    assert python[1] > 500

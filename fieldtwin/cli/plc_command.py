@@ -123,8 +123,8 @@ def force(tag: str, value: str, yes: bool, instance: str) -> int:
     rows = [row for row in _tags(instance, (tag,)) if row["tag"] == tag]
     now = is_now(rows, tag)
     codes = {word: int(code) for code, word in rows[-1]["words"].items()}
-    wanted = codes[value] if value in codes else parse_value(value)
-    _sure(f"force {tag}: {now} now, {value} from then on", yes)
+    wanted = codes[value] if value in codes else parse_value(value, tuple(codes))
+    _sure(f"{tag} is {now}; force it to {value}", yes)
     _act(instance, "force", tag=tag, value=wanted)
     talk.print(f"{tag} is forced to {value}", markup=False)
     return 0

@@ -164,8 +164,8 @@ def is_now(rows: list[Row], tag: str) -> str:
     if not rows:
         raise UsageError(f"no tag {tag!r}", expected="a tag without *")
     row = rows[-1]
-    limits = f" ({_limits(row['limits'])})" if _limits(row["limits"]) else ""
-    return f"{row['side']} {_named(row, row['value'])} {row['unit']}".strip() + f"{limits}, {_quality(row)},"
+    about = [row["side"], _quality(row), *([_limits(row["limits"])] if _limits(row["limits"]) else [])]
+    return f"{_named(row, row['value'])} {row['unit']}".strip() + f" ({', '.join(about)})"
 
 
 def acts_text(acts: dict[str, int]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,8 +57,8 @@ def talk_to(instance: str, ask: Callable[[ControlClient], Awaitable[T]]) -> T:
     return asyncio.run(main())
 
 
-def parse_value(text: str) -> bool | int | float:
-    """``true``, ``false``, a number in decimal or 0x. Raises `UsageError`."""
+def parse_value(text: str, words: Sequence[str] = ()) -> bool | int | float:
+    """``true``, ``false``, a number in decimal or 0x. Raises `UsageError`; `words` would have been understood, too."""
     if text.lower() in ("true", "false"):
         return text.lower() == "true"
     try:
@@ -68,7 +68,7 @@ def parse_value(text: str) -> bool | int | float:
     try:
         return float(text)
     except ValueError as e:
-        raise UsageError("not a value", expected="true, false or a number", got=text) from e
+        raise UsageError("not a value", expected=", ".join(words) or "true, false or a number", got=text) from e
 
 
 # -- programs of a system ---------------------------------------------------------------------------------------------

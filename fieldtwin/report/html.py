@@ -262,7 +262,7 @@ def _frames(window: Window, opened: bool) -> Markup:
             el(
                 "tr", el("td", f"{line.t_ns / SECOND_NS:.6f}", cls="mono"), el("td", line.bus),
                 el("td", "→" if line.sent else "←", title="sent" if line.sent else "received"),
-                el("td", _cut(said, 400), cls="long check"), el("td", _cut(line.raw, 130), cls="mono raw"),
+                el("td", _cut(said, 400), cls="long check"), el("td", _cut(line.raw, 96), cls="mono raw"),
                 cls="bad" if bad else None,
             )
         )  # fmt: skip

@@ -1,9 +1,9 @@
 """A run as a value change dump (IEEE 1364-2005, clause 18), for GTKWave and other waveform viewers.
 
-One scope a device, program and bus, and one for faults. Numbers are ``real``, what is true or false a ``wire``, words
-(states, decoded frames) a ``reg`` of ASCII characters, to be shown as such. A tag has its quality beside it (0 good,
-1 substituted, 2 simulated, 3 uncertain, 4 bad); without a value its number stays what it was, and the quality says that it
-does not count.
+One scope a device and bus, one for what programs say (``plc``), one for faults. Numbers are ``real``, what is true or false
+a ``wire``, words (states, decoded frames) a ``reg`` of ASCII characters, to be shown as such. A tag has its quality beside it
+(0 good, 1 substituted, 2 simulated, 3 uncertain, 4 bad); without a value its number stays what it was, and the quality says
+that it does not count.
 """
 
 from __future__ import annotations
@@ -156,15 +156,8 @@ def _changes(events: Iterable[Event], system: System | None, machines: dict[str,
                     yield t_ns, scope, name or "value", data["value"], 0
                 yield t_ns, scope, f"{name}_quality", _QUALITIES.get(data.get("quality", ""), 4), _QUALITY_BITS
             case Kind.STATE:
-                scope, _, name = event.where.partition(".")
-                machine = machines.get(event.where)
-                yield (
-                    t_ns,
-                    scope,
-                    name or "value",
-                    machine.name_of(data.get("value")) if machine else data.get("value"),
-                    0,
-                )
+                machine, value = machines.get(event.where), data.get("value")
+                yield t_ns, "plc", event.where, machine.name_of(value) if machine else value, 0
             case Kind.FAULT:
                 yield t_ns, "faults", f"{event.where}_{data.get('name', '')}", bool(data.get("on")), 0
             case Kind.STEP:

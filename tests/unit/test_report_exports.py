@@ -131,7 +131,7 @@ def test_a_run_as_waveforms(tmp_path: Path) -> None:
     system, path = observatory(), tmp_path / "run.vcd"
     write_vcd(path, run_trace(20), system, machines_of(system), "a run\nwith $end in its name")
     found = read_vcd(path)
-    assert [(t // MS, word(v)) for t, v in found["relay.state"][1:]] == [
+    assert [(t // MS, word(v)) for t, v in found["plc.relay_state"][1:]] == [
         (0, "STANDBY"), (2010, "ACTIVE"), (16_000, "OFF"), (18_000, "STANDBY"),
     ]  # fmt: skip
     assert found["faults.f1_drop"] == [(0, "x"), (12_000 * MS, "1"), (15_000 * MS, "0")]

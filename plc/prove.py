@@ -127,6 +127,17 @@ def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -
     return Result(len(seen), transitions, depth, complete=True)
 
 
+def shown(proof: Proof, way: Sequence[Given]) -> dict[str, Any]:
+    """What the program's outputs and locals are at the end of `way`, as far as that got: its last scan may have raised."""
+    point = _Point(proof.make(), 0, 0, None, None)
+    for given in way:
+        point = point.after(given)
+        _broken(proof, point, given)
+    program = point.program
+    own = [v.name for v in program.variables.values() if v.role is not Role.INPUT and v.kind is not TagKind.MESSAGE]
+    return {name: program.__dict__[name] for name in own}
+
+
 class _Point:
     """A program in a state that was reached, and how."""
 

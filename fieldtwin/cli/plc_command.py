@@ -245,14 +245,15 @@ def prove(
     _proof behind). Exit 1 with a shortest counterexample, or when the bounds were reached before everything was seen.
     """
     from fieldtwin.cli.plc_views import print_proof
-    from fieldtwin.running.plc_client import chosen, proof_of, scenario
+    from fieldtwin.running.counterexample import scenario
+    from fieldtwin.running.plc_client import chosen, proof_of
     from plc.prove import prove as look
     from twin.system import load_system
 
     loaded = load_system(system, [Path(p) for p in profiles])
     name, proof = chosen(loaded, program, proof_of, "a proof")
     result = look(proof, max_states)
-    text = scenario(loaded, name, result) if result.broken else ""
+    text = scenario(loaded, name, proof, result) if result.broken else ""
     if output is not None and text:
         output.write_text(text, encoding="utf-8")
     if as_json:

@@ -11,12 +11,9 @@ from typing import Any, TypeVar
 
 from gateway.core.control import ControlClient
 from gateway.core.errors import Unreachable, UsageError
-from gateway.core.image import TagKind
-from gateway.core.statemachine import decode_period
-from gateway.core.values import COMMAND
 from plc.binding import load_program
 from plc.program import Program
-from plc.prove import Given, Proof, Result
+from plc.prove import Proof
 from plc.states import StateTable
 from twin.instance import runtime_root
 from twin.system import System
@@ -112,41 +109,3 @@ def proof_of(program: Program) -> Proof | None:
             raise UsageError(f"{name} cannot be imported: {e}") from e
         found = getattr(sys.modules.get(module), "PROOF", None)
     return found if isinstance(found, Proof) else None
-
-
-def scenario(system: System, program: str, result: Result) -> str:
-    """The way to what is broken, as a scenario file (docs/files.md)."""
-    lines = [
-        f"scenario: {result.broken}",
-        "# the shortest way that was found, scan by scan",
-        f"system: {system.path.name}",
-        "steps:",
-    ]
-    for given in result.way:
-        lines += [f"  - wait: {given.ms:g}ms", *(f"  - {step}" for step in _steps(system, program, given))]
-    lines.append(f"  - expect: {{program: {program}, holds: {result.broken!r}}}")
-    return "\n".join(lines) + "\n"
-
-
-def _steps(system: System, program: str, given: Given) -> list[str]:
-    bindings = system.plc.programs[program].inputs
-    steps = []
-    for name, value in given.inputs:
-        tag = bindings[name].tag if name in bindings else f"{program}.{name}"
-        variable = programs(system)[program].variables[name]
-        if variable.kind is TagKind.MESSAGE:
-            if value is not None:
-                steps.append(_message(tag, value))
-        elif value is None:
-            steps.append(f"fault: {{name: bad, tag: {tag}}}")
-        else:
-            steps.append(f"set: {{tag: {tag}, value: {str(value).lower() if isinstance(value, bool) else value}}}")
-    if not given.taken:
-        steps.append("fault: {name: full, of: mailboxes}")
-    return steps
-
-
-def _message(tag: str, data: bytes) -> str:
-    if tag.endswith(".inbox") and len(data) == 2:
-        return f"send: {{from: shore, period_s: {decode_period(COMMAND(data))}}}"
-    return f'send: {{to: {tag}, payload: "{data.hex()}"}}'

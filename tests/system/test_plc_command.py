@@ -12,6 +12,7 @@ from procs import fieldtwin, wait_for
 
 from fieldtwin.cli.main import cli
 from gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from gateway.core.yaml_file import parse
 
 
 def plc(*args: str) -> str:
@@ -92,6 +93,44 @@ def test_a_counterexample_is_a_scenario(tmp_path: Path) -> None:
     out = tmp_path / "found.scenario.yaml"
     shown = plc("prove", str(tmp_path / "site.yaml"), "-o", str(out))
     assert "relay: broken after 2 scans: the state follows from the sign of the period" in shown
-    scenario = out.read_text()
-    assert scenario.count("send: {from: shore, period_s: -") >= 1
-    assert "system: site.yaml" in scenario
+    scenario = parse(out.read_text(), str(out)).data
+    assert (scenario["system"], scenario["needs"]) == ("site.yaml", ["send_command"])
+    assert [s for s in scenario["steps"] if "send" in s] == [{"send": {"from": "shore", "period_s": -32768}}] * 2
+    assert scenario["steps"][-1] == {"pause": "5s"}
+    [seen] = scenario["never"]
+    assert seen.startswith("relay.state == 'ACTIVE' and relay.period == -32768 and relay.commands == 2 and ")
+
+
+def test_values_and_bad_inputs_of_a_counterexample_are_steps(tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / "profiles/systems/observatory.yaml").read_text(encoding="utf-8")
+    inputs = "command: {tag: modem.inbox}\n        sample:  {tag: ctd.sample}"
+    assert inputs in text
+    text = text.replace(inputs, "depth: {tag: ctd.pressure}").replace("plc.relay:Relay", "winch:Winch")
+    text = text.replace("outputs: {period_s: ctd.sample_period_s, response: modem.outbox}", "outputs: {}")
+    (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
+    (tmp_path / "winch.py").write_text(
+        "from gateway.core.image import TagKind\nfrom plc.program import var_input\n"
+        "from plc.states import StateMachine, StateTable, Transition\n\n\nclass Winch(StateMachine):\n"
+        "    depth = var_input(TagKind.REAL)\n    table = StateTable(\n"
+        "        Transition('UP', 'DOWN', when='depth is not None and depth < 5'),\n"
+        "        Transition('DOWN', 'LOST', when='depth is None', after_ms=30),\n    )\n"
+    )
+    (tmp_path / "winch_proof.py").write_text(
+        "from plc.prove import Proof, machine_key\nfrom winch import Winch\n\nPROOF = Proof(Winch, {'depth': [9.0, 2.5, None]},\n"
+        "    {'never \"lost\"': lambda w: w.state_name != 'LOST'}, machine_key, requirement={'never \"lost\"': 'REQ-9'})\n"
+    )
+    out = tmp_path / "found.scenario.yaml"
+    plc("prove", str(tmp_path / "site.yaml"), "-o", str(out))
+    found = parse(out.read_text(), str(out)).data
+    assert found["scenario"] == 'relay: never "lost"'
+    assert (found["requirements"], found["needs"]) == (["REQ-9"], ["set_value", "inject_fault"])
+    assert found["never"] == ["relay.state == 'LOST'"]
+    assert found["steps"] == [
+        {"pause": "10ms"},
+        {"set": {"tag": "ctd.pressure", "value": 2.5}},
+        {"pause": "10ms"},
+        {"set": {"tag": "ctd.pressure", "value": 9.0}},
+        {"pause": "20ms"},
+        {"fault": {"id": "no-ctd", "name": "silence", "device": "ctd"}},
+        {"pause": "5s"},
+    ]

@@ -1,0 +1,111 @@
+"""The shortest way to what does not hold, as a scenario: what can be brought about from outside, in the order of the scans.
+
+A proof's scans are closer together than a wire's messages, so a scenario keeps their order and what is between them at least. It
+ends with a look: what the broken program showed of itself must never be seen. What nothing outside can bring about (a mailbox
+that nobody empties, a payload of one's own) stands in it as a comment.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from gateway.core.image import TagKind
+from gateway.core.statemachine import decode_period
+from gateway.core.values import COMMAND, Quality, TagValue
+from plc.program import Program
+from plc.prove import Given, Proof, Result, shown
+from twin.system import System
+
+ARRIVES = "5s"
+"""How long the last stimulus may take to get to the program."""
+_NEEDS = {"send": "send_command", "set": "set_value", "fault": "inject_fault", "clear": "inject_fault"}
+
+
+def scenario(system: System, program: str, proof: Proof, result: Result) -> str:
+    """A scenario file (docs/scenarios.md) for what `result` found of `program`."""
+    steps = list(_steps(system, program, proof.make(), result.way))
+    needs = list(dict.fromkeys(_NEEDS[word] for word, _ in steps if word in _NEEDS))
+    lines = [
+        f"# The shortest way that was found: {len(result.way)} scans. {result.broken}",
+        f"scenario: {_text(f'{program}: {result.broken}')}",
+        f"system: {_text(system.path.name)}",
+    ]
+    if needs:
+        lines.append(f"needs: [{', '.join(needs)}]")
+    if requirement := proof.requirement.get(result.broken):
+        lines.append(f"requirements: [{_text(requirement)}]")
+    if seen := _seen(system, program, proof, result):
+        lines += ["never:", f"  - {_text(seen)}"]
+    lines.append("steps:")
+    lines += [f"  # {what}" if word == "#" else f"  - {word}: {what}" for word, what in steps]
+    lines.append(f"  - pause: {ARRIVES}")
+    return "\n".join(lines) + "\n"
+
+
+def _text(text: str) -> str:
+    """A string of YAML, whatever is in it."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _seen(system: System, program: str, proof: Proof, result: Result) -> str:
+    """What the broken program shows under its own names; what is bound to a device stands for that device's."""
+    bound = system.plc.programs[program].outputs
+    words = {v.name: dict(v.words) for v in proof.make().variables.values()}
+    parts = []
+    for name, value in shown(proof, result.way).items():
+        if name not in bound and value is not None:
+            word = words[name].get(value) if isinstance(value, int) else None
+            parts.append(f"{program}.{name} == {repr(word) if word else repr(value)}")
+    return " and ".join(parts)
+
+
+def _steps(system: System, program: str, made: Program, way: tuple[Given, ...]) -> Iterator[tuple[str, str]]:
+    """(word, what it says) of each step; ``#`` is a remark."""
+    bindings = system.plc.programs[program].inputs
+    before: dict[str, Any] = {}
+    bad: set[str] = set()
+    waited_ms = 0.0
+    for given in way:
+        waited_ms += given.ms
+        told: list[tuple[str, str]] = []
+        for name, value in given.inputs:
+            tag = bindings[name].tag if name in bindings else f"{program}.{name}"
+            if made.variables[name].kind is TagKind.MESSAGE:
+                told += [] if value is None else [_message(tag, value)]
+            elif name not in before or before[name] != value:
+                told += _input(tag, value, bad)
+            before[name] = value
+        if not given.taken:
+            told.append(("#", "nobody takes the messages that the program sent"))
+        if told:
+            yield "pause", f"{waited_ms:g}ms"
+            waited_ms = 0.0
+            yield from told
+    if waited_ms:
+        yield "pause", f"{waited_ms:g}ms"
+
+
+def _message(tag: str, data: bytes) -> tuple[str, str]:
+    if tag.endswith(".inbox") and len(data) == 2:
+        return "send", f"{{from: shore, period_s: {decode_period(COMMAND(data))}}}"
+    return "#", f"a message of {tag}: {data.hex() or 'empty'}"
+
+
+def _input(tag: str, value: Any, bad: set[str]) -> Iterator[tuple[str, str]]:
+    """`bad` has the devices that were silenced."""
+    device = tag.partition(".")[0]
+    if isinstance(value, TagValue):
+        if value.quality not in (Quality.GOOD, Quality.BAD):
+            yield "#", f"{tag} is {value.quality}"
+        value = None if value.quality is Quality.BAD else value.value
+    if value is None:
+        if device not in bad:
+            yield "fault", f"{{id: {_text(f'no-{device}')}, name: silence, device: {_text(device)}}}"
+            bad.add(device)
+        return
+    if device in bad:
+        yield "clear", _text(f"no-{device}")
+        bad.discard(device)
+    yield "set", f"{{tag: {_text(tag)}, value: {json.dumps(value)}}}"

@@ -28,7 +28,7 @@ class Axis:
 
 def label(name: str, below: str = "") -> list[Markup]:
     """A lane's name on the left, the whole of it in its title, and a line below it."""
-    most = int((LEFT - 14) / CHAR)
+    most = int((LEFT - 14) / 6.9)  # lane names are bold
     shown = name if len(name) <= most else name[: most // 2 - 1] + "…" + name[-(most - most // 2) :]
     parts = [el("text", el("title", name), shown, cls="lane", x=8.0, y=15.0)]
     if below:

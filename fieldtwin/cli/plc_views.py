@@ -192,10 +192,10 @@ def print_proof(name: str, proof: Proof, result: Result, text: str) -> None:
     if result.proved:
         data.print(f"{name}: proved over {seen}", markup=False)
         for invariant in proof.invariants:
-            data.print(f"  holds: {invariant}", markup=False)
+            data.print(f"  holds: {invariant}", markup=False, soft_wrap=True)
     elif result.broken:
-        data.print(f"{name}: broken after {len(result.way)} scans: {result.broken}", markup=False)
-        data.print(text, markup=False, end="")
+        data.print(f"{name}: broken after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
+        data.print(text, markup=False, highlight=False, soft_wrap=True, end="")
     else:
         data.print(f"{name}: nothing broken in {seen}, but not everything was seen: no proof", markup=False)
         talk.print("raise --max-states")

@@ -28,7 +28,7 @@ def scenario(system: System, program: str, proof: Proof, result: Result) -> str:
     steps = list(_steps(system, program, proof.make(), result.way))
     needs = list(dict.fromkeys(_NEEDS[word] for word, _ in steps if word in _NEEDS))
     lines = [
-        f"# The shortest way that was found: {len(result.way)} scans. {result.broken}",
+        f"# The shortest way that was found ({len(result.way)} scans) to where this does not hold: {result.broken}",
         f"scenario: {_text(f'{program}: {result.broken}')}",
         f"system: {_text(system.path.name)}",
     ]

@@ -1,0 +1,105 @@
+"""`fieldtwin trace`: what happened in a run, in words, as JSON, or as waveforms. Parses and prints, no more."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.talk import talk
+from fieldtwin.decoding.decoder import Decoder
+from fieldtwin.decoding.exchange import Decoded, Exchange
+from fieldtwin.decoding.trace_file import read_events
+from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.errors import UsageError
+
+NS_PER_S = 1_000_000_000
+
+
+@click.command("trace")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("system")
+@profiles_option
+@click.option("--only", multiple=True, help="A bus, device, tag, program or fault; all its events. Repeatable.")
+@click.option("--from", "start_s", type=Duration(), default="0s", help="Leave out what was before.")
+@click.option("--to", "end_s", type=Duration(), help="Leave out what was later.")
+@click.option("--problems", is_flag=True, help="Only requests without a good answer.")
+@click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead.")
+@json_option
+def command(
+    file: Path,
+    system: str,
+    profiles: tuple[str, ...],
+    only: tuple[str, ...],
+    start_s: float,
+    end_s: float | None,
+    problems: bool,
+    vcd: Path | None,
+    as_json: bool,
+) -> int:
+    """Show FILE, a trace (run --virtual --trace) or a capture (run --capture) of SYSTEM, frames decoded.
+
+    With --json, each request with its answer, and each message, is a line.
+    """
+    from twin.system import load_system
+
+    plant = load_system(system, [Path(p) for p in profiles])
+    events = read_events(file, plant)
+    start_ns, end_ns = round(start_s * NS_PER_S), None if end_s is None else round(end_s * NS_PER_S)
+    if vcd is not None:
+        if only or problems or as_json:
+            raise UsageError("--vcd takes the whole trace", expected="no --only, --problems or --json beside it")
+        from fieldtwin.report.machines import machines_of
+        from fieldtwin.report.vcd import write_vcd
+
+        inside = [e for e in events if e.t_ns >= start_ns and (end_ns is None or e.t_ns <= end_ns)]
+        write_vcd(vcd, inside, plant, machines_of(plant), f"{plant.name}, {file.name}")
+        talk.print(f"{len(inside)} events  →  {vcd}", soft_wrap=True)
+        return 0
+    decoder = Decoder(plant)
+    for event, decoded in _decoded(decoder, events, end_ns):
+        if event.t_ns < start_ns:
+            continue
+        if as_json or problems:
+            _show_exchanges(decoded.exchanges, only, problems=problems, as_json=as_json)
+        elif _wanted(only, event, decoded):
+            click.echo(_line(event, decoded))
+    if as_json or problems:
+        _show_exchanges(decoder.finish(), only, problems=problems, as_json=as_json)
+    return 0
+
+
+def _decoded(decoder: Decoder, events: Iterator[Event], end_ns: int | None) -> Iterator[tuple[Event, Decoded]]:
+    for event in events:
+        if end_ns is not None and event.t_ns > end_ns:
+            return
+        yield event, decoder.decode(event)
+
+
+def _wanted(only: tuple[str, ...], event: Event, decoded: Decoded) -> bool:
+    names = {event.where, event.where.partition(".")[0], *(e.device for e in decoded.exchanges)}
+    told = decoded.text.partition(":")[0]  # a request names its device too
+    return not only or not names.isdisjoint(only) or (event.kind is Kind.FRAME and told in only)
+
+
+def _line(event: Event, decoded: Decoded) -> str:
+    if event.kind is Kind.FRAME:
+        head = f"{event.where} {'→' if event.data.get('dir') == 'sent' else '←'}"
+    else:
+        head = event.kind.value
+    return f"{event.t_ns / NS_PER_S:12.6f}  {head:<10}  {decoded.text}"
+
+
+def _show_exchanges(
+    exchanges: list[Exchange] | tuple[Exchange, ...], only: tuple[str, ...], *, problems: bool, as_json: bool
+) -> None:
+    for exchange in exchanges:
+        if (problems and exchange.ok) or (only and not {exchange.bus, exchange.device}.intersection(only)):
+            continue
+        if as_json:
+            click.echo(json.dumps({"t_s": exchange.t_ns / NS_PER_S, "bus": exchange.bus, **exchange.describe()}))
+        else:
+            click.echo(f"{exchange.t_ns / NS_PER_S:12.6f}  {exchange.bus:<10}  {exchange.text}: {exchange.reply_text}")

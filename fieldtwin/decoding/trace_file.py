@@ -1,0 +1,48 @@
+"""Files that hold what happened: a run's trace (`fieldtwin run --trace`) and a capture of its wires (`--capture`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from fieldtwin.decoding.decoder import frame_events
+from fieldtwin.formats.pcap import MAX_LINE_BYTES, read_capture
+from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.errors import FileInvalid
+from twin.system import System
+
+_EXPECTED = "[ns, kind, where, data], as `fieldtwin run --virtual --trace` writes it"
+
+
+def read_events(path: Path, system: System) -> Iterator[Event]:
+    """The events of a trace or, of a capture, its frames on the system's buses, ns since the first. A last line that was cut
+    off is left out. Raises `FileInvalid` with the line at any other flaw.
+    """
+    try:
+        with path.open("rb") as file:
+            first = file.read(1)
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    if first == b"{":
+        captured = list(read_capture(path))
+        yield from frame_events(captured, system, captured[0].t_ns if captured else 0)
+        return
+    yield from _trace(path)
+
+
+def _trace(path: Path) -> Iterator[Event]:
+    decoder, kinds = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]]), {k.value: k for k in Kind}
+    with path.open("rb") as file:
+        number = 0
+        while line := file.readline(MAX_LINE_BYTES):
+            number += 1
+            try:
+                t_ns, kind, where, data = decoder.decode(line)
+                event = Event(t_ns, kinds[kind], where, data)
+            except (msgspec.DecodeError, KeyError) as e:
+                if not line.endswith(b"\n") and not file.read(1):
+                    return
+                raise FileInvalid(f"no event: {e}", path=str(path), line=number, expected=_EXPECTED) from e
+            yield event

@@ -28,6 +28,7 @@ from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.recorded_device import RecordedDevice, load_replay
+from emulators.replay.can_log import SUFFIX, CanLog
 from emulators.replay.replay import ExchangeReplay
 from emulators.signals import SignalPlayer, SignalTrack
 from gateway.core.clock import Clock
@@ -252,10 +253,10 @@ class FieldSide:
 
     def _canopen_node(self, config: DeviceConfig) -> CanopenNode:
         emulated = self.prototype.devices[config.name]
-        player = None if emulated.recording is None else self._player(emulated)
+        recording = self._node_recording(emulated)
         try:
             made = emulated_node(
-                emulated.profile, config.address, player, self._clock.monotonic_ns(), emulated.form.identity
+                emulated.profile, config.address, recording, self._clock.monotonic_ns(), emulated.form.identity
             )
         except UsageError as e:
             raise FileInvalid(
@@ -264,6 +265,13 @@ class FieldSide:
         device = self.devices[config.name] = FieldDevice(emulated, None, made.node)
         device.journal = made.journal
         return made.node
+
+    def _node_recording(self, emulated: EmulatedDevice) -> SignalPlayer | CanLog | None:
+        if emulated.recording is None:
+            return None
+        if emulated.recording.suffix != SUFFIX:
+            return self._player(emulated)
+        return CanLog(emulated.recording, emulated.form.speed, WhenUsedUp.parse(emulated.form.at_end))
 
     def _player(self, emulated: EmulatedDevice) -> SignalPlayer:
         assert emulated.recording is not None

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from emulators.replay.can_log import SUFFIX
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.profile import DeviceProfile, load_profile
@@ -147,6 +148,10 @@ def _device(file: YamlFile, system: System, name: str, form: EmulatedForm) -> Em
             recording = find_recording(form.recording, beside=file_path(file))
         except UsageError as e:
             raise file.error((*loc, "recording"), e.message, expected=e.expected) from e
+        if recording.suffix == SUFFIX and profile.protocol != "canopen":
+            raise file.error(
+                (*loc, "recording"), "a log of a CAN bus", expected="a recording (JSON Lines)", got=recording.name
+            )
     for tag in form.identity:
         if tag not in profile.tags:
             raise FileInvalid(f"{profile.name} has no tag {tag!r}", path=file.path, expected=", ".join(profile.tags))

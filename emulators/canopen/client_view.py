@@ -35,7 +35,7 @@ class ClientView:
         self._check_refusal(entry.key)
         for service in self._owners(index):
             service.check_read(index, subindex)
-        self._core.refresh(now_ns)
+        self._core.answer(entry.key, now_ns)
         return self._core.data.get(index, subindex)
 
     def begin_write(self, index: int, subindex: int, size: int | None) -> int | None:

@@ -33,7 +33,7 @@ from emulators.canopen.lss_service import LssService
 from emulators.canopen.node_data import NodeData
 from emulators.canopen.rpdo import Rpdos
 from emulators.canopen.sdo_channels import SdoChannels
-from emulators.canopen.service import Change, Core, Held, NmtState, NodeCounters, SentPdo, Service, Source
+from emulators.canopen.service import AnswersReads, Change, Core, Held, NmtState, NodeCounters, SentPdo, Service, Source
 from emulators.canopen.storage import Storage
 from emulators.canopen.sync import Sync
 from emulators.canopen.time_of_day import TimeOfDay, TimeService
@@ -57,9 +57,9 @@ _TARGET = {
 class NodeContext:
     """What the node is given besides its data sheet.
 
-    `source` plays values; `model` makes of them, and of what clients write, what the device does; `held` is told of every
-    value that the objects then have. `factory` replaces defaults (a serial number). `refusals` are objects that SDO clients
-    get an abort for, whatever the data sheet says.
+    `source` plays values, by time and where it `AnswersReads` by upload; `model` makes of them, and of what clients write, what
+    the device does; `held` is told of every value that the objects then have. `factory` replaces defaults (a serial number).
+    `refusals` are objects that SDO clients get an abort for, whatever the data sheet says.
 
     `tolerate_short_sdo` takes SDO requests of fewer than 8 bytes as padded with zeros, as for old PLCs; by default they are
     ignored. `sdo_block` is how many segments a client may send at once, 1 to 127. A TIME producer (1012h) tells its time every
@@ -98,6 +98,7 @@ class CanopenNode:
         self._behaviour = None if model is None else Behaviour(model, source, data)
         self._core = core = Core(data, node_id, self._behaviour or source, context.journal_size)
         core.held = context.held
+        core.answers = source if isinstance(source, AnswersReads) else None
         self.accepts = Acceptance(core)
         """The acceptance filter: whether a frame can mean anything to this node. Feeding others does no harm."""
         self._powered = False

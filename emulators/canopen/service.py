@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from emulators.canopen.node_data import NodeData
 from gateway.core.canframe import CanFrame
@@ -99,6 +99,15 @@ class Source(Protocol):
         ...
 
 
+@runtime_checkable
+class AnswersReads(Protocol):
+    """A source that besides gives an object's value for each upload of it: what was recorded, read by read."""
+
+    def answer(self, key: tuple[int, int], now_ns: int, /) -> bytes | None:
+        """On-wire bytes for the upload that begins, or None to leave the object as it is."""
+        ...
+
+
 class Core:
     """State that all services share: values, NMT state, frames to send, counters and journals."""
 
@@ -114,6 +123,7 @@ class Core:
         self._source = source
         self._out: list[CanFrame] = []
         self.held: Held | None = None
+        self.answers: AnswersReads | None = None
 
     @property
     def communicating(self) -> bool:
@@ -145,6 +155,15 @@ class Core:
                 self.data.put(index, subindex, raw)
             if self.held is not None:
                 self.held(values, now_ns)
+
+    def answer(self, key: tuple[int, int], now_ns: int) -> None:
+        """A client's upload begins: take the source's values, and the one that is for this read. Raises as `refresh`."""
+        self.refresh(now_ns)
+        raw = None if self.answers is None else self.answers.answer(key, now_ns)
+        if raw is not None:
+            self.data.put(*key, raw)
+            if self.held is not None:
+                self.held({key: raw}, now_ns)
 
     def note(self, now_ns: int, what: str, index: int, subindex: int, data: bytes) -> None:
         """One line in the journal of changes."""

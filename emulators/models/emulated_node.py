@@ -6,7 +6,7 @@ It must never know buses nor clocks: the player that it is given has its start.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from emulators.canopen.codec import encode
 from emulators.canopen.dictionary import Dictionary, Key, load_eds
@@ -14,6 +14,8 @@ from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.journal import HeldJournal
 from emulators.models.by_profile import model_for
 from emulators.models.played_objects import HeldObjects, PlayedObjects
+from emulators.replay.can_log import CanLog
+from emulators.replay.objects import recorded_objects
 from emulators.signals import SignalPlayer
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.profile import DeviceProfile
@@ -30,26 +32,29 @@ class EmulatedNode:
 def emulated_node(
     profile: DeviceProfile,
     node_id: int,
-    player: SignalPlayer | None,
+    recording: SignalPlayer | CanLog | None,
     now_ns: int,
     identity: Mapping[str, str] | None = None,
 ) -> EmulatedNode:
-    """The node of a CANopen profile. Without a `player` it holds what the data sheet says and what its model does.
+    """The node of a CANopen profile, playing signals or what is in a log of its bus. Without a `recording` it holds what the data
+    sheet says and what its model does.
 
     `identity` are values by tag that this one device has instead of the data sheet's. Raises `FileInvalid` for a data sheet
-    that cannot be read or lacks an object of a tag, `UsageError` for an identity that is no number.
+    or log that cannot be read and for a tag whose object the data sheet lacks, `UsageError` for an identity that is no number and
+    for a log without this node.
     """
     if profile.eds_path is None:
         raise UsageError("a node needs a data sheet", where=profile.path, expected="`eds: FILE.eds` in the profile")
     dictionary = load_eds(profile.eds_path)
     tags = profile.tags.values()
     held = HeldObjects(tags)
-    context = NodeContext(
-        source=PlayedObjects(tags, dictionary, player) if player is not None else None,
-        model=model_for(dictionary),
-        held=held,
-        factory=_factory(profile, dictionary, identity or {}),
-    )
+    own = _factory(profile, dictionary, identity or {})
+    context = NodeContext(model=model_for(dictionary), held=held, factory=own)
+    if isinstance(recording, CanLog):
+        objects = recorded_objects(recording, dictionary, node_id)
+        context = replace(context, source=objects, factory={**objects.initial, **own}, refusals=objects.refusals)
+    elif recording is not None:
+        context = replace(context, source=PlayedObjects(tags, dictionary, recording))
     node = CanopenNode(dictionary, node_id, context)
     for tag in tags:  # what nobody plays is held as well: by the data sheet
         if tag.object is not None and node.data.has(*tag.object):

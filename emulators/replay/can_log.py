@@ -1,10 +1,16 @@
-"""A CAN log as candump writes it with -L: ``(1436509052.249713) can0 585#4B06200034120000``. Text in, frames with times out."""
+"""A CAN log as candump writes it with -L: ``(1436509052.249713) can0 585#4B06200034120000``. Text in, frames with times out.
+
+`CanLog` is such a file as a node's recording: where it is and how it is to be played. It is read when frames are asked for.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
 
+from emulators.context import WhenUsedUp
 from gateway.core.canframe import CanFrame
 from gateway.core.errors import FileInvalid
 
@@ -12,6 +18,26 @@ _LINE = re.compile(
     r"\((\d+\.\d+)\)\s+\S+\s+([0-9A-F]{3}|[0-9A-F]{8})#(R[0-8]?|(?:[0-9A-F]{2}){0,8})(?:\s+[RT])?", re.IGNORECASE
 )
 _ERROR = 0x20000000
+
+SUFFIX = ".log"
+"""By which a file is known as a log of candump, among recordings."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanLog:
+    """A log file, played `speed` times as fast as it was written, and what comes after its end."""
+
+    path: Path
+    speed: float = 1.0
+    at_end: WhenUsedUp = WhenUsedUp.HOLD
+
+    def frames(self) -> Iterator[tuple[float, CanFrame]]:
+        """`read_can_log` of the file. Raises `FileInvalid`, also where it cannot be read."""
+        try:
+            with self.path.open(encoding="ascii", errors="replace") as lines:
+                yield from read_can_log(lines, str(self.path))
+        except OSError as e:
+            raise FileInvalid("the log cannot be read", path=str(self.path), got=e.strerror or str(e)) from e
 
 
 def read_can_log(lines: Iterable[str], path: str = "") -> Iterator[tuple[float, CanFrame]]:

@@ -1,8 +1,9 @@
 """A recorded CANopen node, holding again what it held: its object dictionary and its PDO stream, from a log of the bus.
 
-Resolved object by object (SPEC ruling 3): what an SDO transfer or a TPDO carried is a value of an object at a time, however the
-next master reads it. What the recorded master wrote is a setting: the node starts with what was there first and then holds what
-is written. Everything else is read at the emulator's clock. Block transfers are not followed. Pure; it knows no files.
+Resolved object by object (SPEC ruling 3), however the next master reads. What the node was asked for answers again in recorded
+order, one value for each upload of the object. What it sent by itself, in TPDOs, is a signal: read at the emulator's clock, by
+SDO too. What the recorded master wrote is a setting: the node starts with what was there first and then holds what is written.
+An object that was never given but with an abort gets it again. Block transfers are not followed. Pure; it knows no files.
 """
 
 from __future__ import annotations
@@ -10,25 +11,65 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable
 
+from emulators.canopen.aborts import Abort
 from emulators.canopen.dictionary import Dictionary, Key
+from emulators.canopen.error_control import ERROR_CONTROL
 from emulators.canopen.node_data import COMMUNICATION, NodeData
 from emulators.canopen.pdo import PdoParameters, pdo_indices
 from emulators.canopen.sdo_channels import REQUEST, RESPONSE
 from emulators.context import UsedUp, WhenUsedUp
+from emulators.replay.can_log import CanLog
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
+from gateway.core.errors import UsageError
 
 MAX_VALUES = 1_000_000
 """Changes of objects that are kept; later ones are counted in `dropped`."""
 
 _PDO_PARAMETERS = range(0x1400, 0x1C00)
+_SDO_SERVERS = range(RESPONSE + 1, RESPONSE + 128)
+_OF_THE_OBJECT = 0x06
+"""Abort codes that begin so tell of the object; others of the transfer, or of the state that the device was in."""
+
+_ABORTS = frozenset(Abort)
 _NEVER_INITIAL = frozenset({0x1001, 0x1003})
 
 
-class RecordedObjects:
-    """A node's value source. `initial` are the values that the node begins with (for `NodeContext.factory`).
+def node_of(log: CanLog, node_id: int) -> int:
+    """The node that is meant in a log: the one with this id if it is there, else the only one that was asked by SDO. Raises
+    `UsageError`."""
+    ids = {frame.can_id for _, frame in log.frames() if not (frame.extended or frame.remote)}
+    asked = sorted(can_id & 0x7F for can_id in ids if can_id in _SDO_SERVERS)
+    if not asked or node_id in asked or ERROR_CONTROL + node_id in ids:
+        return node_id
+    if len(asked) == 1:
+        return asked[0]
+    raise UsageError(
+        f"the log holds nothing of node {node_id}",
+        where=str(log.path),
+        expected="its SDO replies or heartbeats",
+        got=", ".join(f"node {node}" for node in asked),
+    )
 
-    Time begins with the first call. After the log's end values hold, begin again, or raise `UsedUp`, as `when_used_up` says.
+
+def recorded_objects(log: CanLog, dictionary: Dictionary, node_id: int) -> RecordedObjects:
+    """What a log holds of a node, for a node `node_id`; it may have had another id then. Raises `FileInvalid` or `UsageError`."""
+    then = node_of(log, node_id)
+    objects = RecordedObjects(log.frames(), dictionary, then, log.at_end, log.speed)
+    if not objects.initial:
+        raise UsageError(f"the log holds nothing of node {then} that its data sheet knows", where=str(log.path))
+    if then != node_id:  # identifiers that hang on the node id are those of the id that it has now
+        own = {entry.key for entry in dictionary.entries() if entry.node_relative}
+        objects.initial = {key: raw for key, raw in objects.initial.items() if key not in own}
+    return objects
+
+
+class RecordedObjects:
+    """A node's value source. `initial` are the values that the node begins with (for `NodeContext.factory`), `refusals` what
+    it aborts (for `NodeContext.refusals`).
+
+    Time begins with the first call and runs `speed` times as fast as recorded. After the log's end signals hold, begin again, or
+    raise `UsedUp`, as `when_used_up` says; and so does each object that is asked for when its own values are used up.
     """
 
     def __init__(
@@ -37,17 +78,24 @@ class RecordedObjects:
         dictionary: Dictionary,
         node_id: int,
         when_used_up: WhenUsedUp = WhenUsedUp.HOLD,
+        speed: float = 1.0,
     ) -> None:
         self.initial: dict[Key, bytes] = {}
+        self.refusals: dict[Key, Abort] = {}
         self.dropped = 0
         self.duration_s = 0.0
         self._when_used_up = when_used_up
+        self._speed = speed
         self._began_ns: int | None = None
         self._node_id = node_id
         self._data = NodeData(dictionary, node_id)
         self._tpdos = [PdoParameters(self._data, index) for index in pdo_indices(self._data, 0x1800)]
         self._times: dict[Key, list[float]] = {}
         self._values: dict[Key, list[bytes]] = {}
+        self._answers: dict[Key, list[bytes]] = {}
+        self._next: dict[Key, int] = {}
+        self._sent: set[Key] = set()  # by TPDO
+        self._given: set[Key] = set()  # by SDO
         self._count = 0
         self._written: set[Key] = set()
         self._transfer: tuple[Key, bool, bytearray] | None = None
@@ -55,12 +103,25 @@ class RecordedObjects:
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
         self._began_ns = now_ns if self._began_ns is None else self._began_ns
-        at_s = (now_ns - self._began_ns) / NS_PER_S
+        at_s = (now_ns - self._began_ns) / NS_PER_S * self._speed
         if at_s > self.duration_s and self._when_used_up is WhenUsedUp.ERROR:
             raise UsedUp(f"the log of node {self._node_id} is over after {self.duration_s:.3f} s")
         if self._when_used_up is WhenUsedUp.LOOP and self.duration_s:
             at_s %= self.duration_s
         return {key: self._values[key][max(bisect_right(times, at_s) - 1, 0)] for key, times in self._times.items()}
+
+    def answer(self, key: Key, now_ns: int) -> bytes | None:
+        """The next of the values that were uploaded of an object; None for one that was sent, written, or never asked for."""
+        answers = self._answers.get(key)
+        if answers is None:
+            return None
+        at = self._next.get(key, 0)
+        if at >= len(answers) and self._when_used_up is WhenUsedUp.ERROR:
+            raise UsedUp(f"nothing is left of what node {self._node_id} held in {key[0]:04X}h:{key[1]:02X}")
+        if at >= len(answers) and self._when_used_up is WhenUsedUp.LOOP:
+            at = 0
+        self._next[key] = at + 1
+        return answers[min(at, len(answers) - 1)]
 
     def _learn(self, frames: Iterable[tuple[float, CanFrame]]) -> None:
         began_s: float | None = None
@@ -75,11 +136,14 @@ class RecordedObjects:
                 self._response(frame.data)
             else:
                 self._pdo(frame)
-        for key in self._written:
-            self._times.pop(key, None)
-            self._values.pop(key, None)
-        for key in [key for key in self._times if key[0] in COMMUNICATION]:
+        for key in set(self._times) - self._sent:
             del self._times[key], self._values[key]
+        for key in [key for key in self._times if key in self._written or key[0] in COMMUNICATION]:
+            del self._times[key], self._values[key]
+        for key in [k for k in self._answers if k in self._sent or k in self._written or k[0] in COMMUNICATION]:
+            del self._answers[key]
+        for key in [key for key in self.refusals if key in self._given or key in self._written]:
+            del self.refusals[key]
 
     def _request(self, data: bytes) -> None:
         command, key = data[0] >> 5, (int.from_bytes(data[1:3], "little"), data[3])
@@ -104,13 +168,29 @@ class RecordedObjects:
                 self._note(key, bytes(raw))
         elif command == 2 and not download and data[0] & 2:
             size = 4 - (data[0] >> 2 & 3) if data[0] & 1 else self._size(key, 4)
-            self._note(key, data[4 : 4 + size])
+            self._uploaded(key, data[4 : 4 + size])
         elif command == 0 and not download:
             raw += data[1 : 8 - (data[0] >> 1 & 7)]
             if data[0] & 1:
-                self._note(key, bytes(raw))
+                self._uploaded(key, bytes(raw))
         elif command > 3:
+            code = int.from_bytes(data[4:8], "little")
+            if command == 4 and not download and code >> 24 == _OF_THE_OBJECT and code in _ABORTS:
+                self.refusals.setdefault(key, Abort(code))
             self._transfer = None
+
+    def _uploaded(self, key: Key, raw: bytes) -> None:
+        """A whole value that the node gave when it was asked."""
+        self._transfer = None
+        if not self._fits(key, raw):
+            return
+        self._given.add(key)
+        if self._count < MAX_VALUES:
+            self._count += 1
+            self._answers.setdefault(key, []).append(raw)
+        else:
+            self.dropped += 1
+        self._note(key, raw)
 
     def _pdo(self, frame: CanFrame) -> None:
         for parameters in self._tpdos:
@@ -121,11 +201,11 @@ class RecordedObjects:
                 value = packed >> position & ((1 << mapped.bits) - 1)
                 position += mapped.bits
                 if position <= 8 * len(frame.data):
+                    self._sent.add(mapped.key)
                     self._note(mapped.key, value.to_bytes((mapped.bits + 7) // 8, "little"))
 
     def _note(self, key: Key, raw: bytes) -> None:
-        entry = self._data.dictionary.entry(*key)
-        if entry is None or (entry.size is not None and entry.size != len(raw)):
+        if not self._fits(key, raw):
             return
         if key not in self._written and key[0] not in _NEVER_INITIAL:
             self.initial.setdefault(key, raw)
@@ -140,6 +220,10 @@ class RecordedObjects:
         self._count += 1
         values.append(raw)
         self._times.setdefault(key, []).append(self.duration_s)
+
+    def _fits(self, key: Key, raw: bytes) -> bool:
+        entry = self._data.dictionary.entry(*key)
+        return entry is not None and entry.size in (None, len(raw))
 
     def _size(self, key: Key, default: int) -> int:
         entry = self._data.dictionary.entry(*key)

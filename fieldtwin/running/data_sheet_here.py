@@ -10,14 +10,13 @@ from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.canopen.serve import serve_node
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.models.by_profile import model_for
-from emulators.replay.can_log import read_can_log
-from emulators.replay.objects import RecordedObjects
+from emulators.replay.can_log import CanLog
+from emulators.replay.objects import recorded_objects
 from fieldtwin.cli.talk import talk
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.until_stopped import until_stopped
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 
@@ -55,14 +54,10 @@ async def run_data_sheet(
 def _node(dictionary: Dictionary, node_id: int, log: Path | None) -> CanopenNode:
     """With what was recorded of it, and the model of the device profile that 1000h names, where there are such."""
     if log is not None:
-        try:
-            text = log.read_text(encoding="ascii", errors="replace")
-        except OSError as e:
-            raise FileInvalid("the log cannot be read", path=str(log), got=e.strerror or str(e)) from e
-        played = RecordedObjects(read_can_log(text.splitlines(), str(log)), dictionary, node_id)
-        if not played.initial:
-            raise UsageError(f"the log holds nothing of node {node_id}", where=str(log), hint="--node")
-        context = NodeContext(source=played, factory=played.initial, model=model_for(dictionary))
+        played = recorded_objects(CanLog(log), dictionary, node_id)
+        context = NodeContext(
+            source=played, factory=played.initial, refusals=played.refusals, model=model_for(dictionary)
+        )
         return CanopenNode(dictionary, node_id, context)
     return CanopenNode(dictionary, node_id, NodeContext(model=model_for(dictionary)))
 

@@ -24,6 +24,7 @@ from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.recorded_device import load_replay
+from emulators.replay.can_log import SUFFIX, CanLog
 from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.unit import ReplayUnit
@@ -189,8 +190,12 @@ class DeviceHost:
     ) -> None:
         """A CANopen node on one bus: see `can_here.stand_on_bus`."""
         wire = only_bus(wires)
-        player = self._player(profile, recording) if recording or self._recording_of(profile) else None
-        node = emulated_node(profile, node_id or profile.form.factory.node, player, self._clock.monotonic_ns()).node
+        played: SignalPlayer | CanLog | None = None
+        if recording is not None and recording.suffix == SUFFIX:
+            played = CanLog(find_recording(str(recording)))
+        elif recording or self._recording_of(profile):
+            played = self._player(profile, recording)
+        node = emulated_node(profile, node_id or profile.form.factory.node, played, self._clock.monotonic_ns()).node
         opened: list[SoftBusServer | CanConnection] = []
         try:
             connection, where = await stand_on_bus(wire, bitrate, profile.name, opened)

@@ -1,0 +1,39 @@
+"""What docs/reports.md shows is what runs."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from report_rig import run_trace
+
+from fieldtwin.scenarios.trace import Trace
+
+PAGE = (Path(__file__).parents[2] / "docs" / "reports.md").read_text(encoding="utf-8")
+
+
+def test_the_python_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with open("run.jsonl", "wb") as sink:
+        trace = Trace(sink=sink)
+        for event in run_trace(3):
+            trace.note(*event)
+    space: dict[str, Any] = {}
+    for text in re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE):
+        exec(compile(text, "docs/reports.md", "exec"), space)
+    assert space["slow"] == []
+    assert "<svg" in Path("report.html").read_text(encoding="utf-8")
+    assert "the sensor is quick" in Path("report.xml").read_text(encoding="utf-8")
+
+
+def test_the_options_of_the_page_are_there() -> None:
+    from fieldtwin.cli.trace_command import command
+
+    options = {o for p in command.params for o in p.opts}
+    used = {
+        w for line in PAGE.splitlines() if line.startswith("fieldtwin trace") for w in re.findall(r"--[a-z]+", line)
+    }
+    assert used
+    assert used <= options

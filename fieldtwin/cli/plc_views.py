@@ -6,6 +6,7 @@ import asyncio
 from pathlib import Path
 from typing import Any
 
+from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
@@ -17,6 +18,7 @@ from plc.prove import Proof, Result
 from plc.tag_view import matches
 
 REFRESH_S = 0.25
+IN_A_PIPE = 500
 ROOM_FOR_LIMITS = 100
 """Columns of a terminal from which limits are shown, too."""
 _WHOLE_TYPES = {
@@ -51,7 +53,7 @@ def tags_as_data(rows: list[Row]) -> dict[str, Row]:
 def tag_table(rows: list[Row]) -> Table:
     table = Table(box=None, pad_edge=False)
     names = ["tag", "value", "unit", "limits", "quality", "age", ""]
-    if data.width < ROOM_FOR_LIMITS or not any(_limits(row["limits"]) for row in rows):
+    if _width() < ROOM_FOR_LIMITS or not any(_limits(row["limits"]) for row in rows):
         names.remove("limits")
     for name in names:
         justify: Any = "right" if name in ("value", "age") else "left"
@@ -93,7 +95,17 @@ def _quality(row: Row) -> str:
 
 
 def print_tags(rows: list[Row]) -> None:
-    data.print(tag_table(rows))
+    _print_table(tag_table(rows))
+
+
+def _width() -> int:
+    """Columns: a terminal's, and in a pipe as many as it takes, so that nothing is cut off there."""
+    return data.width if data.is_terminal else IN_A_PIPE
+
+
+def _print_table(table: Table) -> None:
+    console = data if data.is_terminal else Console(file=data.file, width=IN_A_PIPE, highlight=False)
+    console.print(table)
 
 
 async def watch_live(path: Path, patterns: tuple[str, ...]) -> None:
@@ -131,7 +143,8 @@ def print_status(status: dict[str, Any]) -> None:
         "\np99",
         "\nmax",
     ):
-        table.add_column(name, justify="left" if name == "task" else "right", no_wrap=True)
+        text = name in ("task", "every")
+        table.add_column(name, justify="left" if text else "right", no_wrap=not text, overflow="fold")
     for name, task in status["tasks"].items():
         late, took = task["lateness_us"], task["duration_us"]
         every = f"on {task['single']}" if task["single"] else f"{task['cycle_ms']:g} ms"
@@ -139,7 +152,7 @@ def print_status(status: dict[str, Any]) -> None:
             name, every, str(task["scans"]), str(task["missed_periods"]), str(task["overruns"]),
             *(_us(late[k]) for k in ("p50", "p99", "max")), *(_us(took[k]) for k in ("p50", "p99", "max")),
         )  # fmt: skip
-    data.print(table)
+    _print_table(table)
     data.print(f"restarts: {status['restarts']}; {status['retain']['start']}", markup=False)
     granted, refused = status["realtime"]["granted"], status["realtime"]["refused"]
     data.print("granted: " + (", ".join(granted) or "nothing"), markup=False, soft_wrap=True)

@@ -60,6 +60,11 @@ class StateWatch:
         self._words = state_words(layout, self._programs)
 
     @property
+    def programs(self) -> list[str]:
+        """Programs that have named states."""
+        return list(self._words)
+
+    @property
     def relays(self) -> list[str]:
         """Programs seen that are the paper's state machine: it alone goes where the far end's commands say."""
         return [p for p in self.current if list(self._words.get(p, {}).values()) == NAMES]

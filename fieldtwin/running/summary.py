@@ -103,7 +103,7 @@ def summarise(run: Run) -> dict[str, Any]:
         "duration_s": round(run.elapsed_s, 3),
         "mapping": {str(plant): str(target) for plant, target in run.mapping.items()},
         "devices": _devices(gateway),
-        "states": {program: run.states.sequence(program) for program in run.system.plc.programs},
+        "states": {program: run.states.sequence(program) for program in run.states.programs},
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
         "published": {"values": gateway.get("published", 0), **run.oracle.describe()},

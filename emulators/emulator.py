@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from emulators.command_names import CommandNames
 from emulators.modbus.bank import RegisterBank
-from emulators.modbus.unit import ModbusUnit, UnitLimits
+from emulators.modbus.unit import ModbusUnit, UnitLimits, UnitParts
 from gateway.core.connection import PROTOCOL, Connection
 from gateway.core.device import Communication, Device, End, wire
 from gateway.core.errors import UnknownCommand
@@ -92,8 +92,9 @@ class EmulatedUnit(ModbusUnit):
         virtual_context: Sized,
         limits: UnitLimits | None = None,
         name: str = "",
+        parts: UnitParts | None = None,
     ) -> None:
-        super().__init__(bank, limits, name=name)
+        super().__init__(bank, limits, name=name, **(parts or UnitParts()))
         end, self._line = wire(kind)
         self.emulator = emulator_kind(end.type, profile)(end, profile, virtual_context, super().respond)
         self.unlisted = 0

@@ -7,6 +7,7 @@ business. Each function is in a module of its own; here they are chosen, refused
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypedDict
 
 from emulators.modbus.bank import Busy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
 from emulators.modbus.diagnostics import Diagnostics, UnitCounters
@@ -23,16 +24,25 @@ from emulators.modbus.register_functions import (
 )
 from gateway.core.errors import UsageError
 
-__all__ = ["ALL_FUNCTIONS", "Handler", "ModbusUnit", "UnitLimits"]
+__all__ = ["ALL_FUNCTIONS", "Handler", "ModbusUnit", "UnitLimits", "UnitParts"]
 
 ALL_FUNCTIONS = STANDARD_FUNCTIONS
 BROADCAST_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16})
 """What may come as a broadcast: writes that ask for no data back (SL 2.4.1)."""
-_WHILE_BUSY = frozenset({0x08, 0x0B, 0x0C})
+WHILE_BUSY = frozenset({0x08, 0x0B, 0x0C})
 """What a busy unit still answers: how a master finds out that it is busy (AP 6.9)."""
 
 Handler = Callable[[bytes, int], bytes | None]
 """``(pdu, now_ns)`` -> the response PDU, None for silence. May raise a `Refusal`, then it has changed nothing."""
+
+
+class UnitParts(TypedDict, total=False):
+    """What a unit may have besides registers, as `ModbusUnit` takes it."""
+
+    server_id: bytes | None
+    identification: Identification | None
+    files: FileRecords | None
+    fifos: FifoQueues | None
 
 
 class ModbusUnit:
@@ -70,6 +80,7 @@ class ModbusUnit:
         """Of functions of its own, how long a request PDU is: how a line tells where it ends. By its check sum otherwise."""
         self._server_id = server_id
         self._busy_until_ns = 0
+        self._busy_every = self._busy_for_ns = self._answered = 0
         self._broadcasts = set(BROADCAST_FUNCTIONS)
         self._handlers = {f: h for f, h in self._standard(identification).items() if f in self.limits.functions}
 
@@ -118,6 +129,10 @@ class ModbusUnit:
     def be_busy(self, until_ns: int) -> None:
         """Answer with exception 06 until `until_ns` of the emulator's time; functions 08, 0B and 0C still work."""
         self._busy_until_ns = until_ns
+
+    def be_busy_behind(self, every: int, for_ns: int) -> None:
+        """Be busy for `for_ns` behind every so many requests that were not refused for that reason; 0 for never."""
+        self._busy_every, self._busy_for_ns = every, for_ns
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
         """Execute a request to this unit and return its response, exception responses included.
@@ -183,11 +198,13 @@ class ModbusUnit:
             self.diagnostics.wakes(pdu)
             return None
         try:
-            if busy or (now_ns < self._busy_until_ns and pdu[0] not in _WHILE_BUSY):
+            if busy or (now_ns < self._busy_until_ns and pdu[0] not in WHILE_BUSY):
                 raise Busy("too many requests under way")
             handler = self._handlers.get(pdu[0])
             if handler is None:
                 raise IllegalFunction(f"function {pdu[0]:02X}h")
+            if self._busy_every and pdu[0] not in WHILE_BUSY:
+                self._tire(now_ns)
             response = handler(pdu, now_ns)
         except Refusal as refusal:
             self.counters.exceptions += 1
@@ -196,6 +213,12 @@ class ModbusUnit:
             return bytes((pdu[0] | 0x80, refusal.code))
         self.diagnostics.completed(pdu)
         return response
+
+    def _tire(self, now_ns: int) -> None:
+        """One request more; busy behind it, where that is stated."""
+        self._answered += 1
+        if self._busy_every and self._answered % self._busy_every == 0:
+            self._busy_until_ns = max(self._busy_until_ns, now_ns + self._busy_for_ns)
 
     def _report_server_id(self, pdu: bytes, now_ns: int) -> bytes:
         require_length(pdu, 1)

@@ -1,8 +1,9 @@
 """A replayed unit that keeps to its device's profile where the recording has no answer.
 
-What was recorded goes first, whatever it is. Of the rest the profile tells what the device has: which functions, how many
-registers a request, no half values, what can be written and what cannot be read. A write that it allows is accepted and
-reads back. Pure; decodes for itself.
+What was recorded goes first. Of the rest the profile tells what the device has: which functions, how many registers a request,
+no half values, what can be written and what cannot be read, what functions without registers answer. A write that it allows
+is accepted and reads back. Effects are as it states them, and diagnostics (08, 0B, 0C) that it names are the unit's own: a
+recorded answer would count another wire. Pure; decodes for itself.
 """
 
 from __future__ import annotations
@@ -13,17 +14,25 @@ from emulators.replay.own_functions import add_own_functions
 from emulators.replay.replay import Answer, ExchangeReplay
 from emulators.replay.requests import CellRequest
 from emulators.replay.unit import ReplayUnit
+from emulators.stated import Effects, cells_of, parts_of
 from gateway.core.profile import DeviceProfile
 
 _CELL_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10})
+_COUNTING = frozenset({0x08, 0x0B, 0x0C})
+"""What tells of the wire as it is now. A recorded answer would tell of another."""
 
 
 class ProfiledReplay(ReplayUnit):
     """Unit `unit_id` of a recording of a device that `profile` describes, functions of its own included."""
 
     def __init__(self, profile: DeviceProfile, replay: ExchangeReplay, unit_id: int, name: str = "") -> None:
-        super().__init__(replay, unit_id, name or profile.name)
-        self._limits = profile.form.limits
+        super().__init__(replay, unit_id, name or profile.name, parts_of(profile))
+        form = profile.form
+        self._limits = form.limits
+        self._effects = Effects(profile.effects)
+        self._counting = _COUNTING & frozenset(form.limits.functions or ())
+        stated = {0x11: form.server_id, 0x14: form.files, 0x15: form.files, 0x18: form.fifos, 0x2B: form.identification}
+        self._stated = frozenset(function for function, said in stated.items() if said)
         self._writable: set[tuple[Table, int]] = set()
         self._unreadable: set[tuple[Table, int]] = set()
         readable: set[tuple[Table, int]] = set()
@@ -35,7 +44,21 @@ class ProfiledReplay(ReplayUnit):
         self._unreadable -= readable
         add_own_functions(self, profile)
 
+    def computes(self, pdu: bytes) -> bool:
+        if pdu[0] in self._stated:
+            return not self.replay.was_recorded(self.unit_id, pdu)
+        return pdu[0] in self._counting or super().computes(pdu)
+
     def recall(self, pdu: bytes) -> Answer:
+        answer = self._recall(pdu)
+        request = requests.parse_request(pdu) if self._effects else None
+        if request is not None and answer.reply is not None and answer.reply[0] == pdu[0]:
+            for tag, value in self._effects.of(request.table, request.addresses, request.values):
+                at = tag.registers
+                self.replay.put(self.unit_id, at.table, at.address, cells_of(tag, value))
+        return answer
+
+    def _recall(self, pdu: bytes) -> Answer:
         if self.replay.was_recorded(self.unit_id, pdu):
             return super().recall(pdu)
         request, allowed = requests.parse_request(pdu), self._limits.functions

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from emulators.modbus.bank import IllegalAddress, RegisterBank, Table
-from emulators.modbus.unit import Handler, ModbusUnit
+from emulators.modbus.unit import WHILE_BUSY, Handler, ModbusUnit, UnitParts
 from emulators.replay.replay import Answer, ExchangeReplay
 from gateway.core.errors import UsageError
 
@@ -28,11 +28,11 @@ class _NoBank(RegisterBank):
 class ReplayUnit(ModbusUnit):
     """Unit `unit_id` of a recording, which must hold it. It may be served under any id."""
 
-    def __init__(self, replay: ExchangeReplay, unit_id: int, name: str = "") -> None:
+    def __init__(self, replay: ExchangeReplay, unit_id: int, name: str = "", parts: UnitParts | None = None) -> None:
         if unit_id not in replay.units:
             there = ", ".join(map(str, replay.units)) or "none"
             raise UsageError("the recording has no such unit", expected=there, got=str(unit_id))
-        super().__init__(_NoBank(), name=name)
+        super().__init__(_NoBank(), name=name, **(parts or UnitParts()))
         self.replay = replay
         self.unit_id = unit_id
         self.latency_s = 0.0
@@ -47,18 +47,34 @@ class ReplayUnit(ModbusUnit):
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
         """The recorded answer, None for silence. Exchanges are keyed by order, not by time."""
-        if pdu and (pdu[0] in self._registered or now_ns < self._busy_until_ns):
+        busy = now_ns < self._busy_until_ns
+        if pdu and (self.computes(pdu) or (busy and pdu[0] not in WHILE_BUSY) or self.diagnostics.listen_only):
             self.latency_s = 0.0
             return super().respond(pdu, now_ns)
         self.counters.requests += 1
+        self.diagnostics.log.note_received()
         answer = self.recall(pdu)
+        self._tire(now_ns)
         self.latency_s = answer.latency_s
         if answer.reply is None:
             self.counters.unanswered += 1
             return None
-        self.counters.replies += 1
-        self.counters.exceptions += bool(answer.reply[0] & 0x80)
+        self._count_reply(pdu, answer.reply)
         return answer.reply
+
+    def _count_reply(self, pdu: bytes, reply: bytes) -> None:
+        self.counters.replies += 1
+        self.diagnostics.log.note_sent(reply)
+        if not reply[0] & 0x80:
+            self.diagnostics.completed(pdu)
+            return
+        self.counters.exceptions += 1
+        self.counters.busy += reply[1:2] == b"\x06"
+        self.counters.naks += reply[1:2] == b"\x07"
+
+    def computes(self, pdu: bytes) -> bool:
+        """Whether the unit answers this itself, whatever was recorded."""
+        return pdu[0] in self._registered
 
     def recall(self, pdu: bytes) -> Answer:
         """What the recorded unit answers."""
@@ -68,4 +84,6 @@ class ReplayUnit(ModbusUnit):
         """A write to all units has its effect on this one too."""
         self.counters.broadcasts += 1
         self.counters.unanswered += 1
-        self.replay.broadcast(pdu, self.unit_id)
+        self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, broadcast=True)
+        if not self.diagnostics.listen_only:
+            self.replay.broadcast(pdu, self.unit_id)

@@ -156,6 +156,17 @@ class OwnFunction:
     sets: tuple[tuple[Tag, float], ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """When `tag` is read, or written (with `value`, if that is not None), `sets` says what tags hold afterwards. Engineering
+    units."""
+
+    tag: Tag
+    on_read: bool
+    value: float | None
+    sets: tuple[tuple[Tag, float], ...]
+
+
 @dataclass(frozen=True)
 class DeviceProfile:
     """A profile, resolved. Dictionaries keep the file's order."""
@@ -221,6 +232,19 @@ class DeviceProfile:
             )
             for name, f in self.form.functions.items()
         }
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """What reading and writing tags does besides, in the file's order."""
+        return tuple(
+            Effect(
+                self.tags[e.read or e.written or ""],
+                e.read is not None,
+                None if e.value is None else float(e.value),
+                tuple((self.tags[tag], float(value)) for tag, value in e.sets.items()),
+            )
+            for e in self.form.effects
+        )
 
     def command_for(self, tag: str) -> str:
         """The command that writes `tag`."""
@@ -445,6 +469,35 @@ def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
         )
 
 
+def _check_sets(file: YamlFile, p: DeviceProfile, loc: tuple[Key, ...], sets: Iterable[str]) -> None:
+    for tag in sets:
+        if p.tags[tag].bits is not None or p.tags[tag].is_text:
+            raise file.error((*loc, "sets", tag), f"{tag!r} is text, or a part of a register")
+
+
+def _check_stated(file: YamlFile, p: DeviceProfile) -> None:
+    """Effects, and what functions that carry no registers answer: the device must have what they need."""
+    for i, effect in enumerate(p.effects):
+        if not (effect.tag.readable if effect.on_read else effect.tag.writable):
+            verb = "read" if effect.on_read else "written"
+            raise file.error(
+                ("effects", i), f"the tag {effect.tag.name!r} is never {verb}", expected="another `access`"
+            )
+        _check_sets(file, p, ("effects", i), p.form.effects[i].sets)
+    form, allowed = p.form, p.form.limits.functions
+    stated: list[tuple[str, int, object]] = [
+        ("server_id", 0x11, form.server_id),
+        ("identification", 0x2B, form.identification),
+        ("files", 0x14, form.files),
+        ("fifos", 0x18, form.fifos),
+    ]
+    for key, code, said in stated:
+        if said and allowed is not None and code not in allowed:
+            raise file.error((key,), f"function {code:02X}h is not in `limits: functions`", expected=str(code))
+    if form.identification and not {0, 1, 2} <= form.identification.keys():
+        raise file.error(("identification",), "vendor, product code and revision", expected="objects 0, 1 and 2")
+
+
 def _check_references(file: YamlFile, p: DeviceProfile) -> None:
     """Every tag that is named elsewhere in the profile must exist, and be of the kind that its use needs."""
     wanted: list[tuple[tuple[Key, ...], str]] = [(("commands", c), t) for c, t in p.form.commands.items()]
@@ -452,6 +505,9 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
     wanted += [(("identify", i, "tag"), e.tag) for i, e in enumerate(p.form.identify)]
     wanted += [(("tags", t.name, "scale_by"), t.scale_by) for t in p.tags.values() if t.scale_by is not None]
     wanted += [(("functions", n, "sets", t), t) for n, f in p.form.functions.items() for t in f.sets]
+    for i, effect in enumerate(p.form.effects):
+        wanted += [(("effects", i), effect.read or effect.written or "")]
+        wanted += [(("effects", i, "sets", t), t) for t in effect.sets]
     if p.form.trigger is not None:
         wanted.append((("trigger", "tag"), p.form.trigger.tag))
     if p.sampled:
@@ -478,8 +534,7 @@ def _check_references(file: YamlFile, p: DeviceProfile) -> None:
             raise file.error(("functions", name, "code"), f"{function.code:02X}h is not in `limits: functions`")
         if max(len(t) for t in (function.request, function.reply or "")) > 3 * 252:
             raise file.error(("functions", name), "more data than a PDU holds", expected="at most 252 bytes")
-        for tag in function.sets:
-            if tag in p.tags and (p.tags[tag].bits is not None or p.tags[tag].is_text):
-                raise file.error(("functions", name, "sets", tag), f"{tag!r} is text, or a part of a register")
+        _check_sets(file, p, ("functions", name), function.sets)
+    _check_stated(file, p)
     if p.protocol == "canopen" and p.form.eds is None:
         raise FileInvalid("a CANopen profile names its EDS", path=p.path, line=1, expected="`eds: FILE.eds`")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 ValueType = Literal[
     "bool",
@@ -30,6 +30,9 @@ Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
 Access = Literal["ro", "rw", "wo"]
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*(\.\.[0-9]+)?$")]
 Address = int | str
+ByteNumber = Annotated[int, Field(ge=0, le=255)]
+Word = Annotated[int, Field(ge=0, le=0xFFFF)]
+FileNumber = Annotated[int, Field(ge=1, le=0xFFFF)]
 
 
 class Strict(BaseModel):
@@ -159,6 +162,21 @@ class FunctionForm(Strict):
     danger: str = ""
 
 
+class EffectForm(Strict):
+    """What reading or writing a tag does besides: other tags, or itself, hold something else afterwards."""
+
+    read: Name | None = None
+    written: Name | None = None
+    value: int | float | None = Field(default=None, description="only when this is written; default: whatever is")
+    sets: dict[Name, int | float] = Field(min_length=1, description="tag -> what it holds afterwards")
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> EffectForm:
+        if (self.read is None) == (self.written is None) or (self.read is not None and self.value is not None):
+            raise ValueError("an effect has either `read`, or `written` with or without a `value`")
+        return self
+
+
 class ProfileForm(Strict):
     """A device profile."""
 
@@ -179,5 +197,18 @@ class ProfileForm(Strict):
     messages: dict[Name, MessageForm] = Field(default={}, max_length=1)
     tags: dict[Name, TagForm] = {}
     functions: dict[Name, FunctionForm] = Field(default={}, description="functions that no standard knows")
+    effects: list[EffectForm] = Field(default=[], description="what reading or writing a tag does to others")
+    server_id: str | None = Field(
+        default=None, pattern=r"^([0-9A-Fa-f]{2} ?){1,249}$", description="what function 11h tells, in hex"
+    )
+    identification: dict[ByteNumber, Annotated[str, Field(max_length=244)]] = Field(
+        default={}, description="objects of function 2Bh/0Eh: 0 vendor, 1 product code, 2 revision, 3 to 6, 128 to 255"
+    )
+    files: dict[FileNumber, Annotated[int, Field(ge=1, le=10_000)]] = Field(
+        default={}, description="file of functions 14h and 15h -> how many records"
+    )
+    fifos: dict[Word, Annotated[list[Word], Field(max_length=1000)]] = Field(
+        default={}, description="queue of function 18h: its pointer address -> what is in it"
+    )
     commands: dict[Name, str] = Field(default={}, description="command name -> the tag it writes")
     behaviours: dict[Name, dict[str, int | float]] = Field(default={}, description="behaviour -> command -> value")

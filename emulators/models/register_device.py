@@ -1,0 +1,114 @@
+"""A Modbus device of which nothing is recorded: its registers and functions are those of its profile.
+
+The cells are those of the tags; between them there is nothing (exception 02). They hold what the prototype says, 0 otherwise, and
+what a master writes. Effects, functions of its own, identification, files and queues are as the profile states them. A
+function of time only through what is asked: nothing here waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from emulators.journal import HeldJournal
+from emulators.modbus.bank import BIT_TABLES, IllegalValue, MapBank, RegisterBank, Table
+from emulators.modbus.unit import Handler, ModbusUnit
+from emulators.stated import Effects, cells_of, spans_of
+from gateway.core.errors import FileInvalid
+from gateway.core.profile import DeviceProfile, OwnFunction, Tag
+
+
+class StatedRegisters(RegisterBank):
+    """The registers of a device by its profile. `values`: tag -> what it holds at first, in engineering units, or text."""
+
+    def __init__(self, profile: DeviceProfile, values: Mapping[str, float | str], now_ns: int) -> None:
+        for name in values:
+            if name not in profile.tags:
+                known = ", ".join(profile.tags)
+                raise FileInvalid(f"{profile.name} has no tag {name!r}", path=profile.path, expected=known)
+        self.journal = HeldJournal()
+        self._tags = [tag for tag in profile.tags.values() if tag.readable]
+        self._cells = MapBank(spans_of(profile))
+        self._effects = Effects(profile.effects)
+        self._exponents = {t.name: _exponent(t, values) for t in profile.tags.values()}
+        for name, value in values.items():
+            self._put(profile.tags[name], value)
+        for tag in self._tags:
+            self._note(tag, now_ns)
+
+    def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
+        values = self._cells.read(table, address, count, now_ns)
+        self.set(self._effects.of(table, range(address, address + count), None), now_ns)
+        return values
+
+    def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
+        self._cells.check_read(table, address, count, now_ns)
+
+    def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
+        self._cells.write(table, address, values, now_ns)
+        addresses = range(address, address + len(values))
+        self._note_all(table, addresses, now_ns)
+        self.set(self._effects.of(table, addresses, values), now_ns)
+
+    def set(self, sets: Sequence[tuple[Tag, float]], now_ns: int) -> None:
+        """The device changes its own tags, one after the other."""
+        for tag, value in sets:
+            self._put(tag, value)
+            at = tag.registers
+            self._note_all(at.table, range(at.address, at.end), now_ns)
+
+    def _put(self, tag: Tag, value: float | str) -> None:
+        at = tag.registers
+        if isinstance(value, str) != (tag.type == "string"):
+            value = _number(tag, value)
+        cells = cells_of(tag, value, self._exponents[tag.name])
+        if tag.bits is not None:
+            low, high = tag.bits
+            mask = (1 << (high - low + 1)) - 1 << low
+            cells = [self._cells.peek(at.table, at.address) & ~mask | cells[0]]
+        self._cells.poke(at.table, at.address, *cells)
+
+    def _note_all(self, table: Table, addresses: range, now_ns: int) -> None:
+        for tag in self._tags:
+            at = tag.registers
+            if at.table == table and at.address < addresses.stop and addresses.start < at.end:
+                self._note(tag, now_ns)
+
+    def _note(self, tag: Tag, now_ns: int) -> None:
+        at = tag.registers
+        cells = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
+        bits = at.table in BIT_TABLES
+        self.journal.note(tag.name, bytes(cells) if bits else b"".join(c.to_bytes(2, "big") for c in cells), now_ns)
+
+
+def add_own_functions(unit: ModbusUnit, bank: StatedRegisters, profile: DeviceProfile) -> None:
+    """Let `unit` answer every function of the profile's own: the one request that is documented, 03 to any other."""
+    for function in profile.own_functions.values():
+        unit.register(function.code, _handler(bank, function), request_length=1 + len(function.request))
+
+
+def _handler(bank: StatedRegisters, function: OwnFunction) -> Handler:
+    def respond(pdu: bytes, now_ns: int) -> bytes:
+        if pdu[1:] != function.request:
+            raise IllegalValue(f"{function.name}: {pdu[1:].hex(' ')}")
+        bank.set(function.sets, now_ns)
+        return pdu[:1] + function.reply
+
+    return respond
+
+
+def _exponent(tag: Tag, values: Mapping[str, float | str]) -> int:
+    """What the scale-factor register of `tag` holds at first; 0 where it has none."""
+    held = values.get(tag.scale_by, 0) if tag.scale_by is not None else 0
+    return 0 if isinstance(held, str) else int(held)
+
+
+def _number(tag: Tag, text: float | str) -> float:
+    """A value that the prototype gives by the profile's word for it."""
+    for number, word in tag.values:
+        if word == text:
+            return number * tag.scale + tag.offset
+    words = ", ".join(word for _, word in tag.values)
+    expected = (
+        "text" if tag.type == "string" else "none: bytes cannot be stated" if tag.is_text else words or "a number"
+    )
+    raise FileInvalid(f"the value of {tag.name!r}", expected=expected, got=repr(text))

@@ -1,0 +1,103 @@
+"""What a profile states about an emulated device: which cells there are and how values lie in them, what reading or writing one
+does to others, and what functions without registers answer.
+
+Pure; encodes for itself, as everything on this side of the wire. It knows neither banks nor recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from emulators.codec import encode
+from emulators.modbus.bank import BIT_TABLES, Access, Span, Table
+from emulators.modbus.fifo import MOST_READ, FifoQueues
+from emulators.modbus.file_records import FileRecords
+from emulators.modbus.identification import Identification
+from emulators.modbus.unit import UnitParts
+from gateway.core.profile import DeviceProfile, Effect, Tag
+
+
+def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
+    """An engineering value as the cells that it fills. `exponent` is what the tag's scale-factor register holds. Of a tag that is
+    part of a register: that register with nothing in its other bits."""
+    at = tag.registers
+    if isinstance(value, str):
+        return encode(value, tag.type, tag.order, registers=at.count)
+    if at.table in BIT_TABLES:
+        return [int(bool(value))]
+    raw = (value - tag.offset) / (tag.scale * 10.0**exponent)
+    if tag.bits is not None:
+        low, high = tag.bits
+        return [(round(raw) & (1 << (high - low + 1)) - 1) << low]
+    return encode(raw, tag.type, tag.order, registers=at.count)
+
+
+def spans_of(profile: DeviceProfile) -> list[Span]:
+    """The cells that exist: those of the tags, each once. What several tags share can be whatever one of them can."""
+    read: dict[tuple[Table, int], bool] = {}
+    written: dict[tuple[Table, int], bool] = {}
+    for tag in profile.tags.values():
+        at = tag.registers
+        for cell in ((at.table, address) for address in range(at.address, at.end)):
+            read[cell] = read.get(cell, False) or tag.readable
+            written[cell] = written.get(cell, False) or tag.writable
+    return [Span(*cell, 1, _access(read[cell], written[cell])) for cell in read]
+
+
+def _access(read: bool, written: bool) -> Access:
+    return "ro" if not written else "rw" if read else "wo"
+
+
+def parts_of(profile: DeviceProfile) -> UnitParts:
+    """The functions of a profile that carry no registers: 11h, 14h, 15h, 18h and 2Bh, with what they answer."""
+    form = profile.form
+    fifos = FifoQueues(form.fifos, max((MOST_READ, *map(len, form.fifos.values())))) if form.fifos else None
+    if fifos is not None:
+        for address, content in form.fifos.items():
+            fifos.push(address, *content)
+    names = {number: text.encode("ascii", "replace") for number, text in form.identification.items()}
+    return UnitParts(
+        server_id=None if form.server_id is None else bytes.fromhex(form.server_id),
+        identification=Identification(names) if names else None,
+        files=FileRecords(form.files) if form.files else None,
+        fifos=fifos,
+    )
+
+
+class Effects:
+    """A profile's `effects`. Each question gives what tags hold from now on: (tag, engineering value), in the profile's order."""
+
+    def __init__(self, effects: Iterable[Effect]) -> None:
+        self._on_read = [e for e in effects if e.on_read]
+        self._on_write = [e for e in effects if not e.on_read]
+
+    def __bool__(self) -> bool:
+        return bool(self._on_read or self._on_write)
+
+    def of(self, table: Table, addresses: range, written: Sequence[int] | None) -> list[tuple[Tag, float]]:
+        """Of a request that reads (`written` is None) or writes cells. Any cell of a tag is the tag; only where the effect is
+        that of one value, that must have been written whole."""
+        effects = self._on_read if written is None else self._on_write
+        return [
+            pair
+            for e in effects
+            if _touches(e.tag, table, addresses)
+            and (e.value is None or written is None or _is(e.tag, e.value, addresses, written))
+            for pair in e.sets
+        ]
+
+
+def _touches(tag: Tag, table: Table, addresses: range) -> bool:
+    at = tag.registers
+    return at.table == table and at.address < addresses.stop and addresses.start < at.end
+
+
+def _is(tag: Tag, value: float, addresses: range, values: Sequence[int]) -> bool:
+    at = tag.registers
+    if at.address < addresses.start or at.end > addresses.stop:
+        return False
+    written = list(values[at.address - addresses.start : at.end - addresses.start])
+    if tag.bits is not None:
+        low, high = tag.bits
+        written = [written[0] & (1 << (high - low + 1)) - 1 << low]
+    return written == cells_of(tag, value)

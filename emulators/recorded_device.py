@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from emulators.codec import encode
+from emulators.codec import decode, encode
 from emulators.context import WhenUsedUp
+from emulators.distortion import Distortions
 from emulators.emulator import emulator_kind
 from emulators.journal import HeldJournal
 from emulators.replay.counters import CounterSpan
@@ -62,6 +63,8 @@ class RecordedDevice(ProfiledReplay):
         end, self._line = wire(kind)
         self.emulator = emulator_kind(end.type, profile)(end, profile, replay.context, super().respond)
         self.journal = HeldJournal()
+        self.distortions = Distortions()
+        """Of what it answers to reads."""
         self.unlisted = 0
         self._readable = [t for t in profile.tags.values() if t.readable and t.at is not None]
         for tag, text in ((profile.tags[n], text) for n, text in identity.items()):
@@ -77,8 +80,30 @@ class RecordedDevice(ProfiledReplay):
             self.unlisted += 1
             reply = super().respond(pdu, now_ns)
         if reply is not None and reply[0] == pdu[0]:
+            if self.distortions:
+                reply = self._distorted(pdu, reply, now_ns)
             self._note(pdu, reply, now_ns)
         return reply
+
+    def _distorted(self, pdu: bytes, reply: bytes, now_ns: int) -> bytes:
+        """The reply to a read of registers with other numbers in it."""
+        request = parse_request(pdu)
+        if request is None or request.values is not None or request.table in ("coil", "discrete"):
+            return reply
+        data = bytearray(reply)
+        for tag in self._readable:
+            at = tag.registers
+            inside = at.table == request.table and request.address <= at.address and at.end <= request.addresses.stop
+            if not inside or tag.is_text or not self.distortions.of(tag.name):
+                continue
+            first = 2 + 2 * (at.address - request.address)
+            words = [int.from_bytes(data[i : i + 2]) for i in range(first, first + 2 * at.count, 2)]
+            number = decode(words, tag.type, tag.order)
+            assert not isinstance(number, str)
+            value = self.distortions.apply(tag.name, number * tag.scale + tag.offset, now_ns)
+            words = encode((value - tag.offset) / tag.scale, tag.type, tag.order)
+            data[first : first + 2 * at.count] = b"".join(w.to_bytes(2) for w in words)
+        return bytes(data)
 
     def _note(self, pdu: bytes, reply: bytes, now_ns: int) -> None:
         request = parse_request(pdu)

@@ -38,6 +38,7 @@ from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.profile import DeviceProfile
 from gateway.devices.config import DeviceConfig
+from twin.field_faults import FieldFaults
 from twin.prototype_file import EmulatedBus, EmulatedDevice, Prototype
 from twin.system import System
 
@@ -91,6 +92,7 @@ class FieldSide:
         self.listening: dict[str, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
         self.far_units: dict[str, ModbusUnit] = {}
+        self.faults = FieldFaults(system, prototype.seed, clock)
         self._run_dir = run_dir
         self._clock = clock
         self._nursery = Nursery()
@@ -149,7 +151,8 @@ class FieldSide:
             latency_s = as_recorded(plant.serial if listen.scheme == "pty" and bus.pace else None)
         if listen.scheme == "pty":
             pace = plant.serial if bus.pace else None
-            end, self.listening[bus.name] = await self._ports.serial(self._run_dir / listen.path, plant, pace)
+            port, self.listening[bus.name] = await self._ports.serial(self._run_dir / listen.path, plant, pace)
+            end = self.faults.on_bytes(bus.name, port)
             self._connections.append(end)
             self._nursery.start(
                 serve_rtu(end, line_of(plant, units), self._clock, latency_s, echo=echo), f"emulators on {bus.name}"
@@ -163,14 +166,28 @@ class FieldSide:
         elif plant.is_serial or plant.scheme == "rtu+tcp":
             line = line_of(plant, units)
             self.listening[bus.name] = await self._listen(
-                listen, lambda c: serve_rtu(c, line, self._clock, latency_s, echo=echo), 1
+                listen, self._behind(bus.name, lambda c: serve_rtu(c, line, self._clock, latency_s, echo=echo)), 1
             )
         else:
             self.listening[bus.name] = await self._listen(
-                listen, lambda c: serve_mbap(c, MbapSlave(units), self._clock, latency_s)
+                listen, self._behind(bus.name, lambda c: serve_mbap(c, MbapSlave(units), self._clock, latency_s))
             )
         for device in on_it:
             await self._open_far(device, stated_s)
+
+    def _behind(self, bus: str, serve: OnClient) -> OnClient:
+        """`serve` for clients that come through the faults of their bus."""
+
+        async def client(connection: ByteConnection) -> None:
+            if self.faults.refuses(bus):
+                return
+            end = self.faults.on_bytes(bus, connection)
+            try:
+                await serve(end)
+            finally:
+                await end.aclose()
+
+        return client
 
     async def _listen(self, endpoint: Endpoint, on_client: OnClient, max_clients: int = 32) -> Endpoint:
         listener = await self._ports.listen(endpoint, on_client, max_clients)
@@ -197,7 +214,10 @@ class FieldSide:
         self._listeners.append(port)
         self._buses.append(port)
         self.listening[bus.name] = port.bound
-        connections = [await port.join(d.name) for d in on_it]
+        runner = port.runner
+        if runner is not None:
+            self.faults.on_wire(bus.name, runner.disturb, runner.undisturb)
+        connections = [self.faults.on_can(bus.name, await port.join(d.name), d.address) for d in on_it]
         self._connections.extend(connections)
         for device, node, connection in zip(on_it, nodes, connections, strict=True):
             self._nursery.start(serve_node(connection, node, self._clock), f"node {device.name}")
@@ -227,6 +247,7 @@ class FieldSide:
         unit = self._emulated_unit(config, bank, player.track)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = bank.journal
+        self.faults.on_values(config.name, bank.distortions)
         return unit
 
     def _recorded_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> RecordedDevice:
@@ -241,6 +262,7 @@ class FieldSide:
         unit = RecordedDevice(profile, replay.copy(), unit_id, kind, emulated.form.identity, config.name)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = unit.journal
+        self.faults.on_values(config.name, unit.distortions)
         return unit
 
     def _kind(self, config: DeviceConfig) -> type[RS232Connection] | type[TCPConnection]:
@@ -264,6 +286,7 @@ class FieldSide:
             ) from e
         device = self.devices[config.name] = FieldDevice(emulated, None, made.node)
         device.journal = made.journal
+        self.faults.on_values(config.name, made.distortions)
         return made.node
 
     def _node_recording(self, emulated: EmulatedDevice) -> SignalPlayer | CanLog | None:
@@ -305,6 +328,7 @@ class FieldSide:
                 }
                 for name, d in self.devices.items()
             },
+            "faults": self.faults.describe(),
             "listening": {bus: str(endpoint) for bus, endpoint in self.listening.items()},
             "far": {device: str(endpoint) for device, endpoint in self.far.items()},
             "links": {

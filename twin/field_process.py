@@ -76,7 +76,15 @@ class FieldProcess:
         self._field = resolve(self._config).field(run_dir)
         await self._field.open()
         server = ControlServer(
-            {"ready": self._ready, "get": self._get, "held": self._held, "stop": self._request_stop},
+            {
+                "ready": self._ready,
+                "get": self._get,
+                "held": self._held,
+                "fault": self._fault,
+                "clear": self._clear,
+                "set": self._set,
+                "stop": self._request_stop,
+            },
             token=self._config.token,
         )
         socket = run_dir / "field.sock"
@@ -117,6 +125,23 @@ class FieldProcess:
         """At most `HELD_AT_ONCE` entries a device, the oldest first: who wants them all asks again."""
         since = {str(name): int(number) for name, number in (args.get("since") or {}).items()}
         return {name: held[:HELD_AT_ONCE] for name, held in self._field.held_since(since).items()}
+
+    async def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Put in ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if given."""
+        if isinstance(args.get("start_ns"), int):
+            self._field.faults.start_ns = args["start_ns"]
+        said = args.get("fault")
+        if not isinstance(said, dict):
+            raise UsageError("a fault", expected='{"name": ..., "device": ...}', got=repr(said)[:60])
+        return {"id": self._field.faults.inject(said), "faults": self._field.faults.describe()}
+
+    async def _clear(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._field.faults.clear(str(args.get("id", "")))
+        return {"faults": self._field.faults.describe()}
+
+    async def _set(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._field.faults.set_value(str(args.get("device", "")), str(args.get("tag", "")), args.get("value"))
+        return {}
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         asyncio.get_running_loop().call_later(0.05, self._stop.set)

@@ -119,7 +119,7 @@ class VirtualPrototype:
         self._nursery.start(self.field.run(), "field side")
         await clock.sleep_until_ns(self.loop.now_ns + STARTING_NS)
         self._nursery.start(run_on_clock(self.plc, clock), "PLC")
-        self.started_ns = self.loop.now_ns
+        self.started_ns = self.field.faults.start_ns = self.loop.now_ns
         self._nursery.start(self.gateway.run(), "gateway")
         self._nursery.start(self._flush(log), "store")
 

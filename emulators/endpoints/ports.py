@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Protocol
 
+from emulators.endpoints.bus_runner import BusRunner
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.endpoints.can_end import open_can_end
 from emulators.endpoints.pty import PtyEnd
@@ -44,6 +45,11 @@ class CanPort(Listening, Protocol):
 
     def stats(self) -> dict[str, Any]:
         """What the bus counted; empty where it is not ours."""
+        ...
+
+    @property
+    def runner(self) -> BusRunner | None:
+        """The model of the bus; None where it is not ours."""
         ...
 
 
@@ -96,6 +102,10 @@ class _ServedBus:
     def stats(self) -> dict[str, Any]:
         return self._server.bus_stats()
 
+    @property
+    def runner(self) -> BusRunner | None:
+        return self._server.runner
+
     async def aclose(self) -> None:
         await self._server.aclose()
 
@@ -110,6 +120,10 @@ class _KernelBus:
 
     def stats(self) -> dict[str, Any]:
         return {}
+
+    @property
+    def runner(self) -> BusRunner | None:
+        return None
 
     async def aclose(self) -> None:
         """The kernel's interface stays."""

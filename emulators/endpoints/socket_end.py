@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
+import struct
 from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
@@ -93,9 +94,12 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
             self._transport.abort()
             await asyncio.shield(self._closed)
 
-    def evict(self) -> None:
-        """Close at once, whatever is under way."""
+    def evict(self, *, reset: bool = False) -> None:
+        """Close at once, whatever is under way; with `reset` by RST, as a crashed device does."""
         if self._transport is not None:
+            if reset:
+                sock = self._transport.get_extra_info("socket")
+                sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             self._transport.abort()
 
     def on_room(self) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from emulators.endpoints.faulty import FaultyEnd
 from emulators.endpoints.ports import Datagrams
 from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import SocketEnd
@@ -58,7 +59,7 @@ async def serve_rtu(
             if echo and data:
                 await connection.write(data)
             exchanges = slave.receive(data, now_ns)
-            if isinstance(connection, PtyEnd) and connection.paced:
+            if isinstance(connection, PtyEnd | FaultyEnd) and connection.paced:
                 await _reply_on_line(connection, exchanges, clock, now_ns, latency_s, on_frame)
             else:
                 await _reply(connection.write, exchanges, clock, now_ns, latency_s, on_frame)
@@ -153,7 +154,7 @@ async def _reply(
 
 
 async def _reply_on_line(
-    end: PtyEnd,
+    end: PtyEnd | FaultyEnd,
     exchanges: list[Exchange],
     clock: Clock,
     now_ns: int,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from emulators.canopen.codec import encode
 from emulators.canopen.dictionary import Dictionary, Key, load_eds
 from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.models.by_profile import model_for
 from emulators.models.played_objects import HeldObjects, PlayedObjects
@@ -23,10 +24,11 @@ from gateway.core.profile import DeviceProfile
 
 @dataclass(frozen=True, slots=True)
 class EmulatedNode:
-    """The node and what it held, by tag."""
+    """The node and what it held, by tag. `distortions` of what a recording plays; None: it plays none."""
 
     node: CanopenNode
     journal: HeldJournal
+    distortions: Distortions | None
 
 
 def emulated_node(
@@ -50,16 +52,18 @@ def emulated_node(
     held = HeldObjects(tags)
     own = _factory(profile, dictionary, identity or {})
     context = NodeContext(model=model_for(dictionary), held=held, factory=own)
+    played: PlayedObjects | None = None
     if isinstance(recording, CanLog):
         objects = recorded_objects(recording, dictionary, node_id)
         context = replace(context, source=objects, factory={**objects.initial, **own}, refusals=objects.refusals)
     elif recording is not None:
-        context = replace(context, source=PlayedObjects(tags, dictionary, recording))
+        played = PlayedObjects(tags, dictionary, recording)
+        context = replace(context, source=played)
     node = CanopenNode(dictionary, node_id, context)
     for tag in tags:  # what nobody plays is held as well: by the data sheet
         if tag.object is not None and node.data.has(*tag.object):
             held({tag.object: node.data.get(*tag.object)}, now_ns)
-    return EmulatedNode(node, held.journal)
+    return EmulatedNode(node, held.journal, played.distortions if played is not None else None)
 
 
 def _factory(profile: DeviceProfile, dictionary: Dictionary, identity: Mapping[str, str]) -> dict[Key, bytes]:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from emulators.canopen.codec import encode
+from emulators.canopen.codec import encode, integer_range
 from emulators.canopen.dictionary import Dictionary
+from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.signals import SignalPlayer
 from gateway.core.errors import FileInvalid
@@ -23,6 +24,7 @@ class PlayedObjects:
     """
 
     def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: SignalPlayer) -> None:
+        self.distortions = Distortions()
         self._player = player
         self._objects: list[tuple[Tag, Key, int]] = []
         for tag in tags:
@@ -45,11 +47,22 @@ class PlayedObjects:
         values = self._player.values(now_ns)
         out: dict[Key, bytes] = {}
         for tag, key, data_type in self._objects:
-            number = (values[tag.name] - tag.offset) / tag.scale
+            value = values[tag.name]
+            if self.distortions:
+                value = self.distortions.apply(tag.name, value, now_ns)
+            number = (value - tag.offset) / tag.scale
             if math.isnan(number) and not tag.type.startswith("float"):
                 continue  # no integer says "no value": the object keeps what it has
-            out[key] = encode(data_type, number if tag.type.startswith("float") else round(number))
+            out[key] = encode(data_type, number if tag.type.startswith("float") else _whole(number, data_type))
         return out
+
+
+def _whole(number: float, data_type: int) -> int:
+    """The nearest number that the type holds: a device's converters saturate."""
+    bounds = integer_range(data_type)
+    if bounds is None:
+        return round(number)
+    return round(min(max(number, bounds[0]), bounds[1]))
 
 
 class HeldObjects:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from emulators.codec import decode, encode
+from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
 from emulators.signals import SignalPlayer
@@ -34,6 +35,8 @@ class SampledSensor(RegisterBank):
         if profile.sampled is None:
             raise FileInvalid("the profile says nothing about sampling", path=profile.path, expected="`sampled:`")
         self.journal = HeldJournal()
+        self.distortions = Distortions()
+        """Of its signals: what the next samples are instead."""
         self.samples = 0
         self._player = player
         self._tags = profile.tags
@@ -121,7 +124,10 @@ class SampledSensor(RegisterBank):
         values = self._player.track.values(time_ms / 1000)
         self.samples += 1
         for tag in self._signals:
-            self._put(tag, (values[tag.name] - tag.offset) / tag.scale, t_ns)
+            value = values[tag.name]
+            if self.distortions:
+                value = self.distortions.apply(tag.name, value, t_ns)
+            self._put(tag, (value - tag.offset) / tag.scale, t_ns)
         if "instrument_time" in self._tags:
             self._put(self._tags["instrument_time"], time_ms & 0xFFFFFFFF, t_ns)
         self._put(self._count_tag, self.samples & 0xFFFFFFFF, t_ns)

@@ -95,9 +95,9 @@ class MemoryNet:
         bus = self._buses.get(str(endpoint))
         if bus is None or str(endpoint) in self._refused:
             raise Unreachable("no such bus", where=str(endpoint))
-        if bitrate and bitrate != bus.runner.bitrate:
-            raise UsageError("the bus runs at another bit rate", expected=str(bus.runner.bitrate), got=str(bitrate))
-        return bus.runner.attach(endpoint, "gateway")
+        if bitrate and bitrate != bus._runner.bitrate:
+            raise UsageError("the bus runs at another bit rate", expected=str(bus._runner.bitrate), got=str(bitrate))
+        return bus._runner.attach(endpoint, "gateway")
 
     async def listen_for_clients(
         self,
@@ -118,7 +118,7 @@ class MemoryNet:
 
     def runner(self, listening: Endpoint) -> BusRunner:
         """The bus at `listening`."""
-        return self._buses[str(listening)].runner
+        return self._buses[str(listening)]._runner
 
     def refuse(self, listening: Endpoint, *, refused: bool = True) -> None:
         """Whether who connects to `listening` is refused from now on."""
@@ -257,15 +257,16 @@ class MemoryBus:
 
     def __init__(self, net: MemoryNet, bound: Endpoint, runner: BusRunner) -> None:
         self.bound = bound
-        self.runner = runner
+        self.runner: BusRunner | None = runner
+        self._runner = runner
         self._net = net
 
     async def join(self, name: str) -> AttachedConnection:
-        return self.runner.attach(self.bound, name)
+        return self._runner.attach(self.bound, name)
 
     def stats(self) -> dict[str, Any]:
-        return self.runner.stats()
+        return self._runner.stats()
 
     async def aclose(self) -> None:
         self._net._buses.pop(str(self.bound), None)
-        self.runner.close(closed_here(self.bound))
+        self._runner.close(closed_here(self.bound))

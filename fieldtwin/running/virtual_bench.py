@@ -64,7 +64,9 @@ class VirtualBench:
     target = "virtual"
     can = frozenset(
         {
+            Can.INJECT_FAULT,
             Can.SEND_COMMAND,
+            Can.SET_VALUE,
             Can.SEE_WIRE,
             Can.SEE_HELD,
             Can.EXACT_TIME,
@@ -157,13 +159,16 @@ class VirtualBench:
         self.shore.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
-        raise UsageError("values cannot be set on this target", expected="one that can", got=f"{device}.{tag}")
+        self.run.field.faults.set_value(device, tag, value)
 
     async def inject(self, fault: dict[str, Any]) -> None:
-        raise UsageError("faults cannot be put in on this target", got=str(fault.get("name")))
+        id = self.run.field.faults.inject(fault)
+        target = fault.get("device") or fault.get("bus") or ""
+        self.note(Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target})
 
     async def clear(self, id: str) -> None:
-        raise UsageError("there are no faults on this target", got=id)
+        self.run.field.faults.clear(id)
+        self.note(Kind.FAULT, id, {"name": "", "on": False, "target": ""})
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:
         device, _, tag = name.partition(".")

@@ -88,6 +88,8 @@ class _End(Generic[T]):
         self.max_pending = max_pending
         self.on_arrival: Callable[[T], None] | None = None
         """Told of every item at the moment it arrives, read or not (a tap). It may not feed, read or raise."""
+        self.intercept: Callable[[T], bool] | None = None
+        """Handed each item before anybody sees it; True: it took the item, and may pass it on with `feed_through`."""
         self._lost: FieldtwinError | None = None
         self._waiter: asyncio.Future[None] | None = None
 
@@ -98,6 +100,12 @@ class _End(Generic[T]):
 
     def feed(self, item: T) -> bool:
         """Something arrived. Returns False when nothing more should be taken from the medium for now."""
+        if self.intercept is not None and self.intercept(item):
+            return len(self.inbound.data_stream) < self.max_pending
+        return self.feed_through(item)
+
+    def feed_through(self, item: T) -> bool:
+        """As `feed`, past `intercept`."""
         self.inbound.write(item)
         if self.on_arrival is not None:
             self.on_arrival(item)

@@ -1,0 +1,155 @@
+"""An emulated node's end of a CAN bus with faults on it: frames that it sends and hears pass through the bus's faults."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from emulators.faults.can_fault import BusFault, CanFault, CanPiece
+from emulators.faults.engine import WireFaults, in_time
+from emulators.faults.fault import Active
+from emulators.faults.frames import Frame, Framing, Way
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import CANConnection, CanConnection
+from gateway.core.errors import ConnectionLost, FieldtwinError
+
+
+class FaultyCan(CanConnection):
+    """`inner`, the end of node `node`, behind `faults`. Close it instead of `inner`."""
+
+    def __init__(self, inner: CanConnection, faults: WireFaults, node: int) -> None:
+        assert isinstance(inner.inbound, CANConnection)
+        super().__init__(inner.inbound, inner.endpoint, inner.max_pending)
+        self.inner = inner
+        self.node = node
+        self._faults = faults
+        self._loop = asyncio.get_running_loop()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._closed = False
+        inner.accept = self._accepts
+        inner.intercept = self._heard
+        faults.listeners.append(self._put_in)
+
+    @property
+    def lost(self) -> FieldtwinError | None:
+        return self.inner.lost
+
+    def _accepts(self, frame: CanFrame) -> bool:
+        return self.accept is None or self.accept(frame)
+
+    async def recv(self) -> CanFrame:
+        return await self.inner.recv()
+
+    async def send(self, frame: CanFrame) -> None:
+        pieces = self._struck(Way.REPLY, frame)
+        if pieces is None:
+            await self.inner.send(frame)
+            return
+        for piece in pieces:
+            if piece.delay_s <= 0:
+                await self.inner.send(piece.frame)
+        self._later(p for p in pieces if p.delay_s > 0)
+
+    async def aclose(self) -> None:
+        self._closed = True
+        if self._put_in in self._faults.listeners:
+            self._faults.listeners.remove(self._put_in)
+        for task in tuple(self._tasks):
+            task.cancel()
+        await self.inner.aclose()
+
+    # -- frames ---------------------------------------------------------------------------------------------------------
+
+    def _now_ns(self) -> int:
+        return round(self._loop.time() * NS_PER_S)
+
+    def _heard(self, frame: CanFrame) -> bool:
+        pieces = self._struck(Way.REQUEST, frame)
+        if pieces is None:
+            return False
+        for piece in pieces:
+            if piece.delay_s <= 0:
+                self.inner.feed_through(piece.frame)
+            else:
+                self._loop.call_later(piece.delay_s, self.inner.feed_through, piece.frame)
+        return True
+
+    def _struck(self, way: Way, frame: CanFrame) -> list[CanPiece] | None:
+        """What becomes of the frame; None: nothing happens to it."""
+        if not self._faults.active or frame.error:
+            return None
+        now_ns = self._now_ns()
+        pieces: list[CanPiece] | None = None
+        for active in tuple(self._faults.active.values()):
+            fault = active.fault
+            if not isinstance(fault, CanFault) or (active.units and self.node not in active.units):
+                continue
+            if active.aim.cob_id is not None and frame.can_id != active.aim.cob_id:
+                continue
+            if not fault.aims_at(frame, self.node) or not active.strikes(_seen(way, self.node), now_ns):
+                continue
+            before = pieces if pieces is not None else [CanPiece(frame)]
+            pieces = [
+                CanPiece(after.frame, after.delay_s + piece.delay_s)
+                for piece in before
+                for after in fault.strike(piece.frame, self.node, active.random)
+            ]
+        return pieces
+
+    def _put_in(self, active: Active) -> None:
+        if not isinstance(active.fault, CanFault) or (active.units and self.node not in active.units):
+            return
+        pieces = active.fault.appears(self.node, active.random)
+        wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
+        self._later(CanPiece(p.frame, p.delay_s + wait_s) for p in pieces)
+
+    def _later(self, pieces: Iterable[CanPiece]) -> None:
+        for piece in pieces:
+            self._loop.call_later(piece.delay_s, self._start, piece.frame)
+
+    def _start(self, frame: CanFrame) -> None:
+        if self._closed:
+            return
+        task = self._loop.create_task(self._send_quietly(frame), name="a fault's frame")
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _send_quietly(self, frame: CanFrame) -> None:
+        try:
+            await self.inner.send(frame)
+        except ConnectionLost:
+            pass  # it was too late
+
+
+def _seen(way: Way, node: int) -> Frame:
+    return Frame(way, Framing.RAW, b"", node)
+
+
+def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[int]) -> Any:
+    """A rule for the modelled bus (emulators/wires/can_faults.py): spoil what the nodes send while the fault lasts."""
+    from emulators.wires.can_faults import Disturbance
+
+    assert isinstance(active.fault, BusFault)
+    attempts, spoilt = active.fault.attempts, 0
+    again: CanFrame | None = None
+
+    def rule(frame: CanFrame, start_ns: int, senders: tuple[int, ...], /) -> Disturbance | None:
+        nonlocal again, spoilt
+        ours = any((frame.can_id & 0x7F) == node for node in from_nodes) and frame.can_id > 0x80
+        if not ours or not in_time(active, now_ns()) or (attempts is not None and spoilt >= attempts):
+            return None
+        if active.aim.cob_id is not None and frame.can_id != active.aim.cob_id:
+            return None
+        if active.aim.probability < 1.0 and active.random.random() >= active.aim.probability:
+            return None
+        if attempts is None and again is not None and again.key() == frame.key():
+            again = None  # its controller sends it again, and that goes well
+            return None
+        again = frame
+        spoilt += 1
+        active.struck += 1
+        return Disturbance()
+
+    return rule

@@ -1,0 +1,115 @@
+"""A fault as a file or a scenario says it: its name, what it aims at, its parameters.
+
+faults:
+  - {id: dead, name: silence, device: ctd, from: 5s, until: 12s}
+  - {name: corrupt-crc, bus: line1, probability: 0.1}
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from emulators.faults.fault import Aim, Fault
+from emulators.faults.registry import fault_class
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.yaml_file import Key, YamlFile, load
+
+_AIM_KEYS = tuple(info.alias or name for name, info in Aim.model_fields.items())
+_DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|min|h)?$")
+_UNIT_S = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "h": 3600.0}
+MOST = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class FaultSpec:
+    """A fault that may be put in. Times in seconds of the run; `until_s` None: until it is taken away."""
+
+    id: str
+    kind: type[Fault]
+    aim: Aim
+    parameters: dict[str, Any]
+    from_s: float
+    until_s: float | None
+
+    def make(self) -> Fault:
+        """The fault, anew: some remember."""
+        return self.kind(self.kind.form.model_validate(self.parameters))
+
+
+def seconds(value: str | float | int) -> float:
+    """``5s``, ``250ms``, ``2min``, ``24h``, or seconds. Raises `UsageError`."""
+    if isinstance(value, int | float):
+        return float(value)
+    match = _DURATION.match(value.strip())
+    if match is None:
+        raise UsageError("a time", expected="5s, 250ms, 2min or 24h", got=repr(value))
+    return float(match[1]) * _UNIT_S[match[2] or ""]
+
+
+def parse_fault(
+    said: dict[str, Any], file: YamlFile | None = None, loc: tuple[Key, ...] = (), number: int = 1
+) -> FaultSpec:
+    """One fault. Raises `FileInvalid` at its spot in `file`, or `UsageError` where there is no file."""
+
+    def wrong(key: str, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid | UsageError:
+        if file is not None:
+            return file.error((*loc, key) if key else loc, message, expected=expected, got=got, hint=hint)
+        return UsageError(message, expected=expected, got=got, hint=hint)
+
+    if not isinstance(said, dict):
+        raise wrong("", "a fault", expected="{name: ..., device: ...}", got=repr(said)[:60])
+    name = said.get("name")
+    if not isinstance(name, str):
+        raise wrong("", "a fault without a name", expected="name: one that `fieldtwin faults` lists")
+    try:
+        kind = fault_class(name)
+    except UsageError as e:
+        raise wrong("name", e.message, expected=e.expected, hint=e.hint) from e
+    own = tuple(kind.form.model_fields)
+    known = ("id", "name", *_AIM_KEYS, *own)
+    for key in said:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else ""
+            raise wrong(str(key), f"unknown key {key!r} in fault {name}", expected=", ".join(known), hint=hint)
+    try:
+        aim = Aim.model_validate({k: v for k, v in said.items() if k in _AIM_KEYS})
+        parameters = {k: v for k, v in said.items() if k in own}
+        kind.form.model_validate(parameters)
+        from_s = seconds(aim.from_)
+        until_s = None if aim.until is None else seconds(aim.until)
+    except ValidationError as e:
+        first = e.errors()[0]
+        key = str(first["loc"][0]) if first["loc"] else ""
+        raise wrong(key, f"{key}: {first['msg']}", got=repr(first["input"])[:60]) from e
+    except UsageError as e:
+        raise wrong("from", e.message, expected=e.expected, got=e.got) from e
+    if until_s is not None and until_s <= from_s:
+        raise wrong("until", "a fault that ends before it begins", expected="until after from")
+    return FaultSpec(str(said.get("id") or f"{name}-{number}"), kind, aim, parameters, from_s, until_s)
+
+
+def load_faults(path: Path) -> tuple[dict[str, Any], ...]:
+    """The faults of a file, checked, as they were said, each with an id. Raises `FileInvalid`."""
+    file = load(path)
+    for key in file.data:
+        if key != "faults":
+            raise file.error((key,), f"unknown key {key!r}", expected="faults")
+    said = file.data.get("faults")
+    if not isinstance(said, list) or not said:
+        raise file.error(("faults",), "a list of faults", expected="faults: [{name: ..., device: ...}]")
+    if len(said) > MOST:
+        raise file.error(("faults",), "too many faults", expected=f"at most {MOST}", got=str(len(said)))
+    found: dict[str, dict[str, Any]] = {}
+    for n, one in enumerate(said):
+        spec = parse_fault(one, file, ("faults", n), n + 1)
+        if spec.id in found:
+            raise file.error(("faults", n, "id"), f"the id {spec.id!r} stands twice")
+        found[spec.id] = {**one, "id": spec.id}
+    return tuple(found.values())

@@ -1,0 +1,220 @@
+"""The faults of a field side: what is put in by name is aimed here, by the system file, at a bus, a device, a register or a tag.
+
+A plant has none of this. Whoever asks is `fieldtwin run --faults`, a scenario, or somebody at the control channel.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from random import Random
+from typing import Any
+
+from emulators.distortion import Distortions
+from emulators.endpoints.faulty import FaultyEnd
+from emulators.endpoints.faulty_can import FaultyCan, bus_rule
+from emulators.faults.can_fault import BusFault
+from emulators.faults.engine import WireFaults
+from emulators.faults.fault import Active, Aim, Fault, Kind, ValueFault
+from emulators.faults.frames import Framing
+from emulators.faults.schema import FaultSpec, parse_fault
+from emulators.faults.set_value import Form, SetValue
+from emulators.wires.can_faults import Rule
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import ByteConnection, CanConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.profile import Tag
+from twin.system import System
+
+MOST = 1_000
+
+
+class FieldFaults:
+    """What is in on the buses of a system, and in its devices. `start_ns`: when the run began; `from` and `until` count from
+    then."""
+
+    def __init__(self, system: System, seed: int, clock: Clock) -> None:
+        self.start_ns = clock.monotonic_ns()
+        self._system = system
+        self._seed = seed
+        self._clock = clock
+        self._buses = {name: WireFaults(framing_of(bus.endpoint)) for name, bus in system.buses.items()}
+        self._distortions: dict[str, Distortions] = {}
+        self._rules: dict[str, tuple[str, Rule]] = {}
+        self._disturb: dict[str, Callable[[Rule], None]] = {}
+        self._undisturb: dict[str, Callable[[Rule], None]] = {}
+        self._active: dict[str, tuple[FaultSpec, Active, str]] = {}
+
+    # -- where faults can be --------------------------------------------------------------------------------------------
+
+    def on_bytes(self, bus: str, connection: ByteConnection) -> FaultyEnd:
+        """An emulator's end of a line or socket, behind the faults of its bus."""
+        return FaultyEnd(connection, self._buses[bus])
+
+    def on_can(self, bus: str, connection: CanConnection, node: int) -> FaultyCan:
+        """A node's end of a bus, behind the faults of that bus."""
+        return FaultyCan(connection, self._buses[bus], node)
+
+    def on_values(self, device: str, distortions: Distortions | None) -> None:
+        """What `device` holds can be distorted; None: it cannot."""
+        if distortions is not None:
+            self._distortions[device] = distortions
+
+    def on_wire(self, bus: str, disturb: Callable[[Rule], None], undisturb: Callable[[Rule], None]) -> None:
+        """A modelled CAN bus, on which errors can happen."""
+        self._disturb[bus], self._undisturb[bus] = disturb, undisturb
+
+    def refuses(self, bus: str) -> bool:
+        """Whether who connects to the emulators of `bus` is turned away now."""
+        return self._buses[bus].refuses(self._clock.monotonic_ns())
+
+    # -- putting in and taking away -------------------------------------------------------------------------------------
+
+    def inject(self, said: Mapping[str, Any]) -> str:
+        """Put a fault in; its id. Raises `UsageError` for what makes no sense, or an id that is in already."""
+        spec = parse_fault(dict(said), number=len(self._active) + 1)
+        if spec.id in self._active:
+            raise UsageError(f"the fault {spec.id!r} is in already", hint="clear it first, or give another id")
+        if len(self._active) >= MOST:
+            raise UsageError("too many faults at once", expected=f"at most {MOST}")
+        fault = spec.make()
+        bus = self._bus_of(spec, fault)
+        until_ns = None if spec.until_s is None else self.start_ns + round(spec.until_s * NS_PER_S)
+        active = Active(
+            spec.id,
+            fault,
+            spec.aim,
+            Random(f"{self._seed} {spec.id}"),
+            self.start_ns + round(spec.from_s * NS_PER_S),
+            until_ns,
+            units=self._units(spec),
+            addresses=self._addresses(spec),
+        )
+        self._put(spec, active, bus)
+        self._active[spec.id] = (spec, active, bus)
+        return spec.id
+
+    def _put(self, spec: FaultSpec, active: Active, bus: str) -> None:
+        if isinstance(active.fault, ValueFault):
+            found = self._distortions.get(spec.aim.device)
+            if found is None:
+                raise UsageError(
+                    f"what {spec.aim.device} holds cannot be changed", expected="a device with a recording"
+                )
+            found.put_in(active, spec.aim.register_)
+        elif isinstance(active.fault, BusFault):
+            disturb = self._disturb.get(bus)
+            if disturb is None:
+                raise UsageError(f"no errors on the wire of bus {bus!r}", expected="the software CAN bus")
+            nodes = frozenset(active.units) or frozenset(d.address for d in self._system.devices_on(bus))
+            rule = bus_rule(active, self._clock.monotonic_ns, nodes)
+            self._rules[spec.id] = bus, rule
+            disturb(rule)
+        else:
+            self._buses[bus].put_in(active)
+
+    def clear(self, id: str) -> None:
+        """Take a fault away. Raises `UsageError` for an id that is not in."""
+        if id not in self._active:
+            raise UsageError(f"no fault {id!r} is in", expected=", ".join(self._active) or "one; there is none")
+        spec, _, bus = self._active.pop(id)
+        if spec.aim.device in self._distortions:
+            self._distortions[spec.aim.device].take_away(id)
+        if id in self._rules:
+            on, rule = self._rules.pop(id)
+            self._undisturb[on](rule)
+        elif bus:
+            self._buses[bus].take_away(id)
+
+    def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
+        """From now on the device holds `value` for `tag`; None: what it says by itself again."""
+        found = self._tag(device, tag)
+        distortions = self._distortions.get(device)
+        if distortions is None or found.is_text:
+            raise UsageError(f"{device}.{tag} cannot be set", expected="a number of a device with a recording")
+        id = f"set {device}.{tag}"
+        distortions.take_away(id)
+        if value is None:
+            return
+        if isinstance(value, str):
+            raise UsageError(f"{device}.{tag}", expected="a number", got=repr(value))
+        now_ns = self._clock.monotonic_ns()
+        fault = SetValue(Form(value=float(value)))
+        distortions.put_in(Active(id, fault, Aim(), Random(id), now_ns, None), tag)
+
+    def describe(self) -> list[dict[str, Any]]:
+        """What is in, and how often it struck."""
+        return [
+            {"id": id, "name": spec.kind.name, "bus": bus, "device": spec.aim.device, "struck": active.struck}
+            for id, (spec, active, bus) in self._active.items()
+        ]
+
+    # -- aiming ---------------------------------------------------------------------------------------------------------
+
+    def _bus_of(self, spec: FaultSpec, fault: Fault) -> str:
+        aim = spec.aim
+        if aim.device:
+            self._known("device", aim.device, list(self._system.devices))
+            bus = self._system.devices[aim.device].bus
+        elif aim.bus:
+            self._known("bus", aim.bus, list(self._system.buses))
+            bus = aim.bus
+        else:
+            raise UsageError(f"fault {spec.kind.name} aims at nothing", expected="device: NAME, or bus: NAME")
+        if fault.kind is Kind.VALUE:
+            if not aim.device:
+                raise UsageError(f"fault {spec.kind.name} is one of a device", expected="device: NAME")
+            if aim.register_:
+                self._tag(aim.device, aim.register_)
+            return bus
+        is_can = self._system.buses[bus].endpoint.is_can
+        if is_can != (fault.kind is Kind.CAN):
+            raise UsageError(f"fault {spec.kind.name} is for {fault.kind.value}", got=f"bus {bus!r}")
+        return bus
+
+    def _units(self, spec: FaultSpec) -> tuple[int, ...]:
+        if spec.aim.unit is not None:
+            return (spec.aim.unit,)
+        return (self._system.devices[spec.aim.device].address,) if spec.aim.device else ()
+
+    def _addresses(self, spec: FaultSpec) -> range | None:
+        aim = spec.aim
+        if issubclass(spec.kind, ValueFault):
+            return None
+        if aim.register_:
+            if not aim.device:
+                raise UsageError("a register is one of a device", expected="device: NAME")
+            at = self._tag(aim.device, aim.register_).registers
+            return range(at.address, at.end)
+        if aim.address is None:
+            return None
+        text = str(aim.address).rpartition(":")[2]
+        try:
+            address = int(text, 0)
+        except ValueError:
+            raise UsageError("an address", expected="a number, or holding:0x10", got=repr(aim.address)) from None
+        return range(address, address + 1)
+
+    def _tag(self, device: str, tag: str) -> Tag:
+        self._known("device", device, list(self._system.devices))
+        tags = self._system.devices[device].profile.tags
+        self._known(f"tag of {device}", tag, list(tags))
+        return tags[tag]
+
+    @staticmethod
+    def _known(what: str, name: str, known: list[str]) -> None:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+            raise UsageError(
+                f"no {what} {name!r}", expected=", ".join(known), hint=f"did you mean {near[0]!r}?" if near else ""
+            )
+
+
+def framing_of(endpoint: Endpoint) -> Framing:
+    """How frames look on a bus."""
+    if endpoint.is_can:
+        return Framing.RAW
+    if endpoint.scheme == "ascii":
+        return Framing.ASCII
+    return Framing.RTU if endpoint.is_serial or endpoint.scheme == "rtu+tcp" else Framing.MBAP

@@ -26,12 +26,14 @@ from emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, 
 from emulators.modbus.unit import ModbusUnit, UnitLimits
 from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
+from emulators.models.register_device import StatedRegisters, add_own_functions
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.recorded_device import RecordedDevice, load_replay
 from emulators.replay.can_log import SUFFIX, CanLog
 from emulators.replay.replay import ExchangeReplay
 from emulators.signals import SignalPlayer, SignalTrack
-from gateway.core.clock import Clock
+from emulators.stated import parts_of
+from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
@@ -226,6 +228,12 @@ class FieldSide:
 
     def _modbus_unit(self, config: DeviceConfig) -> EmulatedUnit | RecordedDevice:
         emulated = self.prototype.devices[config.name]
+        unit = self._made_unit(config, emulated)
+        if emulated.form.busy is not None:
+            unit.be_busy_behind(emulated.form.busy.every, emulated.form.busy.for_ms * NS_PER_MS)
+        return unit
+
+    def _made_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit | RecordedDevice:
         if emulated.form.model == "mailbox":
             link = emulated.form.far_link
             pair = ModemPair(
@@ -240,6 +248,8 @@ class FieldSide:
             modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
             modem.journal = pair.near.journal
             return unit
+        if emulated.form.model == "profile":
+            return self._stated_unit(config, emulated)
         if emulated.profile.sampled is None:
             return self._recorded_unit(config, emulated)
         player = self._player(emulated)
@@ -248,6 +258,21 @@ class FieldSide:
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = bank.journal
         self.faults.on_values(config.name, bank.distortions)
+        return unit
+
+    def _stated_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit:
+        """A device of which nothing is recorded: its profile, and what the prototype file says that its tags hold."""
+        values = {**emulated.form.values, **emulated.form.identity}
+        try:
+            bank = StatedRegisters(emulated.profile, values, self._clock.monotonic_ns())
+        except FileInvalid as e:
+            raise FileInvalid(
+                f"{config.name!r}: {e.message}", path=str(self.prototype.path), expected=e.expected, got=e.got
+            ) from e
+        unit = self._emulated_unit(config, bank, ())
+        add_own_functions(unit, bank, emulated.profile)
+        device = self.devices[config.name] = FieldDevice(emulated, unit, None)
+        device.journal = bank.journal
         return unit
 
     def _recorded_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> RecordedDevice:
@@ -271,7 +296,8 @@ class FieldSide:
     def _emulated_unit(self, config: DeviceConfig, bank: RegisterBank, context: Sized) -> EmulatedUnit:
         """The device on a wire of the plant's kind, whatever carries that wire now."""
         profile = self.prototype.devices[config.name].profile
-        return EmulatedUnit(bank, profile, self._kind(config), context, unit_limits(profile), config.name)
+        limits, parts = unit_limits(profile), parts_of(profile)
+        return EmulatedUnit(bank, profile, self._kind(config), context, limits, config.name, parts)
 
     def _canopen_node(self, config: DeviceConfig) -> CanopenNode:
         emulated = self.prototype.devices[config.name]

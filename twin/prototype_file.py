@@ -10,7 +10,7 @@ from emulators.replay.can_log import SUFFIX
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.yaml_file import YamlFile, load, validate
+from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.data_files import find, find_recording
 from twin.system import System
 from twin.system_schema import EmulatedForm, PrototypeForm
@@ -138,10 +138,10 @@ def _device(file: YamlFile, system: System, name: str, form: EmulatedForm) -> Em
         raise file.error(
             loc, f"the mailbox model for {name!r}", expected="a profile with a mailbox, and `far: ENDPOINT`"
         )
-    if form.model == "profile" and profile.protocol != "canopen":
-        raise file.error(
-            (*loc, "model"), f"no model of a device profile for {name!r}", expected="a CANopen node, or a recording"
-        )
+    if form.model == "profile" and (profile.sampled is not None or profile.inbox is not None):
+        expected = "`recording: FILE`, of its signals" if profile.sampled is not None else "`model: mailbox`"
+        raise file.error((*loc, "model"), f"{name!r} does more than its registers say", expected=expected)
+    _check_stated(file, loc, form, profile)
     recording = None
     if form.recording is not None:
         try:
@@ -156,6 +156,19 @@ def _device(file: YamlFile, system: System, name: str, form: EmulatedForm) -> Em
         if tag not in profile.tags:
             raise FileInvalid(f"{profile.name} has no tag {tag!r}", path=file.path, expected=", ".join(profile.tags))
     return EmulatedDevice(name, profile, form, recording)
+
+
+def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, profile: DeviceProfile) -> None:
+    """What is said of being busy is said of a Modbus device, and what of registers, of one without a recording."""
+    if form.busy is not None and profile.protocol != "modbus":
+        raise file.error((*loc, "busy"), "nothing of this protocol", expected="a Modbus device")
+    if form.values and (form.model != "profile" or profile.protocol != "modbus"):
+        raise file.error((*loc, "values"), "values of registers", expected="`model: profile`, of a Modbus device")
+    for tag in form.values:
+        if tag not in profile.tags:
+            raise file.error(
+                (*loc, "values", tag), f"{profile.name} has no tag {tag!r}", expected=", ".join(profile.tags)
+            )
 
 
 def file_path(file: YamlFile) -> Path:

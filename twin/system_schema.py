@@ -256,6 +256,13 @@ class FarLinkForm(Strict):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
+class BusyForm(Strict):
+    """Behind every so many requests that it took, a Modbus device answers with exception 06 for so long."""
+
+    every: int = Field(ge=1)
+    for_ms: Milliseconds
+
+
 class EmulatedForm(Strict):
     """What stands in for a device: a recording (time-keyed signals), or a model."""
 
@@ -266,6 +273,10 @@ class EmulatedForm(Strict):
     at_end: Literal["hold", "loop", "error"] = "hold"
     latency_ms: float = Field(default=0.0, ge=0, le=60_000)
     identity: dict[Name, str] = {}
+    values: dict[Name, int | float | str] = Field(
+        default={}, description="model profile, Modbus: tag -> what it holds at first"
+    )
+    busy: BusyForm | None = None
     far: str | None = Field(default=None, description="where the far modem listens")
     far_link: FarLinkForm = FarLinkForm()
 

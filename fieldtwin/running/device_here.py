@@ -22,6 +22,7 @@ from emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit
 from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
+from emulators.models.register_device import StatedRegisters, add_own_functions
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.recorded_device import load_replay
 from emulators.replay.can_log import SUFFIX, CanLog
@@ -29,6 +30,7 @@ from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.unit import ReplayUnit
 from emulators.signals import SignalPlayer, SignalTrack
+from emulators.stated import parts_of
 from fieldtwin.cli.talk import talk
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.until_stopped import until_stopped
@@ -102,7 +104,14 @@ class DeviceHost:
         return ModbusUnit(bank, unit_limits(profile), name=profile.name)
 
     def _recorded(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
-        """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name."""
+        """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name.
+        Without either, its profile is all there is of it."""
+        if recording is None and self._recording_of(profile) is None:
+            bank = StatedRegisters(profile, {}, self._clock.monotonic_ns())
+            unit = ModbusUnit(bank, unit_limits(profile), name=profile.name, **parts_of(profile))
+            add_own_functions(unit, bank, profile)
+            talk.print(f"{profile.name}: nothing recorded; every register of its profile begins with 0", soft_wrap=True)
+            return unit
         replay, recorded = load_replay(profile, find_recording(str(recording or f"{Path(profile.path).stem}.jsonl")))
         return ProfiledReplay(profile, replay, recorded)
 

@@ -4,8 +4,9 @@
     benchmarks/plc_scan.py [--runs 5] [--quick]
 
 In one thread, back to back: execution time without waking up, with warm caches. Once every 10 ms the same scan takes several
-times as long, on a computer that does anything else meanwhile; that is shown beside it, and what `plc status` shows. The peer for each figure is a plain Python loop that copies as
-many numbers from one list to another, in the same run: what no interpreter could do without. Exit status 1 when a goal is missed.
+times as long, on a computer that does anything else meanwhile; that is shown beside it, and is what `plc status` shows.
+The peer for each figure is a plain Python loop that copies as many numbers from one list to another, in the same run: what no
+interpreter could do without. Exit status 1 when a goal is missed.
 """
 
 from __future__ import annotations

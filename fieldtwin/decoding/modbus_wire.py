@@ -6,13 +6,14 @@ transaction id. What answers nothing is a stray. No clock: times come with the c
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from fieldtwin.decoding.exchange import Exchange, Span
 from fieldtwin.decoding.modbus_frames import Expected, Frame, splitter
 from fieldtwin.decoding.modbus_pdu import Asked, parse_reply, parse_request, words
-from fieldtwin.decoding.tags import TagMap
+from fieldtwin.decoding.tags import SECRET, TagMap
 from gateway.core.values import Scalar
 
 MAX_OPEN = 64
@@ -51,6 +52,8 @@ class ModbusWire:
         self._echo_due = b""
         self._served = served
         self._open: dict[int, _Open] = {}  # by transaction id; on a line there is one, with id -1
+        self._given_up: deque[int] = deque(maxlen=MAX_OPEN)
+        self._cut_off = False
 
     def feed(self, sent: bool, data: bytes, t_ns: int) -> tuple[list[str], list[Exchange]]:
         """A chunk, in the order of the trace. Each text describes a frame, or what there is of one."""
@@ -94,6 +97,7 @@ class ModbusWire:
             return f"{text}, to all"
         if (replaced := self._open.pop(frame.transaction, None)) is not None:
             done.append(self._unanswered(replaced))
+        self._cut_off = self._replies.pending > 0  # it may go on, or its connection was lost and this is another one
         if len(self._open) >= MAX_OPEN:
             done.append(self._unanswered(self._open.pop(next(iter(self._open)))))
         self._open[frame.transaction] = opened
@@ -129,12 +133,18 @@ class ModbusWire:
             else:
                 self._echo_due = b""
                 texts.append("the echo differs from what was sent: a collision")
-        if self._datagrams:
-            self._replies.flush()
+        if self._datagrams or (self._cut_off and self._begins_a_reply(data)):
+            self._judge(self._replies.flush(), texts, done)
+        self._cut_off = False
         self._judge(self._replies.feed(data, t_ns, self._expected()), texts, done)
         if not texts:
             texts = [f"{_bytes(self._replies.pending)} of a reply"]
         return texts, done
+
+    def _begins_a_reply(self, data: bytes) -> bool:
+        """Whether what came is the beginning of an answer that is awaited, though another one is unfinished (MBAP)."""
+        opened = self._open.get(int.from_bytes(data[:2])) if len(data) >= 7 else None
+        return opened is not None and data[2:4] == b"\0\0" and data[6] == opened.frame.unit
 
     def _expected(self) -> Expected | None:
         opened = self._open.get(-1)
@@ -154,18 +164,28 @@ class ModbusWire:
                 texts.append(self._stray(frame, done))
                 continue
             del self._open[frame.transaction]
+            if not self._serial and not self._served:
+                done += self._older(opened)
             if frame.bad:
                 done.append(self._exchange(opened, frame, frame.bad, "damaged: the check sum is wrong"))
             else:
                 done.append(self._answered(opened, frame))
             texts.append(f"{opened.device or f'unit {frame.unit}'}: {done[-1].reply_text}")
 
+    def _older(self, answered: _Open) -> list[Exchange]:
+        """What was asked before: we ask one thing at a time, so that it was given up."""
+        older = [t for t, o in self._open.items() if o.frame.t_ns <= answered.frame.t_ns]
+        self._given_up.extend(older)
+        return [self._unanswered(self._open.pop(t)) for t in older]
+
     def _stray(self, frame: Frame, done: list[Exchange]) -> str:
         if frame.bad:
             return f"{_bytes(len(frame.raw))} of noise ({frame.bad})"
         unit = self._units.get(frame.unit)
         name = unit.name if unit else ""
-        text = f"{name or f'unit {frame.unit}'}: a frame that answers nothing"
+        late = frame.transaction in self._given_up
+        why = "an answer that comes too late" if late else "a frame that answers nothing"
+        text = f"{name or f'unit {frame.unit}'}: {why}"
         done.append(
             Exchange(
                 frame.t_ns, frame.t_ns, self.bus, name, frame.unit, frame.pdu[0] & 0x7F if frame.pdu else 0, "stray",
@@ -240,7 +260,7 @@ def _shown(tags: TagMap | None, span: Span, found: dict[str, Scalar | None], reg
     if tags is not None and found:
         return tags.show(found)
     if tags is not None and tags.secret(span):
-        return "(secret)"
+        return SECRET
     most = 8
     numbers = " ".join(str(r) if span.table in ("coil", "discrete") else f"{r:04X}" for r in registers[:most])
     return numbers + (f" ... ({len(registers)})" if len(registers) > most else "")

@@ -13,6 +13,9 @@ from gateway.core.profile import Box, DeviceProfile, Tag
 from gateway.core.values import Scalar, TagValue
 from gateway.devices.codec import apply_scale, decode, decode_little
 
+SECRET = "(secret)"
+"""What is shown of a tag that nobody is to see."""
+
 _KEPT_PLANS = 1024
 """Different spans of a device whose tags are remembered: a scan of all addresses may not fill the memory."""
 
@@ -34,6 +37,7 @@ class TagMap:
         self.by_object = {t.object: t for t in profile.tags.values() if t.object is not None}
         self._plans: dict[Span, _Plan] = {}
         self._exponents: dict[str, TagValue] = {}
+        self._secrets = [t for t in profile.tags.values() if t.secret]
         self._scales = {t.scale_by for t in profile.tags.values() if t.scale_by}
 
     def names(self, span: Span) -> list[str]:
@@ -45,8 +49,12 @@ class TagMap:
         return [t.name for t, *_ in plan.tags] + [n for n, *_ in plan.blocks] + [b.name for b, _ in plan.boxes]
 
     def secret(self, span: Span) -> bool:
-        """Whether anything in `span` is nobody's business."""
-        return any(tag.secret for tag, *_ in self._plan(span).tags)
+        """Whether any part of `span` is nobody's business."""
+        return any(
+            tag.secret and tag.at and tag.at.table == span.table
+            and tag.at.address < span.address + span.count and span.address < tag.at.end
+            for tag in self._secrets
+        )  # fmt: skip
 
     def of_registers(self, span: Span, data: bytes, t_ns: int) -> dict[str, Scalar | None]:
         """Values by name from the register bytes of `span`, as on the wire; bits as one byte each (0 or 1).
@@ -79,7 +87,7 @@ class TagMap:
         if tag is None:  # a message or a mailbox's payload, in hex
             return str(value) if value not in (None, "") else "empty"
         if tag.secret:
-            return "(secret)"
+            return SECRET
         word = dict(tag.values).get(value) if isinstance(value, int) else None
         return f"{show_value(value)} {tag.unit}".rstrip() + (f" ({word})" if word else "")
 

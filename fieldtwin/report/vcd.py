@@ -3,7 +3,7 @@
 One scope a device and bus, one for what programs say (``plc``), one for faults. Numbers are ``real``, what is true or false
 a ``wire``, words (states, decoded frames) a ``reg`` of ASCII characters, to be shown as such. A tag has its quality beside it
 (0 good, 1 substituted, 2 simulated, 3 uncertain, 4 bad); without a value its number stays what it was, and the quality says
-that it does not count.
+that it does not count. Secret tags are left out.
 """
 
 from __future__ import annotations
@@ -147,12 +147,14 @@ def _declare(file: TextIO, signals: _Signals, comment: str) -> None:
 
 def _changes(events: Iterable[Event], system: System | None, machines: dict[str, Machine]) -> Iterator[Change]:
     decoder = Decoder(system) if system is not None else None
+    devices = system.devices.values() if system is not None else ()
+    secrets = {f"{d.name}.{t.name}" for d in devices for t in d.profile.tags.values() if t.secret}
     for event in events:
         data, t_ns = event.data, max(0, event.t_ns)
         match event.kind:
             case Kind.TAG:
                 scope, _, name = event.where.partition(".")
-                if data.get("value") is not None:
+                if data.get("value") is not None and event.where not in secrets:
                     yield t_ns, scope, name or "value", data["value"], 0
                 yield t_ns, scope, f"{name}_quality", _QUALITIES.get(data.get("quality", ""), 4), _QUALITY_BITS
             case Kind.STATE:

@@ -13,6 +13,7 @@ from typing import Any
 
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.decoding.tags import SECRET
 from fieldtwin.report.coverage import Collector
 from fieldtwin.report.model import CheckResult, Counts, Machine, ScenarioResult
 from fieldtwin.scenarios.trace import Event, Kind
@@ -113,6 +114,9 @@ class Study:
         self._collector = Collector(system, machines)
         self._machines = {m.variable: m for m in machines}
         self._scenario = scenario
+        self._secrets = {
+            f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values() if t.secret
+        }
         self._now: dict[Kind, dict[str, Step]] = {Kind.TAG: {}, Kind.STATE: {}}
         self._on: dict[str, FaultBar] = {}
         self._off: list[FaultBar] = []
@@ -158,7 +162,9 @@ class Study:
             if inside:
                 decoded = self._decoder.decode(event)
                 done = decoded.exchanges
-                line = FrameLine(event.t_ns, event.where, data.get("dir") == "sent", _raw(event), decoded.text)
+                line = FrameLine(
+                    event.t_ns, event.where, data.get("dir") == "sent", _raw(event, decoded.text), decoded.text
+                )
                 for window in inside:
                     _keep(window, line)
             else:
@@ -183,6 +189,8 @@ class Study:
     def _changed(self, event: Event, inside: list[Window]) -> None:
         data, name, value = event.data, event.where, event.data.get("value")
         machine = self._machines.get(name)
+        if event.kind is Kind.TAG and name in self._secrets:
+            value = SECRET
         step = Step(
             event.t_ns, machine.name_of(value) if machine else value, data.get("quality", ""), data.get("reason", "")
         )
@@ -239,8 +247,10 @@ def _keep(window: Window, line: FrameLine) -> None:
         window.after.append(line)
 
 
-def _raw(event: Event) -> str:
-    """The bytes as they are written: a CAN identifier before them."""
+def _raw(event: Event, text: str) -> str:
+    """The bytes as they are written, a CAN identifier before them; nothing of a frame whose words hide something."""
     data = event.data
+    if SECRET in text:
+        return SECRET
     raw = " ".join(data.get("bytes", "")[i : i + 2] for i in range(0, len(data.get("bytes", "")), 2))
     return f"{data['id']:03X} # {raw}" if isinstance(data.get("id"), int) else raw

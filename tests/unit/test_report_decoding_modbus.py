@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -16,8 +17,11 @@ from fieldtwin.decoding.modbus_pdu import parse_request
 from fieldtwin.decoding.modbus_wire import ModbusWire, Unit
 from fieldtwin.decoding.tags import TagMap
 from fieldtwin.scenarios.trace import Event
+from gateway.core.profile import load_profile
 from gateway.protocols.modbus.ascii import lrc
 from gateway.protocols.modbus.crc import with_crc
+
+METER = Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml"
 
 
 def only(events: list[Event]) -> Exchange:
@@ -238,3 +242,48 @@ def test_any_bytes_are_described_and_none_is_lost(framing: str, chunks: list[tup
     frames = [f for t_ns, (_, data) in enumerate(chunks) for f in one.feed(data, t_ns)]
     assert b"".join(f.raw for f in frames + one.flush()) == b"".join(data for _, data in chunks)
     assert [f.t_ns for f in frames] == sorted(f.t_ns for f in frames)
+
+
+def test_on_tcp_an_answer_ends_what_was_asked_before() -> None:
+    """One request at a time: the next one's answer says that the first was given up, and its own comes too late."""
+    events = [chunk(0, True, adu(1, "03 0022 0001"), "lan"), chunk(50, True, adu(2, "03 0022 0001"), "lan")]
+    decoder = Decoder(observatory())
+    assert [decoder.feed(e) for e in events] == [[], []]
+    first, second = decoder.feed(chunk(60, False, adu(2, "03 02 0008"), "lan"))
+    assert (first.t_ns, first.problem) == (0, "no reply")
+    assert (second.t_ns, second.ok) == (50 * MS, True)
+    late = decoder.decode(chunk(70, False, adu(1, "03 02 0009"), "lan"))
+    assert late.text == "modem: an answer that comes too late"
+    assert [e.problem for e in late.exchanges] == ["stray"]
+    assert decoder.finish() == []
+
+
+@pytest.mark.parametrize("cut", [3, 8, 10])
+def test_a_connection_that_is_lost_inside_an_answer(cut: int) -> None:
+    """The next connection begins with a frame of its own, whatever the last one still owed."""
+    answer_1, answer_2 = adu(1, "03 02 0009"), adu(1, "03 02 0008")
+    found = exchanges(
+        observatory(),
+        [chunk(0, True, adu(1, "03 0022 0001"), "lan"), chunk(5, False, answer_1[:cut], "lan"),
+         chunk(900, True, adu(1, "03 0022 0001"), "lan"), chunk(903, False, answer_2, "lan")],
+    )  # fmt: skip
+    assert [(e.problem, e.tags["inbox_ack"]) for e in found] == [("no reply", None), ("", "0008")]
+
+
+def test_an_answer_in_pieces_over_the_next_request_is_whole() -> None:
+    """No connection was lost: the rest of the first answer comes when the second request is out."""
+    raw = adu(1, "03 02 0009")
+    found = exchanges(
+        observatory(),
+        [chunk(0, True, adu(1, "03 0022 0001"), "lan"), chunk(5, False, raw[:4], "lan"),
+         chunk(6, True, adu(2, "03 0022 0001"), "lan"), chunk(7, False, raw[4:] + adu(2, "03 02 0008"), "lan")],
+    )  # fmt: skip
+    assert [e.tags["inbox_ack"] for e in found] == ["0009", "0008"]
+
+
+def test_secrets_have_no_value_in_words() -> None:
+    wire = ModbusWire("line1", "rtu", {1: Unit("meter", TagMap(load_profile(METER)))})
+    words = wire.feed(True, with_crc(bytes.fromhex("01 10 000E 0002 04 447A0000")), 0)[0]
+    assert words == ["meter: write registers 40015 (holding:14) x 2: password (secret)"]
+    wire.feed(True, with_crc(bytes.fromhex("01 03 000F 0001")), 1)
+    assert wire.feed(False, with_crc(bytes.fromhex("01 03 02 0000")), 2)[0] == ["meter: (secret)"]  # half of it

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from report_rig import MS, can, note, observatory, run_trace
+from report_rig import MS, answer, ask, can, note, observatory, run_trace
 
 from fieldtwin.report.coverage import Collector, devices_covered
 from fieldtwin.report.html import BUDGET, render_html, write_html
@@ -20,6 +20,8 @@ from fieldtwin.report.requirements import requirement_verdicts
 from fieldtwin.report.window import LONGEST_NS, MOST_EXCHANGES, MOST_FRAMES, MOST_STEPS, Study
 from fieldtwin.scenarios.trace import Event, Kind
 from gateway.core.errors import FileInvalid
+from gateway.core.profile import load_profile
+from gateway.devices.config import DeviceConfig
 
 EVIL = "<script>alert(1)</script>\" onload='x' & \u202e\x00"
 TRACE = run_trace(20)
@@ -274,3 +276,14 @@ def test_a_tag_that_was_never_published_has_a_lane_that_says_so() -> None:
     check = replace(FAILED, names=("ctd.conductivity", "ctd.pressure"))
     said = page(report(scenario(checks=(check,)))).said
     assert "ctd.conductivity never published" in said.replace("ctd.conductivity ctd.conductivity", "ctd.conductivity")
+
+
+def test_secrets_are_not_in_the_page() -> None:
+    profile = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml")
+    system = replace(observatory(), devices={"meter": DeviceConfig("meter", profile, "line1", 1)})
+    events = [ask(13_000, "10 000E 0002 04 447A0000"), answer(13_050, "10 000E 0002")]
+    events.append(note(13_060, Kind.TAG, "meter.password", value=1000.5, quality="good", reason="none"))
+    html = render_html(report(scenario(trace=events), system=system))
+    assert "password (secret)" in html
+    assert "1000.5" not in html
+    assert "44 7a" not in html.lower()

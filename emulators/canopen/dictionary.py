@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field, replace
+from pathlib import Path, PureWindowsPath
 
 from emulators.canopen import codec
 from emulators.canopen.compact_pdo import implied_pdos
@@ -75,11 +75,12 @@ def load_eds(path: str | Path) -> Dictionary:
     except OSError as e:
         raise FileInvalid("the data sheet cannot be read", path=str(path), got=e.strerror or str(e)) from e
     notes: list[Note] = []
-    return parse_eds(decode_file(raw, notes), str(path), notes)
+    return parse_eds(decode_file(raw, notes), str(path), notes, Path(path).parent)
 
 
-def parse_eds(text: str, path: str = "", notes: list[Note] | None = None) -> Dictionary:
-    """The dictionary in the text of an EDS or DCF. `path` is for messages, `notes` are known already. Raises `FileInvalid`."""
+def parse_eds(text: str, path: str = "", notes: list[Note] | None = None, folder: Path | None = None) -> Dictionary:
+    """The dictionary in the text of an EDS or DCF. `path` is for messages, `notes` are known already; what a DOMAIN's
+    DownloadFile names is looked for in `folder`. Raises `FileInvalid`."""
     notes = [] if notes is None else notes
     sections = parse_sections(text, path, notes)
     objects: dict[int, DictionaryObject] = {}
@@ -90,6 +91,7 @@ def parse_eds(text: str, path: str = "", notes: list[Note] | None = None) -> Dic
             if found is not None:
                 objects[found.index] = found
     _read_subobjects(sections, objects)
+    _fill_domains(sections, objects, folder)
     if not objects:
         raise FileInvalid("a data sheet without objects", path=path, expected="sections such as [1000]")
     info = sections.get("deviceinfo", Section("DeviceInfo", 0, path, notes=notes))
@@ -150,6 +152,26 @@ def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObje
             own.note(f"SubNumber of [{own.name}] is {told}, {len(found.entries)} are described", "SubNumber")
 
 
+def _fill_domains(sections: dict[str, Section], objects: dict[int, DictionaryObject], folder: Path | None) -> None:
+    """A DOMAIN holds what a DCF would download to it (CiA 306, 4.7.3). A file that is not there is no reason to refuse: noted."""
+    for found in objects.values():
+        for sub, entry in found.entries.items():
+            section = sections.get(f"{found.index:04x}sub{sub:x}") or sections.get(f"{found.index:04x}")
+            if section is None or entry.data_type != codec.DOMAIN:
+                continue
+            if section.text("UploadFile"):
+                section.note(f"UploadFile of [{section.name}]: nothing is stored there", "UploadFile")
+            name = section.text("DownloadFile")
+            if not name:
+                continue
+            try:
+                if folder is None:
+                    raise FileNotFoundError
+                found.entries[sub] = replace(entry, default=(folder / PureWindowsPath(name).name).read_bytes())
+            except OSError:
+                section.note(f"DownloadFile of [{section.name}] cannot be read, the object is empty", "DownloadFile")
+
+
 def _read_dummies(section: Section | None) -> frozenset[int]:
     if section is None:
         return frozenset()
@@ -173,6 +195,10 @@ def _read_object(index: int, section: Section, sections: dict[str, Section]) -> 
         entries[0] = Entry(index, 0, "Highest subindex supported", 0x05, "ro", False, bytes([count]))
         names = sections.get(f"{index:04x}name")
         values = sections.get(f"{index:04x}value")
+        for listed in (names, values):
+            for key in listed.values if listed else ():
+                if listed and key != "nrofentries" and not (key.isdecimal() and 1 <= int(key) <= count):
+                    listed.note(f"entry {key} of [{listed.name}] is left out, there are {count}", key)
         for sub in range(1, count + 1):
             label = names.text(str(sub), f"{name}{sub}") if names else f"{name}{sub}"
             text = values.text(str(sub)) if values else ""

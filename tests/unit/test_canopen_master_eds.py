@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.protocols.canopen.concise_dcf import settings_of
 from gateway.protocols.canopen.datatypes import DataType
 from gateway.protocols.canopen.dictionary import DictionaryEntry, load_dictionary, parse_dictionary
 
@@ -143,6 +144,45 @@ def test_harmless_ways_of_writing(old: str, new: str, tmp_path: Path) -> None:
     path = tmp_path / "probe.eds"
     path.write_bytes(text.encode())
     assert load_dictionary(path, 5).entries == parse_dictionary(EDS, 5).entries
+
+
+COMPACT = EDS + (
+    "[3000]\nParameterName=Valve\nObjectType=0x8\nCompactSubObj=5\nDataType=0x6\nAccessType=rw\nDefaultValue=4\n"
+    "[3000Value]\nNrOfEntries=2\n1=0x1234\n4=99\n"
+    "[3000Name]\nNrOfEntries=1\n4=Big valve\n"
+    "[3000Denotation]\nNrOfEntries=1\n4=the one aft\n"
+)
+
+
+def test_a_dcf_sets_entries_of_compact_arrays() -> None:
+    od = parse_dictionary(COMPACT)
+    assert [(e.subindex, e.name, e.default) for e in od if e.index == 0x3000 and e.configured] == [
+        (1, "Valve.Valve1", 0x1234),
+        (4, "Valve.Big valve", 99),
+    ]
+    assert [e.default for e in od if e.index == 0x3000] == [5, 0x1234, 4, 4, 99, 4]
+    assert [str(setting) for setting in settings_of(od)] == ["3000h:01 = 34 12", "3000h:04 = 63 00"]
+    with pytest.raises(FileInvalid, match=r"x\.dcf:\d+: \[3000Value\] 6: no such entry; expected 1 to 5"):
+        parse_dictionary(COMPACT.replace("4=99", "6=99"), path="x.dcf")
+    with pytest.raises(FileInvalid, match=r"ParameterValue .*Valve1"):
+        settings_of(parse_dictionary(COMPACT.replace("0x1234", "0x12345")))
+    assert "no compact array" in parse_dictionary(COMPACT.replace("CompactSubObj=5\n", "")).mended[0]
+
+
+def test_a_domain_is_set_to_the_file_that_a_dcf_names(tmp_path: Path) -> None:
+    domain = (
+        "[5000]\nParameterName=Table\nObjectType=0x2\nDataType=0xF\nAccessType=rw\n"
+        "UploadFile=was.bin\nDownloadFile=C:\\job\\table.bin\n"
+    )
+    path = tmp_path / "unit.dcf"
+    path.write_text(EDS + domain, encoding="ascii")
+    with pytest.raises(FileInvalid, match=r"unit\.dcf:64: \[5000\] DownloadFile: cannot be read"):
+        load_dictionary(path)
+    (tmp_path / "table.bin").write_bytes(bytes(range(9)))
+    od = load_dictionary(path)
+    assert [(s.index, s.data) for s in settings_of(od)] == [(0x5000, bytes(range(9)))]
+    assert od.mended == ("[5000] UploadFile: nothing is stored there",)
+    assert not settings_of(parse_dictionary(EDS + domain)), "of a text, no files are read"
 
 
 def test_compact_arrays_have_all_their_entries() -> None:

@@ -98,6 +98,28 @@ def test_compact_array_names_and_values() -> None:
     assert [e.name for e in entries.values()][1:] == ["Sample1", "Special", "Sample3"]
 
 
+def test_entries_beyond_a_compact_array_are_noted() -> None:
+    text = "[2100]\nObjectType=8\nDataType=3\nCompactSubObj=3\n[2100Value]\nNrOfEntries=1\n4=1\n"
+    dictionary = parse_eds(text + "[2100Denotation]\nNrOfEntries=1\n1=aft\n")
+    assert [str(note) for note in dictionary.notes] == ["line 7: entry 4 of [2100Value] is left out, there are 3"]
+
+
+def test_a_domain_holds_the_file_that_a_dcf_names(tmp_path: Path) -> None:
+    path = tmp_path / "unit.dcf"
+    path.write_text(
+        "[2100]\nObjectType=2\nDataType=15\nAccessType=rw\nUploadFile=was.bin\nDownloadFile=C:\\job\\table.bin\n"
+    )
+    dictionary = load_eds(path)
+    assert [str(note) for note in dictionary.notes] == [
+        "line 5: UploadFile of [2100]: nothing is stored there",
+        "line 6: DownloadFile of [2100] cannot be read, the object is empty",
+    ]
+    (tmp_path / "table.bin").write_bytes(bytes(range(9)))
+    entry = load_eds(path).entry(0x2100, 0)
+    assert entry is not None
+    assert entry.default == bytes(range(9))
+
+
 def test_a_dcf_s_parameter_values_and_node_id() -> None:
     text = "[DeviceComissioning]\nNodeID=0x10\n" + var("1017", 6, "rw", 0) + "ParameterValue=500\n"
     dictionary = parse_eds(text)

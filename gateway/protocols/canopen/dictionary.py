@@ -12,7 +12,7 @@ import difflib
 import io
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from types import MappingProxyType
 
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable
@@ -22,7 +22,7 @@ from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.values import Scalar
 from gateway.protocols.canopen.cob_id import check_node
 from gateway.protocols.canopen.datatypes import DataType
-from gateway.protocols.canopen.eds_text import EdsText, decode_eds, read_eds_text
+from gateway.protocols.canopen.eds_text import EdsText, decode_eds, invalid, read_eds_text
 
 _TYPE_AREA = range(0x1000)
 """Indices that define data types (7.4.1): no objects of the device."""
@@ -98,19 +98,28 @@ class ObjectDictionary:
 
 
 def load_dictionary(path: Path, node_id: int | None = None) -> ObjectDictionary:
-    """Read an EDS or DCF file. Raises `FileInvalid` with file, line, section and key."""
+    """Read an EDS or DCF file. Raises `FileInvalid` with file, line, section and key.
+
+    A DOMAIN's DownloadFile (CiA 306, 4.7.3) is read from the file's own folder: its bytes are what the DCF sets.
+    """
     try:
         raw = path.read_bytes()
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     text, assumed = decode_eds(raw, str(path))
-    return parse_dictionary(text, node_id, path=str(path), mended=assumed)
+    return parse_dictionary(text, node_id, path=str(path), mended=assumed, folder=path.parent)
 
 
 def parse_dictionary(
-    text: str, node_id: int | None = None, *, path: str = "", mended: tuple[str, ...] = ()
+    text: str,
+    node_id: int | None = None,
+    *,
+    path: str = "",
+    mended: tuple[str, ...] = (),
+    folder: Path | None = None,
 ) -> ObjectDictionary:
-    """Read the text of an EDS or DCF. `node_id` fills in $NODEID; without it the DCF's own, if it has one."""
+    """Read the text of an EDS or DCF. `node_id` fills in $NODEID; without it the DCF's own, if it has one. Files that it
+    names are looked for in `folder`; None: they are not read."""
     if node_id is not None:
         check_node(node_id)
     eds = read_eds_text(text, path)
@@ -118,9 +127,12 @@ def parse_dictionary(
         theirs = import_eds(io.StringIO(str(eds)), node_id)  # type: ignore[no-untyped-call]
     except (configparser.Error, ValueError, KeyError, OverflowError) as e:
         raise FileInvalid(f"not an EDS that can be used: {e}", path=path) from e
+    entries = _entries(theirs.values(), eds)
+    if folder is not None:
+        entries.update(_downloads(entries, eds, folder, path))
     information = theirs.device_information
     return ObjectDictionary(
-        MappingProxyType(_entries(theirs.values(), eds)),
+        MappingProxyType(entries),
         vendor_name=information.vendor_name or "",
         vendor_number=information.vendor_number,
         product_name=information.product_name or "",
@@ -149,6 +161,26 @@ def _entries(
             members = _expand(item, members, compact)
         entries.update({(entry.index, entry.subindex): entry for entry in members})
     return dict(sorted(entries.items()))
+
+
+def _downloads(
+    entries: Mapping[tuple[int, int], DictionaryEntry], eds: EdsText, folder: Path, path: str
+) -> dict[tuple[int, int], DictionaryEntry]:
+    """The DOMAINs that name a DownloadFile, set to its content."""
+    found: dict[tuple[int, int], DictionaryEntry] = {}
+    for key, entry in entries.items():
+        index, sub = f"{entry.index:04X}", f"{entry.index:04X}sub{entry.subindex:X}"
+        section = eds.sections.get(sub) or eds.sections[index]
+        name = section.values.get("DownloadFile", "")
+        if not name or entry.type_code != DataType.DOMAIN:
+            continue
+        try:
+            raw = (folder / PureWindowsPath(name).name).read_bytes()
+        except OSError as e:
+            problem = f"cannot be read: {e.strerror or e}"
+            raise invalid(problem, section, "DownloadFile", path, expected="a file beside this one", got=name) from e
+        found[key] = replace(entry, default=raw, configured=True)
+    return found
 
 
 def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[DictionaryEntry]:

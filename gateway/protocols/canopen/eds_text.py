@@ -15,7 +15,7 @@ from gateway.core.errors import FileInvalid
 MAX_BYTES = 16 * 1024 * 1024
 """No EDS comes near; whatever does is another kind of file."""
 
-_OBJECT = re.compile(r"^([0-9A-F]{4})(?:(SUB)([0-9A-F]{1,2})|(NAME))?$", re.IGNORECASE)
+_OBJECT = re.compile(r"^([0-9A-F]{4})(?:(SUB)([0-9A-F]{1,2})|(NAME|VALUE|DENOTATION))?$", re.IGNORECASE)
 _TYPE_OF_A_TOOL = re.compile(r"^[0-9A-F]{2,3}sub1$")
 """Where CANFestival's editor says of which basic type a type of its own is; `canopen` looks there."""
 _COMMENT = re.compile(r"\s;.*$")
@@ -23,7 +23,7 @@ _OCTAL = re.compile(r"^0[0-7]+$")
 _NUMBER = re.compile(r"^(0x[0-9a-f]+|[0-9]+)$", re.IGNORECASE)
 
 _TEXT_KEYS = ("ParameterName", "AccessType", "DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
-_MORE_TEXT_KEYS = ("Factor", "Description", "Unit", "StorageLocation")
+_MORE_TEXT_KEYS = ("Factor", "Description", "Unit", "StorageLocation", "DownloadFile")
 _NUMBER_KEYS = {"ObjectType": "0x7", "DataType": "", "PDOMapping": "0", "CompactSubObj": "0", "NrOfEntries": "0"}
 """Keys that hold a number, and what an empty one stands for (CiA 306, 4.6.3.2); nothing for those that must be there."""
 
@@ -32,7 +32,15 @@ _DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO
 _COMMISSIONING_NUMBERS = ("NodeID", "Baudrate")
 _CANONICAL = {
     key.lower(): key
-    for key in (*_TEXT_KEYS, *_MORE_TEXT_KEYS, *_NUMBER_KEYS, *_DEVICE_TEXT, *_DEVICE_NUMBERS, *_COMMISSIONING_NUMBERS)
+    for key in (
+        "UploadFile",
+        *_TEXT_KEYS,
+        *_MORE_TEXT_KEYS,
+        *_NUMBER_KEYS,
+        *_DEVICE_TEXT,
+        *_DEVICE_NUMBERS,
+        *_COMMISSIONING_NUMBERS,
+    )
 }
 
 
@@ -84,7 +92,7 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
         kept[name] = _mend_information(section, allowed, path, mended)
     for name in (n for n in sections if _TYPE_OF_A_TOOL.match(n) and sections[n].values.get("DefaultValue")):
         kept[name] = sections[name]
-    for name in sorted((n for n in sections if _OBJECT.match(n)), key=_order):
+    for name in sorted((n for n in sections if _OBJECT.match(n) and not n.endswith("Denotation")), key=_order):
         parent = sections.get(name[:4])
         if parent is None:
             mended.append(f"[{name}]: left out, there is no [{name[:4]}]")
@@ -92,6 +100,8 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
             mended.append(f"[{name}]: left out, [{parent.name}] is a single variable")
         elif name.endswith("Name"):
             _mend_names(sections[name], parent, kept, path, mended)
+        elif name.endswith("Value"):
+            _spell_out(sections[name], parent, kept, path, mended)
         else:
             kept[name] = _mend_object(sections[name], path, mended)
     return EdsText(kept, tuple(mended))
@@ -108,9 +118,9 @@ def _commissioning() -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _order(name: str) -> tuple[int, int, int]:
-    """Objects, then their sub-objects, then their names."""
-    index, sub = int(name[:4], 16), name[7:]
-    return index, name.endswith("Name"), -1 if len(name) == 4 or name.endswith("Name") else int(sub, 16)
+    """Objects, then their sub-objects, then their names, then their values."""
+    rank = {"Name": 1, "Value": 2}.get(name[4:], 0)
+    return int(name[:4], 16), rank, -1 if rank or len(name) == 4 else int(name[7:], 16)
 
 
 def _canonical_section(name: str) -> str:
@@ -121,7 +131,7 @@ def _canonical_section(name: str) -> str:
         return known.get(name.lower(), name)
     index = match[1].upper()
     if match[4]:
-        return f"{index}Name"
+        return index + match[4].capitalize()
     return f"{index}sub{int(match[3], 16):X}" if match[2] else index
 
 
@@ -205,6 +215,8 @@ def _mend_object(section: Section, path: str, mended: list[str]) -> Section:
             kept.values[key] = _number(section, key, _NUMBER_KEYS[key], path, mended)
         elif key in _TEXT_KEYS or key in _MORE_TEXT_KEYS:
             kept.values[key] = value
+        elif key == "UploadFile" and value:
+            mended.append(f"[{section.name}] UploadFile: nothing is stored there")
     if not int(kept.values.get("CompactSubObj", "0"), 0):
         kept.values.pop("CompactSubObj", None)  # `canopen` takes its mere presence for a compact array
     required = ("ParameterName", "DataType", "AccessType") if _is_variable(kept, path) else ("ParameterName",)
@@ -221,6 +233,27 @@ def _is_variable(section: Section, path: str) -> bool:
     kind = int(_number(section, "ObjectType", "0x7", path, []), 0)
     compact = int(_number(section, "CompactSubObj", "0", path, []) if "CompactSubObj" in section.values else "0", 0)
     return kind in (0x2, 0x7) or "sub" in section.name or bool(compact)
+
+
+def _spell_out(values: Section, parent: Section, kept: dict[str, Section], path: str, mended: list[str]) -> None:
+    """[xxxxValue] holds what a DCF sets in a compact array (CiA 306, 4.7.3): all its entries become sub-objects of their own,
+    since the reader of the text knows no such section."""
+    array = kept[parent.name]
+    if "CompactSubObj" not in array.values:
+        mended.append(f"[{values.name}]: left out, [{parent.name}] is no compact array")
+        return
+    count = min(int(array.values["CompactSubObj"], 0), 254)
+    for key in values.values:
+        if key != "NrOfEntries" and not (key.isdecimal() and 1 <= int(key) <= count):
+            raise invalid("no such entry", values, key, path, expected=f"1 to {count}")
+    names = kept.get(f"{parent.name}Name", Section("", 0)).values
+    every = {key: value for key, value in array.values.items() if key not in ("CompactSubObj", "ObjectType")}
+    for sub in range(1, count + 1):
+        own = Section(f"{parent.name}sub{sub:X}", values.line, dict(every), dict(array.lines))
+        own.values["ParameterName"] = names.get(str(sub)) or f"{array.values['ParameterName']}{sub}"
+        if value := values.values.get(str(sub)):
+            own.values["ParameterValue"], own.lines["ParameterValue"] = value, values.lines[str(sub)]
+        kept[own.name] = own
 
 
 def _mend_names(names: Section, parent: Section, kept: dict[str, Section], path: str, mended: list[str]) -> None:

@@ -86,7 +86,7 @@ def test_a_mapping_is_learnt_from_what_is_written() -> None:
 
 
 def test_a_mapping_that_was_refused_is_not_learnt() -> None:
-    refused = [can(0, "605#231A000110002060"), can(1, "585#801A000100000106")]
+    refused = [can(0, "605#23001A0110002060"), can(1, "585#80001A0100000106")]
     assert exchanges(observatory(), [*refused, can(10, "185#9E013500")])[-1].tags["slope_long"] == 4.14
 
 
@@ -223,3 +223,21 @@ def test_what_is_no_frame_has_words_too() -> None:
         "ctd.pressure 12.5 dbar, good", "ctd.status 1 (sampling), bad: timeout", "relay.state = 1",
         "fault f1: drop on line1", "step 3: wait for ctd: passed", "run: began",
     ]  # fmt: skip
+
+
+def test_a_segment_that_was_lost_comes_again() -> None:
+    """Block upload: the second of three segments is lost, one is acknowledged, the rest comes again from number 1."""
+    watch = SdoWatch()
+    watch.request(bytes.fromhex("A4 0020 00 7F 00 0000"), 0)
+    watch.reply(bytes.fromhex("C6 0020 00 15000000"), 1)
+    watch.request(bytes.fromhex("A3 000000 00000000"), 2)
+    for segment in ("01 61626364656667", "03 78787878787878"):
+        watch.reply(bytes.fromhex(segment), 3)
+    watch.request(bytes.fromhex("A2 01 7F 0000000000"), 4)
+    for segment in ("01 68696A6B6C6D6E", "82 6F707172737475"):
+        watch.reply(bytes.fromhex(segment), 5)
+    watch.request(bytes.fromhex("A2 02 7F 0000000000"), 6)
+    watch.reply(bytes.fromhex("C1 0000 0000000000"), 7)
+    done = watch.request(bytes.fromhex("A1 00000000000000"), 8).done
+    assert done is not None
+    assert bytes(done.data) == b"abcdefghijklmnopqrstu"

@@ -287,3 +287,12 @@ def test_secrets_are_not_in_the_page() -> None:
     assert "password (secret)" in html
     assert "1000.5" not in html
     assert "44 7a" not in html.lower()
+
+
+def test_what_was_refused_is_not_covered() -> None:
+    counts = Collector(observatory())
+    counts.feed(ask(0, "03 0064 0004"))
+    counts.feed(answer(5, "83 02"))
+    ctd = devices_covered(observatory(), counts.finish())[0]
+    (serial,) = [p for p in ctd.places if p.name == "serial"]
+    assert (serial.read, serial.refused, serial.missing) == (0, 1, ["read"])

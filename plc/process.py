@@ -178,6 +178,7 @@ class PlcProcess:
         cold = args.get("cold") is True
         self._note("restart", args, cold=cold)
         self._runner.restart(cold=cold)
+        self._loop.call_soon(self._loop.stop)  # a wait that began while nothing ran is too long now
         return {"start": self._runner.retained.start}
 
 

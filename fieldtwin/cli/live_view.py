@@ -110,7 +110,8 @@ def ports(session: RunSession) -> list[str]:
 
 
 def troubles(session: RunSession) -> list[str]:
-    """What is wrong now, each with its reason: errors of the run, buses that cannot be opened, devices that do not answer."""
+    """What is wrong now, each with its reason: errors of the run, buses that cannot be opened, devices that do not answer, and
+    what stopped the PLC."""
     gateway = session.gateway_status or {}
     found = list(session.errors)
     closed = {name: bus["error"] for name, bus in gateway.get("buses", {}).items() if bus["error"]}
@@ -120,6 +121,8 @@ def troubles(session: RunSession) -> list[str]:
     for name, device in gateway.get("devices", {}).items():
         if device["error"] and device["error"] != closed.get(device["bus"]):
             found.append(f"{name}: {device['error']}")
+    if error := (session.plc_status or {}).get("error"):
+        found.append(f"PLC: {error}")
     return found
 
 

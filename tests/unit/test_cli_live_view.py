@@ -104,6 +104,9 @@ def test_a_paused_plc_and_forces_are_in_sight(session: RunSession) -> None:
 def test_every_trouble_is_named_once(session: RunSession) -> None:
     session.note_error("plc: ended with signal 9")
     assert troubles(session) == ["plc: ended with signal 9", f"line1: {NOBODY}", f"modem: {SILENT}"]
+    assert session.plc_status is not None
+    session.plc_status["error"] = "program pump, pump.st:8: LogicError: division by zero"
+    assert troubles(session)[-1] == "PLC: program pump, pump.st:8: LogicError: division by zero"
     session.gateway_status = session.plc_status = None
     assert troubles(session) == ["plc: ended with signal 9"]
     shown(session, 80)  # and nothing breaks while nobody answers

@@ -9,6 +9,7 @@ has it and may be sent, else by SDO.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 
 from gateway.core.clock import Clock
@@ -47,6 +48,17 @@ NMT_COMMANDS = {
 }
 
 
+@dataclass(slots=True)
+class TpdoSeen:
+    """A TPDO of the node that is listened to: `frames` since it was mapped. With 0 the node never sent it."""
+
+    number: int
+    cob_id: int
+    tags: tuple[str, ...]
+    mapping: PdoMapping
+    frames: int = 0
+
+
 class CanopenDriver(DeviceDriver):
     """A driver of one node, made from its profile."""
 
@@ -59,7 +71,8 @@ class CanopenDriver(DeviceDriver):
         self.malformed_pdos = 0
         self._master: CanopenMaster | None = None
         self._by_object = {t.object: t for t in self.profile.tags.values()}
-        self._mappings: dict[int, PdoMapping] = {}
+        self.tpdos: tuple[TpdoSeen, ...] = ()
+        """Those that are listened to, by number."""
         self._listening: dict[int, PdoCallback] = {}
         self._by_change: frozenset[str] = frozenset()
         self._rpdos: dict[str, Rpdo] = {}
@@ -81,7 +94,7 @@ class CanopenDriver(DeviceDriver):
     def pdo_tags(self) -> list[str]:
         """The full names of the tags that TPDOs bring."""
         names = list(self.config.tpdo1.tags) if self.config.tpdo1 else []
-        mapped = [(e.index, e.subindex) for mapping in self._mappings.values() for e in mapping.entries]
+        mapped = [(e.index, e.subindex) for seen in self.tpdos for e in seen.mapping.entries]
         names += [self._by_object[o].name for o in mapped if o in self._by_object]
         return [f"{self.config.name}.{name}" for name in dict.fromkeys(names)]
 
@@ -105,7 +118,7 @@ class CanopenDriver(DeviceDriver):
         """Use `master`, which talks over `connection`, from now on."""
         self.attach(connection)
         self._master = master
-        self._mappings, self._listening = {}, {}
+        self.tpdos, self._listening = (), {}
         self._rpdos, self._started = {}, False
         consumer_ms = self.config.heartbeat.consumer_ms if self.config.heartbeat else 0
         master.add_node(
@@ -191,11 +204,15 @@ class CanopenDriver(DeviceDriver):
     def _listen(self, tpdos: list[PdoConfig]) -> None:
         for cob_id, callback in self._listening.items():
             self.master.unsubscribe_pdo(cob_id, callback)
-        self._mappings = {t.cob_id: t.mapping for t in tpdos}
+        by_cob_id = {t.cob_id: t for t in tpdos}
+        self.tpdos = tuple(
+            TpdoSeen(t.number, t.cob_id, tuple(n for n in tags_in(t.mapping, self._by_object) if n), t.mapping)
+            for t in sorted(by_cob_id.values(), key=lambda t: t.number)
+        )
         self._by_change = frozenset(
             name for t in tpdos if not t.cyclic for name in tags_in(t.mapping, self._by_object) if name
         )
-        self._listening = {cob_id: partial(self._on_pdo, mapping) for cob_id, mapping in self._mappings.items()}
+        self._listening = {seen.cob_id: partial(self._on_pdo, seen) for seen in self.tpdos}
         for cob_id, callback in self._listening.items():
             self.master.subscribe_pdo(cob_id, callback)
 
@@ -240,17 +257,18 @@ class CanopenDriver(DeviceDriver):
 
     # -- what the node sends --------------------------------------------------------------------------------------------
 
-    def _on_pdo(self, mapping: PdoMapping, data: bytes, t_ns: int) -> None:
+    def _on_pdo(self, seen: TpdoSeen, data: bytes, t_ns: int) -> None:
+        seen.frames += 1
         if self.identity_error:
             return
         if self.master.node_state(self.node) not in (NmtState.OPERATIONAL, None) and not self.operational:
             return  # a TPDO that overtook its node's last heartbeat: the state decides
         try:
-            values = mapping.unpack(data)
+            values = seen.mapping.unpack(data)
         except PdoLengthMismatch:
             self.malformed_pdos += 1
             return
-        for entry, raw in zip(mapping.entries, values, strict=True):
+        for entry, raw in zip(seen.mapping.entries, values, strict=True):
             tag = self._by_object.get((entry.index, entry.subindex))
             if tag is not None and BITS.get(tag.type) == entry.bits:
                 self.sink.put(f"{self.config.name}.{tag.name}", decode_little(tag, raw, t_ns))

@@ -84,6 +84,10 @@ def _devices(gateway: Gateway, now_ns: int) -> dict[str, Any]:
                     "emcy_log": status.emcy_log.describe(now_ns),
                     "errors": driver.malformed_pdos + status.poll_errors,
                     "polls": status.polls,
+                    "tpdos": {
+                        str(t.number): {"cob_id": f"{t.cob_id:03X}h", "tags": list(t.tags), "frames": t.frames}
+                        for t in driver.tpdos
+                    },
                     "rpdos": {str(r.number): [tag for tag in r.tags if tag] for r in driver.rpdos},
                     "rpdos_sent": status.writes.frames,
                 }

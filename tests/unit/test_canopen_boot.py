@@ -259,10 +259,18 @@ def test_tpdos_come_from_the_node_or_from_its_dcf(tmp_path: Path) -> None:
             await asyncio.sleep(0.6)
             assert r.status.online
             assert any(f.data[1:3] == b"\x00\x1a" for f in r.peers.sent) == reads
+            (seen,) = r.status.driver.tpdos
+            assert (seen.number, seen.cob_id, seen.tags, seen.frames) == (
+                1,
+                0x185,
+                ("slope_long", "slope_lateral"),
+                0,
+            ), "never sent so far"
             r.peer.say(0x180, bytes.fromhex("D2040CFE"))
             await asyncio.sleep(0.001)
             assert r.tags.current("incl.slope_long", 0).value == 12.34
             assert r.tags.current("incl.slope_lateral", 0).value == -5.0
+            assert seen.frames == 1
             assert r.peers.writes() == []
 
     from_dcf = (PdoConfig(1, 0x185, True, 254, 100, PdoMapping.of(SLOPES)),)

@@ -17,8 +17,10 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from emulators.endpoints.faulty import FaultyEnd
 from emulators.endpoints.link_ends import TcpDoor, TcpEnd, TtyEnd
 from emulators.endpoints.pty import PtyEnd
+from emulators.faults.engine import WireFaults
 from gateway.core.connection import PROTOCOL, ByteConnection, TCPConnection
 from gateway.core.endpoint import SOCKET_SCHEMES, Endpoint
 from gateway.core.errors import Bug, FieldtwinError, Unreachable, UsageError
@@ -185,7 +187,9 @@ class Link:
         far: Endpoint,
         options: LinkOptions | None = None,
         on_event: Callable[[str], None] | None = None,
+        faults: WireFaults | None = None,
     ) -> None:
+        self._faults = faults
         self.options = options or LinkOptions()
         self._near, self._far = _plug(near, self.options), _plug(far, self.options)
         if near.scheme not in SOCKET_SCHEMES and far.scheme not in SOCKET_SCHEMES:
@@ -285,8 +289,13 @@ class Link:
 
     async def _session(self, near: ByteConnection, far: ByteConnection) -> str:
         """Forward both ways until one side ends; why it did."""
-        outward = asyncio.create_task(self._pump(near, far, outward=True))
-        inward = asyncio.create_task(self._pump(far, near, outward=False))
+        masters, devices = near, far
+        behind: FaultyEnd | None = None
+        if self._faults is not None:  # the end at which masters ask: a port that was made, or where we listen
+            behind = FaultyEnd(far if isinstance(self._far, _PtyPlug | _DoorPlug) else near, self._faults)
+            masters, devices = (behind, far) if behind.inner is near else (near, behind)
+        outward = asyncio.create_task(self._pump(masters, devices, outward=True))
+        inward = asyncio.create_task(self._pump(devices, masters, outward=False))
         try:
             done, still = await asyncio.wait((outward, inward), return_when=asyncio.FIRST_COMPLETED)
             ended, other, target = (outward, inward, far) if outward in done else (inward, outward, near)
@@ -299,6 +308,8 @@ class Link:
                 await asyncio.wait((other,), timeout=self.options.half_close_s)
             return str(ended.result())
         finally:
+            if behind is not None:
+                behind.detach()
             await _cancel(outward, inward)
 
     async def _pump(self, source: ByteConnection, target: ByteConnection, outward: bool) -> FieldtwinError:
@@ -324,6 +335,8 @@ class Link:
 
     def _patience_s(self, target: ByteConnection, nbytes: int) -> float | None:
         """TCP holds back its sender for as long as it takes; a serial line waits for nobody."""
+        if isinstance(target, FaultyEnd):
+            target = target.inner
         if isinstance(target, TcpEnd):
             return None
         return self.options.stall_s + nbytes * target.endpoint.serial.char_time_s
@@ -353,13 +366,14 @@ async def run_link(
     *,
     on_event: Callable[[str], None] | None = None,
     on_ready: Callable[[Link], None] | None = None,
+    faults: WireFaults | None = None,
 ) -> None:
-    """Run a link until cancelled. `on_ready` is called once its port and its listener exist.
+    """Run a link until cancelled. `on_ready` is called once its port and its listener exist. `faults` strike what passes.
 
     Raises `UsageError` for endpoints that cannot be linked, `EndpointBusy` when the port to listen on is taken.
     A far side that is not there yet is no error: it is tried again.
     """
-    link = Link(near, far, options, on_event)
+    link = Link(near, far, options, on_event, faults)
     await link.open()
     try:
         if on_ready is not None:

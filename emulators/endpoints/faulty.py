@@ -15,7 +15,7 @@ from emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
 from emulators.faults.frames import FLUSH_S, Assembler, Frame, Way
 from emulators.virtual.wire import MemoryEnd
 from gateway.core.clock import NS_PER_S
-from gateway.core.connection import ByteConnection
+from gateway.core.connection import PROTOCOL, ByteConnection
 from gateway.core.errors import ConnectionLost, FieldtwinError
 
 MOST_WAITING = 10_000
@@ -74,8 +74,13 @@ class FaultyEnd(ByteConnection):
             await (self.inner.answer(piece, after_s) if n == 0 else self.inner.write(piece))
 
     async def aclose(self) -> None:
-        self._close()
+        self.detach()
         await self.inner.aclose()
+
+    def detach(self) -> None:
+        """Faults no longer strike here; `inner` stays as it is."""
+        self._close()
+        self.inner.intercept = None
 
     def _close(self) -> None:
         self._dead = True
@@ -220,11 +225,8 @@ class FaultyEnd(ByteConnection):
             self._hang(hang, [])
 
     def _hang(self, hang: Hang, last: list[bytes]) -> None:
-        if (
-            self._dead
-            or isinstance(self.inner, PtyEnd)
-            or (isinstance(self.inner, MemoryEnd) and self.inner.wire.serial)
-        ):
+        in_memory = isinstance(self.inner, MemoryEnd) and self.inner.wire.serial
+        if self._dead or in_memory or self.inner.type is PROTOCOL.RS232:
             return  # a serial line cannot be ended: what is said on it is lost by the fault itself
         if hang is Hang.HALF_OPEN:
             self._dead = True
@@ -239,3 +241,7 @@ class FaultyEnd(ByteConnection):
             self.inner.wire.cut(ConnectionLost("the other side ended the connection", where=str(self.endpoint)))
         elif isinstance(self.inner, SocketEnd):
             self.inner.evict(reset=hang is Hang.RESET)
+        else:
+            task = self._loop.create_task(self.inner.aclose(), name="a fault's end of a connection")
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)

@@ -26,6 +26,7 @@ COMMANDS = {
     "bridge": ("fieldtwin.cli.bridge_command", "Modbus TCP clients to units on a serial line, or the other way round."),
     "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
+    "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),
     "trace": ("fieldtwin.cli.trace_command", "What happened in a run: frames in words, JSON, or waveforms."),
     "schema": ("fieldtwin.cli.schema_command", "Print the JSON schema of a kind of file."),
     "doctor": ("fieldtwin.cli.doctor_command", "Check what this computer can do, and say what to change."),

@@ -1,0 +1,50 @@
+"""Faults of a wire of which nobody knows more than its framing: a link between two strangers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from random import Random
+from typing import Any
+
+from emulators.faults.engine import WireFaults
+from emulators.faults.fault import Active, Kind
+from emulators.faults.frames import Framing
+from emulators.faults.schema import parse_fault
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import UsageError
+
+
+def wire_faults(said: Iterable[Mapping[str, Any]], framing: Framing, seed: int, start_ns: int) -> WireFaults:
+    """The faults, all put in; their times count from `start_ns`. Raises `UsageError` for what needs a system file: devices,
+    registers by name, CAN, values."""
+    faults = WireFaults(framing)
+    for number, one in enumerate(said, 1):
+        spec = parse_fault(dict(one), number=number)
+        aim = spec.aim
+        if spec.kind.kind is not Kind.BYTES:
+            raise UsageError(
+                f"fault {spec.kind.name} is for {spec.kind.kind.value}", expected="one of a line or socket"
+            )
+        if aim.device or aim.bus or aim.register_:
+            raise UsageError(f"fault {spec.id}: a link knows no names", expected="unit, function, address")
+        addresses = None
+        if aim.address is not None:
+            try:
+                address = int(str(aim.address).rpartition(":")[2], 0)
+            except ValueError:
+                raise UsageError("an address", expected="a number, or holding:0x10", got=repr(aim.address)) from None
+            addresses = range(address, address + 1)
+        until_ns = None if spec.until_s is None else start_ns + round(spec.until_s * NS_PER_S)
+        faults.put_in(
+            Active(
+                spec.id,
+                spec.make(),
+                aim,
+                Random(f"{seed} {spec.id}"),
+                start_ns + round(spec.from_s * NS_PER_S),
+                until_ns,
+                units=() if aim.unit is None else (aim.unit,),
+                addresses=addresses,
+            )
+        )
+    return faults

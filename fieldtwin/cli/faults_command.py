@@ -1,0 +1,64 @@
+"""`fieldtwin faults`: which faults there are, where they can be put, and what they can be told."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import click
+from rich.table import Table
+
+from emulators.faults.fault import Fault
+from fieldtwin.cli.options import json_option
+from fieldtwin.cli.talk import data
+
+
+@click.command("faults")
+@click.argument("names", nargs=-1)
+@json_option
+def command(names: tuple[str, ...], as_json: bool) -> int:
+    """List the faults, or say all of NAMES.
+
+    A fault file is `faults: [{name: silence, device: ctd, from: 5s, until: 12s}]`, for `fieldtwin run --prototype --faults
+    FILE` and `fieldtwin link --faults FILE`. What every fault takes: id, bus or device, unit, function, address or register,
+    cob_id, direction (request, reply, both), nth, every, from, until, probability.
+    """
+    from emulators.faults.registry import FAULTS, fault_class
+
+    chosen = [fault_class(name) for name in names] or list(FAULTS.values())
+    described = [_described(kind) for kind in chosen]
+    if as_json:
+        json.dump(described, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+        return 0
+    for on in dict.fromkeys(d["on"] for d in described):
+        table = Table(title=on, title_justify="left", title_style="bold", box=None, show_header=False, pad_edge=False)
+        table.add_column(no_wrap=True)
+        table.add_column()
+        for d in described:
+            if d["on"] == on:
+                table.add_row(d["name"], _told(d))
+        data.print(table)
+        data.print()
+    return 0
+
+
+def _described(kind: type[Fault]) -> dict[str, Any]:
+    """A fault as JSON; its parameters as JSON schema has them."""
+    own = kind.form.model_json_schema().get("properties", {})
+    for parameter in own.values():
+        parameter.pop("title", None)
+    ways = sorted(way.value for way in kind.ways)
+    return {
+        "name": kind.name,
+        "on": kind.kind.value,
+        "summary": kind.summary,
+        "direction": ways,
+        "parameters": own,
+    }
+
+
+def _told(described: dict[str, Any]) -> str:
+    own = ", ".join(f"{name}: {p['default']:g}" for name, p in described["parameters"].items())
+    return f"{described['summary']}" + (f" [dim]({own})[/dim]" if own else "")

@@ -162,7 +162,7 @@ class FaultyEnd(ByteConnection):
                 if due_ns <= now_ns:
                     at_once.append(piece.data)
                 else:
-                    self._send_at(due_ns + round(after_s * NS_PER_S), way, piece.data)
+                    self._send_at(due_ns + round(after_s * NS_PER_S), way, piece)
         if self._free_ns[way] <= now_ns:
             self._free_ns[way] = 0
         if outcome.hang is not None:
@@ -176,16 +176,17 @@ class FaultyEnd(ByteConnection):
         self._gathered[way] = bytearray(piece.data)
         self._loop.call_later(piece.delay_s, lambda: self._send(way, bytes(self._gathered.pop(way))))
 
-    def _send_at(self, due_ns: int, way: Way, data: bytes) -> None:
+    def _send_at(self, due_ns: int, way: Way, piece: Piece) -> None:
         if self._waiting >= MOST_WAITING:
             self.lost_pieces += 1
             return
         self._waiting += 1
-        self._loop.call_at(due_ns / NS_PER_S, self._due, way, data)
+        self._loop.call_at(due_ns / NS_PER_S, self._due, way, piece)
 
-    def _due(self, way: Way, data: bytes) -> None:
+    def _due(self, way: Way, piece: Piece) -> None:
         self._waiting -= 1
-        self._send(way, data)
+        if piece.gone is None or not piece.gone():
+            self._send(way, piece.data)
 
     def _send(self, way: Way, data: bytes) -> None:
         if self._dead or self.inner.lost is not None or not data:

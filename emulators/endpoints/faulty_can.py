@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from emulators.faults.can_fault import BusFault, CanFault, CanPiece
+from emulators.faults.can_fault import SDO_REPLY, SDO_REQUEST, BusFault, CanFault, CanPiece
 from emulators.faults.engine import WireFaults, in_time
 from emulators.faults.fault import Active
 from emulators.faults.frames import Frame, Framing, Way
@@ -86,7 +86,7 @@ class FaultyCan(CanConnection):
             fault = active.fault
             if not isinstance(fault, CanFault) or (active.units and self.node not in active.units):
                 continue
-            if active.aim.cob_id is not None and frame.can_id != active.aim.cob_id:
+            if not _aimed(active, frame):
                 continue
             if not fault.aims_at(frame, self.node) or not active.strikes(_seen(way, self.node), now_ns):
                 continue
@@ -123,6 +123,18 @@ class FaultyCan(CanConnection):
             pass  # it was too late
 
 
+def _aimed(active: Active, frame: CanFrame) -> bool:
+    """Whether a frame is one that the fault's `cob_id` and `index` mean. An index stands in SDO requests and replies that name
+    an object, so in no segment."""
+    aim = active.aim
+    if aim.cob_id is not None and frame.can_id != aim.cob_id:
+        return False
+    if aim.index is None:
+        return True
+    sdo = frame.can_id & 0x780 in (SDO_REPLY, SDO_REQUEST) and len(frame.data) == 8
+    return sdo and int.from_bytes(frame.data[1:3], "little") == aim.index
+
+
 def _seen(way: Way, node: int) -> Frame:
     return Frame(way, Framing.RAW, b"", node)
 
@@ -140,16 +152,13 @@ def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[in
         ours = any((frame.can_id & 0x7F) == node for node in from_nodes) and frame.can_id > 0x80
         if not ours or not in_time(active, now_ns()) or (attempts is not None and spoilt >= attempts):
             return None
-        if active.aim.cob_id is not None and frame.can_id != active.aim.cob_id:
-            return None
-        if active.aim.probability < 1.0 and active.random.random() >= active.aim.probability:
-            return None
         if attempts is None and again is not None and again.key() == frame.key():
             again = None  # its controller sends it again, and that goes well
             return None
+        if not _aimed(active, frame) or not active.strikes(_seen(Way.REPLY, frame.can_id & 0x7F), now_ns()):
+            return None
         again = frame
         spoilt += 1
-        active.struck += 1
         return Disturbance()
 
     return rule

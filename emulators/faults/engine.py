@@ -65,6 +65,8 @@ def _joined(before: Outcome | None, frame: Frame, fault: WireFault, active: Acti
 
 def _later(pieces: Iterable[Piece], behind: Piece) -> list[Piece]:
     return [
-        Piece(p.data, p.delay_s + behind.delay_s, p.overtake or behind.overtake, p.gather or behind.gather, p.back)
+        Piece(
+            p.data, p.delay_s + behind.delay_s, p.overtake or behind.overtake, p.gather or behind.gather, p.back, p.gone
+        )
         for p in pieces
     ]

@@ -7,7 +7,7 @@ out. It never opens, waits or reads a clock.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from random import Random
@@ -41,6 +41,8 @@ class Piece:
     overtake: bool = False
     gather: bool = False
     back: bool = False
+    gone: Callable[[], bool] | None = None
+    """Whether it went by itself meanwhile, asked when its time has come."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,8 @@ class Aim(BaseModel):
     register_: str = Field(default="", alias="register")
     """A tag of the device."""
     cob_id: int | None = Field(default=None, ge=0, le=0x7FF)
+    index: int | None = Field(default=None, ge=0, le=0xFFFF)
+    """An object of CANopen: SDO requests and replies that name it."""
     direction: str = Field(default="", pattern="^(request|reply|both|)$")
     nth: int | None = Field(default=None, ge=1)
     every: int | None = Field(default=None, ge=1)

@@ -24,8 +24,17 @@ class Reorder(WireFault):
         self._held: Frame | None = None
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
-        if self._held is None:
-            self._held = frame
-            return Outcome((Piece(frame.data, self.parameters.most_ms / 1000, overtake=True),))
+        before, self._held = self._held, None
+        if before is not None:
+            return Outcome((Piece(frame.data, overtake=True), Piece(before.data, overtake=True)))
+        self._held = frame
+        return Outcome(
+            (Piece(frame.data, self.parameters.most_ms / 1000, overtake=True, gone=lambda: self._went(frame)),)
+        )
+
+    def _went(self, frame: Frame) -> bool:
+        """Its time is up: nobody overtook it, or it went behind another long ago."""
+        if self._held is not frame:
+            return True
         self._held = None
-        return Outcome((Piece(frame.data, overtake=True),))
+        return False

@@ -50,7 +50,7 @@ class SampledSensor(RegisterBank):
         self._period_s = 0
         self._next_ns = 0
         for tag in self._signals:
-            self._put(tag, math.nan, player.start_ns)
+            self._put(tag, 0 if tag.type.startswith(("int", "uint")) else math.nan, player.start_ns)
         for tag in (self._count_tag, self._period_tag, *(profile.tags[n] for n in OWN if n in profile.tags)):
             self._put(tag, 0, player.start_ns)
         for name, text in identity.items():
@@ -135,8 +135,6 @@ class SampledSensor(RegisterBank):
     def _put(self, tag: Tag, value: float | int | str, now_ns: int) -> None:
         """The device sets one of its own tags."""
         at = tag.registers
-        if tag.type.startswith(("int", "uint")) and not isinstance(value, str):
-            value = round(value) if math.isfinite(value) else 0
         words = encode(value, tag.type, tag.order, registers=at.count)
         self._cells.poke(at.table, at.address, *words)
         self.journal.note(tag.name, b"".join(w.to_bytes(2) for w in words), now_ns)

@@ -60,5 +60,10 @@ def _described(kind: type[Fault]) -> dict[str, Any]:
 
 
 def _told(described: dict[str, Any]) -> str:
-    own = ", ".join(f"{name}: {p['default']:g}" for name, p in described["parameters"].items())
+    own = ", ".join(f"{name}: {_number(p['default'])}" for name, p in described["parameters"].items())
     return f"{described['summary']}" + (f" [dim]({own})[/dim]" if own else "")
+
+
+def _number(value: float) -> str:
+    """Codes, which are large, as everybody writes them."""
+    return f"0x{value:X}" if isinstance(value, int) and value >= 0x1000 else f"{value:g}"

@@ -13,8 +13,9 @@ from emulators.models.register_device import StatedRegisters, add_own_functions
 from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.stated import parts_of
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 from gateway.core.connection import RS232Connection
-from gateway.core.errors import FileInvalid
+from gateway.core.errors import FieldtwinError, FileInvalid
 from gateway.core.profile import DeviceProfile, load_profile
 from gateway.core.recording import Exchange
 
@@ -201,3 +202,91 @@ def test_statements_that_cannot_be(tmp_path: Path, before: str, after: str, told
     with pytest.raises(FileInvalid) as refused:
         profile_of(tmp_path, PROFILE.replace(before, after))
     assert told in str(refused.value)
+
+
+SYSTEM = """
+fieldtwin: 1
+system: pump
+buses:
+  line1: {url: "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1"}
+devices:
+  tank: {profile: ./tank.yaml, bus: line1, unit: 1, poll: {values: {every_ms: 200}, coils: {every_ms: 500}}}
+plc:
+  programs:
+    idle: {source: "python: idle_tank:Idle"}
+"""
+PROTOTYPE = """
+prototype_of: pump.yaml
+buses:
+  line1: {listen: "pty:line1"}
+devices:
+  tank:
+    model: profile
+    values: {level: 1.5, total: 1000, mode: filling, current_sf: -2, current: 3.21, valve: 1, alarm: 3}
+    identity: {model: TK}
+    busy: {every: 20, for_ms: 150}
+"""
+IDLE = """
+from plc.program import Program
+
+
+class Idle(Program):
+    def execute(self, scan):
+        pass
+"""
+
+
+def system(folder: Path, prototype: str) -> str:
+    profile_of(folder)
+    (folder / "pump.yaml").write_text(SYSTEM, encoding="utf-8")
+    (folder / "pump.prototype.yaml").write_text(prototype, encoding="utf-8")
+    (folder / "idle_tank.py").write_text(IDLE, encoding="utf-8")
+    return str(folder / "pump.yaml")
+
+
+def test_a_prototype_of_a_device_that_nobody_recorded(tmp_path: Path) -> None:
+    run = VirtualRun(VirtualOptions(system(tmp_path, PROTOTYPE), 10.0))
+    run.run()
+    summary = run.summary()
+    assert run.errors == []
+    assert summary["published"]["checked"] > 100
+    assert summary["published"]["wrong"] == 0
+    assert run.gateway_status is not None
+    tags = run.gateway_status["tags"]
+    assert {name.removeprefix("tank."): tag["value"] for name, tag in tags.items()} == {
+        "level": 1.5,
+        "total": 1000,
+        "reset": 0,
+        "alarm": 0,
+        "mode": 2,
+        "ready": 0,
+        "current": pytest.approx(3.21),
+        "current_sf": -2,
+        "model": "TK",
+        "valve": True,
+    }
+    assert run.field_status is not None
+    assert run.field_status["devices"]["tank"]["counters"]["exceptions"] > 3, "busy, and the gaps between its tags"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "told"),
+    [
+        ("alarm: 3", "alarms: 3", "no tag 'alarms'"),
+        ("mode: filling", "mode: full", "'tank': the value of 'mode'; expected off, filling"),
+        ("every: 20", "every: 0", "1"),
+        ("model: profile", "recording: tank.jsonl", "`model: profile`"),
+    ],
+)
+def test_prototypes_that_cannot_be(tmp_path: Path, before: str, after: str, told: str) -> None:
+    (tmp_path / "tank.jsonl").write_text("")
+    assert told in why_not(system(tmp_path, PROTOTYPE.replace(before, after)))
+
+
+def why_not(path: str) -> str:
+    try:
+        run = VirtualRun(VirtualOptions(path, 1.0))
+    except FieldtwinError as e:
+        return str(e)
+    run.run()
+    return " ".join(run.errors)

@@ -8,7 +8,7 @@ import shlex
 import signal
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import click
 
@@ -69,6 +69,12 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     help="With --seeds: add each run to this file, and leave out those in it.",
 )
 @click.option("--trace", type=click.Path(dir_okay=False), help="With --virtual: every event to this file (JSON lines).")
+@click.option(
+    "--faults",
+    default="",
+    metavar="FILE|random",
+    help="With --prototype: put these faults in (fieldtwin faults); random, with --virtual: ones that the seed chooses.",
+)
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
 @json_option
@@ -94,6 +100,7 @@ def command(
     jobs: int,
     ledger: str | None,
     trace: str | None,
+    faults: str,
     cold: bool,
     profiles: tuple[str, ...],
     as_json: bool,
@@ -107,6 +114,8 @@ def command(
     """
     if prototype == plant:
         raise UsageError(NEITHER if not plant else "--plant and --prototype exclude each other")
+    if plant and faults:
+        raise UsageError("a plant has no faults but its own", hint="--faults goes with --prototype")
     if plant and (field_host or recordings or listen or can or speed or prototype_file or commands):
         raise UsageError(
             "a plant is not emulated",
@@ -133,6 +142,7 @@ def command(
                 speed,
                 commands,
                 trace,
+                faults,
             ),
             seeds,
             jobs,
@@ -158,8 +168,17 @@ def command(
         commands=parse_periods(commands) if commands is not None else DEFAULT_SCRIPT,
         capture=Path(capture) if capture else None,
         cold=cold,
+        faults=_faults(faults) if faults else (),
     )
     return asyncio.run(_run(options, as_json))
+
+
+def _faults(path: str) -> tuple[dict[str, Any], ...]:
+    from emulators.faults.schema import load_faults
+
+    if path == "random":
+        raise UsageError("random faults go with --virtual")
+    return load_faults(Path(path))
 
 
 class VirtualRequest(NamedTuple):
@@ -174,6 +193,7 @@ class VirtualRequest(NamedTuple):
     speed: float
     commands: str | None
     trace: str | None
+    faults: str
 
 
 def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | None, as_json: bool) -> int:
@@ -190,6 +210,8 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | 
         speed=request.speed,
         commands=parse_periods(request.commands) if request.commands is not None else DEFAULT_SCRIPT,
         trace=Path(request.trace) if request.trace else None,
+        faults=_faults(request.faults) if request.faults not in ("", "random") else (),
+        random_faults=request.faults == "random",
     )
     if not seeds:
         if ledger is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -26,4 +27,5 @@ class RunOptions:
     commands: tuple[int, ...] = ()
     capture: Path | None = None
     cold: bool = False
-    faults: Path | None = None
+    faults: tuple[dict[str, Any], ...] = ()
+    """As `emulators.faults.schema.load_faults` gives them."""

@@ -83,7 +83,7 @@ class RunSession:
     @property
     def disturbed(self) -> bool:
         """Whether faults were put in."""
-        return self.options.faults is not None
+        return bool(self.options.faults)
 
     # -- starting -------------------------------------------------------------------------------------------------------
 
@@ -117,6 +117,9 @@ class RunSession:
         await self._start_child("gateway", "twin.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
         self.started_ns = self.clock.monotonic_ns()
+        if self._field is not None:
+            for fault in self.options.faults:  # each knows its time
+                await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
         self._start_watching()
 
     def _field_config(self, run_dir: Path) -> FieldConfig:

@@ -18,6 +18,7 @@ from typing import Any, BinaryIO
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.seal import sealed
 from fieldtwin.running.age_oracle import AgeOracle
+from fieldtwin.running.fault_schedule import random_schedule
 from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.summary import summarise
@@ -54,6 +55,8 @@ class VirtualOptions:
     speed: float = 0.0
     commands: tuple[int, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
+    random_faults: bool = False
+    """Faults that the seed chooses, besides."""
     trace: Path | None = None
     prototype: bool = True
     field_host: str = ""
@@ -80,6 +83,9 @@ class VirtualRun:
         self.system = twin.ecs.system
         self.prototype = twin.prototype
         self.seed = self.prototype.seed if options.seed is None else options.seed
+        self.faults: tuple[dict[str, Any], ...] = options.faults
+        if options.random_faults:
+            self.faults += random_schedule(self.system, self.seed, options.duration_s)
         self.instance = _Instance()
         self.states = StateWatch(self.system)
         self.oracle = AgeOracle()
@@ -101,7 +107,7 @@ class VirtualRun:
 
     @property
     def disturbed(self) -> bool:
-        return bool(self.options.faults)
+        return bool(self.faults)
 
     def run(self, progress: Callable[[float], None] | None = None) -> None:
         """Run it. `progress` is told the virtual seconds that are over, from time to time. Errors are kept in `errors`."""
@@ -152,7 +158,7 @@ class VirtualRun:
             self.states.knows(bench.run.twin.ecs.layout)
             for program, state in bench.states().items():
                 self.states.note(program, state, loop.now_ns)
-            for fault in o.faults:  # each knows its time
+            for fault in self.faults:  # each knows its time
                 await bench.inject(fault)
             await self._through(bench, loop)
             await self._settle(bench)

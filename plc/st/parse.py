@@ -109,9 +109,20 @@ class _Build(Transformer_NonRecursive[Token, Any]):
         types = tuple(one for item in items if isinstance(item, list) for one in item)
         return t.Unit(
             types,
-            tuple(i for i in items if isinstance(i, t.VarBlock)),
+            tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock)),
             tuple(i for i in items if isinstance(i, t.Pou)),
         )
+
+    def configuration(self, meta: Meta, items: list[Any]) -> tuple[t.VarBlock, ...]:
+        """Its globals, and those of its resources."""
+        return tuple(b for i in items for b in (i if isinstance(i, tuple) else (i,)) if isinstance(b, t.VarBlock))
+
+    resource = configuration
+
+    def task(self, meta: Meta, items: list[Any]) -> None:
+        return None
+
+    instance = task_value = task
 
     def _pou(self, kind: str, meta: Meta, items: list[Any]) -> t.Pou:
         name, *rest = items

@@ -163,6 +163,9 @@ class _Converter:
             raise self._fail(
                 pou, "a POU of unknown kind", expected=", ".join(_POUS), got=pou.attributes.get("pouType", "")
             )
+        for unsupported in ("Method", "Property", "action", "transition"):
+            for found in pou.every(unsupported):
+                raise self._fail(found, f"{self._name(pou)} has what is not supported: {unsupported.lower()}")
         interface = pou.find("interface")
         returns = interface.find("returnType") if interface else None
         if kind == "FUNCTION" and (returns is None or not returns.children):

@@ -77,3 +77,13 @@ def test_errors_name_line_and_column_of_the_export(tmp_path: Path) -> None:
         with pytest.raises(FileInvalid, match=told) as e:
             load_file(path)
         assert (e.value.line, e.value.column) == (line, column)
+
+
+def test_methods_and_actions_are_refused_where_they_stand(tmp_path: Path) -> None:
+    text = (SHAPES / "codesys_shape.xml").read_text()
+    assert text.count("<addData />") == 1
+    path = tmp_path / "tank.xml"
+    data = '<addData><data name="http://www.3s-software.com/plcopenxml/method"><Method name="Reset"/></data></addData>'
+    path.write_text(text.replace("<addData />", data))
+    with pytest.raises(FileInvalid, match="FB_Ramp has what is not supported: method"):
+        load_file(path)

@@ -272,6 +272,29 @@ def test_what_stands_at_an_address_is_an_input_or_an_output() -> None:
     assert (made.lamp, made.horn, made.m, made.n) == (True, False, 5, 5)  # type: ignore[attr-defined]
 
 
+def test_a_file_with_its_configuration_as_openplc_writes_it() -> None:
+    made = program(
+        """PROGRAM blink
+  VAR_EXTERNAL runs : DINT; END_VAR
+  VAR lamp AT %QX0.0 : BOOL; on : INT; END_VAR
+  lamp := NOT(lamp); on := on + LIMIT; runs := runs + 1;
+END_PROGRAM
+
+CONFIGURATION Config0
+  VAR_GLOBAL runs : DINT; END_VAR
+  RESOURCE Res0 ON PLC
+    VAR_GLOBAL CONSTANT LIMIT : INT := 7; END_VAR
+    TASK task0(INTERVAL := T#20ms,PRIORITY := 0);
+    TASK edge(SINGLE := TRUE, PRIORITY := 1);
+    PROGRAM instance0 WITH task0 : blink;
+  END_RESOURCE
+END_CONFIGURATION
+"""
+    )
+    scan(made)
+    assert (made.lamp, made.on) == (True, 7)  # type: ignore[attr-defined]
+
+
 def test_which_program_is_meant() -> None:
     two = "PROGRAM a END_PROGRAM PROGRAM b VAR x : INT := 1; END_VAR END_PROGRAM"
     with pytest.raises(FileInvalid, match="which PROGRAM"):

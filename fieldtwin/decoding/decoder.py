@@ -10,7 +10,7 @@ Bounded: one request a line, 64 on a Modbus TCP wire, one transfer a node.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 from fieldtwin.decoding.canopen_wire import CanopenWire
@@ -22,16 +22,21 @@ from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
 from gateway.core.errors import FieldtwinError
+from gateway.devices.config import DeviceConfig
 from gateway.protocols.modbus.framings import framing_of
 from twin.system import System
 
 
 class Decoder:
-    """Decodes one trace, whose events are fed in order. `served` are buses on which the gateway is the one that is asked."""
+    """Decodes one trace, whose events are fed in order. `served` are buses on which the far end asks. `framings` says what is
+    spoken on wires that are no bus of `system`: rtu, ascii, mbap, udp or can; nothing there has a name."""
 
-    def __init__(self, system: System, served: Collection[str] = ()) -> None:
+    def __init__(
+        self, system: System | None, served: Collection[str] = (), framings: Mapping[str, str] | None = None
+    ) -> None:
         self._system = system
         self._served = served
+        self._framings = framings or {}
         self._modbus: dict[str, ModbusWire] = {}
         self._canopen: dict[str, CanopenWire] = {}
         self._maps: dict[str, TagMap] = {}
@@ -75,19 +80,24 @@ class Decoder:
 
     def _line(self, bus: str) -> ModbusWire | None:
         if bus not in self._modbus:
-            config = self._system.buses.get(bus)
-            if config is None or config.endpoint.is_can:
+            config = self._system.buses.get(bus) if self._system else None
+            if config is not None and config.endpoint.is_can:
                 return None
-            units = {d.address: Unit(d.name, TagMap(d.profile)) for d in self._system.devices_on(bus)}
-            self._modbus[bus] = ModbusWire(
-                bus, framing_of(config.endpoint), units, echo=config.echo, served=bus in self._served
-            )
+            framing = framing_of(config.endpoint) if config else self._framings.get(bus, "can")
+            if framing == "can":
+                return None
+            units = {d.address: Unit(d.name, TagMap(d.profile)) for d in self._devices(bus)}
+            echo = config.echo if config else False
+            self._modbus[bus] = ModbusWire(bus, framing, units, echo=echo, served=bus in self._served)
         return self._modbus[bus]
 
     def _can(self, bus: str) -> CanopenWire:
         if bus not in self._canopen:
-            self._canopen[bus] = CanopenWire(bus, self._system.devices_on(bus))
+            self._canopen[bus] = CanopenWire(bus, self._devices(bus))
         return self._canopen[bus]
+
+    def _devices(self, bus: str) -> list[DeviceConfig]:
+        return self._system.devices_on(bus) if self._system else []
 
     def _words(self, event: Event) -> str:
         data, where = event.data, event.where
@@ -108,7 +118,7 @@ class Decoder:
 
     def _tag_value(self, where: str, value: Any) -> str:
         device, _, name = where.partition(".")
-        config = self._system.devices.get(device)
+        config = self._system.devices.get(device) if self._system else None
         if config is None or not isinstance(value, bool | int | float | str | None):
             return show_value(value)
         if device not in self._maps:

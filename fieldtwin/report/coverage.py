@@ -30,7 +30,7 @@ K = TypeVar("K", bound=Hashable)
 class Collector:
     """Counts one run's events. Subscribe `feed` to a trace: what a full trace has dropped is counted as well."""
 
-    def __init__(self, system: System, machines: Iterable[Machine] = ()) -> None:
+    def __init__(self, system: System | None, machines: Iterable[Machine] = ()) -> None:
         self.counts = Counts()
         self._decoder = Decoder(system)
         self._machines = {m.variable: m for m in machines}

@@ -169,10 +169,10 @@ def _study(report: Report) -> tuple[Counts, list[Markup]]:
             plain.append((number, scenario))
         wanted = failing if room else []
         windows: list[Window] = []
-        if report.system is not None and (scenario.counts is None or wanted):
-            own, windows = Study(report.system, report.machines, scenario).run(wanted)
+        if scenario.counts is None or wanted:
+            own, windows = Study(report, scenario).run(wanted)
             counts.add(own)
-        elif scenario.counts is not None:
+        else:
             counts.add(scenario.counts)
         if scenario.verdict.bad and room:
             section = _failure(report, number, scenario, windows, opened=drawn < 4)

@@ -6,10 +6,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fieldtwin.scenarios.trace import Event
-from twin.system import System
+
+if TYPE_CHECKING:  # verdicts and results are also made where no system can be read
+    from twin.system import System
 
 
 class Verdict(Enum):
@@ -133,6 +135,10 @@ class Report:
     machines: Sequence[Machine] = ()
     faults: Sequence[str] = ()
     """The faults that there are to be injected, by name; those that ran are added."""
+    framings: Mapping[str, str] = field(default_factory=dict)
+    """What is spoken on wires in the traces that are no bus of the system: rtu, ascii, mbap, udp or can."""
+    served: Sequence[str] = ()
+    """The wires on which the far end asks."""
 
     @property
     def counts(self) -> dict[Verdict, int]:

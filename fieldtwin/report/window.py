@@ -15,9 +15,8 @@ from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.decoding.tags import SECRET
 from fieldtwin.report.coverage import Collector
-from fieldtwin.report.model import CheckResult, Counts, Machine, ScenarioResult
+from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult
 from fieldtwin.scenarios.trace import Event, Kind
-from twin.system import System
 
 SECOND_NS = 1_000_000_000
 MOST_FRAMES = 160
@@ -109,14 +108,13 @@ def around(check: CheckResult, end_ns: int) -> Window | None:
 class Study:
     """One pass over a scenario's trace: its counts, and the windows around the checks that are given."""
 
-    def __init__(self, system: System, machines: Sequence[Machine], scenario: ScenarioResult) -> None:
-        self._decoder = Decoder(system)
-        self._collector = Collector(system, machines)
-        self._machines = {m.variable: m for m in machines}
+    def __init__(self, report: Report, scenario: ScenarioResult) -> None:
+        self._decoder = Decoder(report.system, report.served, report.framings)
+        self._collector = Collector(report.system, report.machines)
+        self._machines = {m.variable: m for m in report.machines}
         self._scenario = scenario
-        self._secrets = {
-            f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values() if t.secret
-        }
+        devices = report.system.devices.values() if report.system else ()
+        self._secrets = {f"{d.name}.{t.name}" for d in devices for t in d.profile.tags.values() if t.secret}
         self._now: dict[Kind, dict[str, Step]] = {Kind.TAG: {}, Kind.STATE: {}}
         self._on: dict[str, FaultBar] = {}
         self._off: list[FaultBar] = []

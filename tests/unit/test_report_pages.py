@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -9,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from report_rig import MS, answer, ask, can, note, observatory, run_trace
+from report_rig import MS, adu, answer, ask, can, chunk, note, observatory, run_trace
 
 from fieldtwin.report.coverage import Collector, devices_covered
 from fieldtwin.report.html import BUDGET, render_html, write_html
@@ -196,7 +198,7 @@ def test_many_events_give_a_small_file() -> None:
 
 def test_a_long_wait_is_drawn_at_its_end() -> None:
     waited = replace(FAILED, since_ns=0, t_ns=3_600_000 * MS)
-    (window,) = Study(observatory(), (), scenario(trace=TRACE)).run([waited])[1]
+    (window,) = Study(report(), scenario(trace=TRACE)).run([waited])[1]
     assert window.at_ns - window.start_ns == LONGEST_NS
 
 
@@ -264,7 +266,7 @@ def test_what_is_thinned_still_reaches_the_failure() -> None:
         at = 12_200 + n / 5
         crowd.append(can(at, "185#9E013500"))
         crowd.append(note(at, Kind.TAG, "ctd.pressure", value=n % 97 / 7, quality="bad" if n == 77 else "good"))
-    (window,) = Study(observatory(), (), scenario(trace=crowd)).run([FAILED])[1]
+    (window,) = Study(report(), scenario(trace=crowd)).run([FAILED])[1]
     assert window.thinned == {"can0", "ctd.pressure"}
     for kept, most in ((window.exchanges, MOST_EXCHANGES), (window.tags["ctd.pressure"], MOST_STEPS)):
         assert most // 4 < len(kept) <= most
@@ -296,3 +298,21 @@ def test_what_was_refused_is_not_covered() -> None:
     ctd = devices_covered(observatory(), counts.finish())[0]
     (serial,) = [p for p in ctd.places if p.name == "serial"]
     assert (serial.read, serial.refused, serial.missing) == (0, 1, ["read"])
+
+
+def test_a_wire_of_no_system_is_decoded_as_what_is_spoken_there() -> None:
+    """Conformance: somebody else's master asks us."""
+    events = [chunk(13_000, False, adu(1, "03 0000 0001"), "listen"), chunk(13_020, True, adu(1, "83 06"), "listen")]
+    judged = scenario(trace=events, requirements=())
+    of = Report("a master", [judged], framings={"listen": "mbap"}, served=("listen",))
+    said = page(of).said
+    assert "unit 1: read holding registers 40001 (holding:0)" in said
+    assert "unit 1: exception 06 server device busy" in said
+    assert "listen 1 exception 1" in said
+
+
+def test_results_need_no_protocols() -> None:
+    """Who only makes results (a plugin in somebody's own environment) needs neither pymodbus nor canopen."""
+    code = "import sys, fieldtwin.report.model; print([m for m in ('pymodbus', 'canopen', 'twin.system') if m in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30)
+    assert ran.stdout == "[]\n"

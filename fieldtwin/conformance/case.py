@@ -1,0 +1,86 @@
+"""What a case is: an id of the catalogue, what the device does, what the master must do, and who judges it.
+
+Protocols are elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+
+from fieldtwin.conformance.observation import Observation
+from fieldtwin.report.model import Verdict
+
+
+class Danger(Enum):
+    """What a case may do to whatever is behind the master, in rising order."""
+
+    OBSERVE = "observe"
+    """Nothing: it only listens."""
+    READ = "read"
+    """Reads are answered oddly."""
+    WRITE = "write"
+    """Writes are answered oddly: the master may repeat them."""
+    DISRUPT = "disrupt"
+    """The connection is cut, or the line disturbed for everybody on it."""
+
+    @property
+    def rank(self) -> int:
+        return list(Danger).index(self)
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A verdict and the one sentence that says why."""
+
+    verdict: Verdict
+    reason: str = ""
+
+
+def passed(reason: str = "") -> Finding:
+    return Finding(Verdict.PASSED, reason)
+
+
+def failed(reason: str) -> Finding:
+    return Finding(Verdict.FAILED, reason)
+
+
+def skipped(reason: str) -> Finding:
+    return Finding(Verdict.SKIPPED, reason)
+
+
+def inconclusive(reason: str) -> Finding:
+    return Finding(Verdict.INCONCLUSIVE, reason)
+
+
+Judge = Callable[[Observation], Finding]
+"""Pure: the same observation, the same finding."""
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """The part of a case that people see, and its judge.
+
+    `id` is the catalogue's, with a letter behind it where a row is several cases. `clause` names the source as
+    the catalogue does.
+    """
+
+    id: str
+    title: str
+    clause: str
+    danger: Danger
+    does: str
+    must: str
+    judge: Judge
+
+    @property
+    def row(self) -> str:
+        """The row of the catalogue."""
+        return self.id.rstrip("abcdefgh")
+
+    role = "master"
+
+    def chosen(self, only: frozenset[str]) -> bool:
+        """Whether `only` names it, or its row; all are chosen by none."""
+        return not only or self.id in only or self.row in only

@@ -1,0 +1,141 @@
+"""What the hostile device does on any framing, and on serial lines. Pure: a request in, moves out."""
+
+from __future__ import annotations
+
+import itertools
+
+from emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.conformance.scene import Move, Play, Say, Scene
+
+SPLIT_S = 0.016
+"""The latency timer of a usual USB adapter."""
+LATE = 1.5
+"""So many timeouts behind the request a late reply comes."""
+
+
+def nothing(scene: Scene) -> list[Move]:
+    return []
+
+
+def bad_crc(scene: Scene) -> list[Move]:
+    frame = scene.frame(scene.false)
+    return [Say(frame[:-2] + bytes(b ^ 0xFF for b in frame[-2:]))]
+
+
+def truncated(scene: Scene) -> list[Move]:
+    frame = scene.frame(scene.false)
+    return [Say(frame[: max(len(frame) - 3, 4)])]
+
+
+def paused(scene: Scene) -> list[Move]:
+    frame = scene.frame(scene.true)
+    return [Say(frame[:4]), Say(frame[4:], 0.010)]
+
+
+def split_16_ms(scene: Scene) -> list[Move]:
+    frame = scene.frame(scene.true)
+    cuts = (0, 1, 3, 5, len(frame))
+    return [Say(frame[a:b], i * SPLIT_S) for i, (a, b) in enumerate(itertools.pairwise(cuts))]
+
+
+def glued(scene: Scene) -> list[Move]:
+    return [Say(scene.from_unit(scene.neighbour, scene.false) + scene.frame(scene.true))]
+
+
+def leading_noise(scene: Scene) -> list[Move]:
+    return [Say(b"\x00\xff\x00" + scene.frame(scene.true))]
+
+
+def trailing_zeros(scene: Scene) -> list[Move]:
+    return [Say(scene.frame(scene.true) + b"\0\0")]
+
+
+def echo(scene: Scene) -> list[Move]:
+    return [Say(with_crc(scene.request)), Say(scene.frame(scene.true), 0.005)]
+
+
+def corrupt_echo(scene: Scene) -> list[Move]:
+    sent = bytearray(with_crc(scene.request))
+    sent[3] ^= 0x10
+    return [Say(bytes(sent))]
+
+
+def late(scene: Scene) -> list[Move]:
+    """The first request is answered too late, with the poison; what comes meanwhile waits its turn behind it."""
+    return [Say(scene.frame(scene.false), LATE * scene.timeout_s)]
+
+
+def late_other(scene: Scene) -> list[Move]:
+    """The first request is answered when one of another shape has come; that one is answered behind it."""
+    if scene.first is None:
+        return []
+    if scene.first.request == scene.request:
+        return [scene.good()]
+    return [Say(scene.first.frame(scene.first.false)), scene.good(0.050)]
+
+
+def second_reply(scene: Scene) -> list[Move]:
+    return [scene.good(), Say(scene.frame(scene.false), 0.003)]
+
+
+def other_unit(scene: Scene) -> list[Move]:
+    return [Say(scene.from_unit(scene.neighbour, scene.false))]
+
+
+def other_unit_first(scene: Scene) -> list[Move]:
+    return [Say(scene.from_unit(scene.neighbour, scene.false)), Say(scene.frame(scene.true), 0.020)]
+
+
+def other_function(scene: Scene) -> list[Move]:
+    return [Say(scene.frame(bytes((scene.function ^ 0x07,)) + scene.false[1:]))]  # 03 and 04 change places
+
+
+def too_few(scene: Scene) -> list[Move]:
+    data = scene.false[2:-2]
+    return [Say(scene.frame(bytes((scene.function, len(data))) + data))]
+
+
+def too_many(scene: Scene) -> list[Move]:
+    data = scene.false[2:] + scene.false[-2:]
+    return [Say(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
+
+
+def count_255(scene: Scene) -> list[Move]:
+    return [Say(scene.frame(scene.false[:1] + b"\xff" + scene.false[2:]))]
+
+
+def odd_count(scene: Scene) -> list[Move]:
+    data = scene.false[2:] + scene.false[-1:]
+    return [Say(scene.frame(bytes((scene.function, len(data) & 0xFF)) + data))]
+
+
+def other_echo(scene: Scene) -> list[Move]:
+    return [Say(scene.frame(scene.true[:-1] + bytes((scene.true[-1] ^ 0x01,))))]
+
+
+def other_exception(scene: Scene) -> list[Move]:
+    return [Say(scene.refuse(2, scene.function ^ 0x07))]
+
+
+def exception(code: int) -> Play:
+    return lambda scene: [Say(scene.refuse(code))]
+
+
+def hole(scene: Scene) -> list[Move]:
+    return [Say(scene.refuse(2))]
+
+
+def garbage(scene: Scene) -> list[Move]:
+    """Twice the baud rate makes of a byte two, with framing errors: bits doubled, idle bits between them."""
+    frame = scene.frame(scene.false)
+    out = bytearray()
+    for byte in frame:
+        spread = sum(3 << 2 * bit for bit in range(8) if byte >> bit & 1)
+        out += bytes((spread & 0xFF | 0x80, spread >> 8 | 0xC0))
+    return [Say(bytes(out))]
+
+
+def collision(scene: Scene) -> list[Move]:
+    """Two senders at once: where either drives a 0 there is a 0."""
+    ours, other = scene.frame(scene.false), scene.from_unit(scene.neighbour, scene.true[:1] + scene.true[1:])
+    return [Say(bytes(a & b for a, b in zip(ours, other[1:] + other[:1], strict=False)))]

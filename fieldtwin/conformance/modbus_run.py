@@ -1,0 +1,245 @@
+"""Plays the cases against a Modbus master, one after the other, and has each judged.
+
+First the master's habit is learnt; before each case all is well, after each one too. What cannot be brought about is skipped with
+the reason, what the master did not take part in is inconclusive.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+from fieldtwin.conformance.case import Danger, Finding, inconclusive, skipped
+from fieldtwin.conformance.line_plays import nothing
+from fieldtwin.conformance.modbus_cases import CASES
+from fieldtwin.conformance.modbus_stage import Stage
+from fieldtwin.conformance.observation import Asked, Ended, Habit, Observation, Shown, Told, Word
+from fieldtwin.conformance.probe import OutputProbe, Probe
+from fieldtwin.conformance.results import CaseResult
+from fieldtwin.conformance.scene import ModbusCase
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import Unreachable
+
+POLL_S = 0.01
+STEADY = 3
+"""So many polls make a habit."""
+TRAIL_S = 0.3
+"""How long a case looks on after the master is back to good: what it publishes late is seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is to be played. `timeout_s` is the master's response timeout, 0 if unknown; `patience_s` how long anything may
+    take, `wait_s` until the master first asks; `has` the options that single cases need (``echo``); `at_most` the highest danger;
+    `for_s` the end of it all, 0 for none."""
+
+    only: frozenset[str] = frozenset()
+    timeout_s: float = 0.0
+    patience_s: float = 10.0
+    wait_s: float = 30.0
+    for_s: float = 0.0
+    has: frozenset[str] = frozenset()
+    at_most: Danger = Danger.DISRUPT
+
+
+@dataclass
+class ModbusRun:
+    """One judgement of a master. `traits` of the endpoint as `modbus_stage.traits` says; `tell` hears each result as it comes."""
+
+    stage: Stage
+    plan: Plan
+    traits: frozenset[str]
+    probe: Probe | None = None
+    cases: Iterable[ModbusCase] = CASES
+    tell: Callable[[CaseResult], None] = lambda result: None
+    results: list[CaseResult] = field(default_factory=list)
+    habit: Habit = field(default_factory=Habit)
+
+    def __post_init__(self) -> None:
+        self._word = Word.FIRST
+        self._ended: Ended | None = None
+        self._started_ns = self.stage.now_ns()
+        if self.probe is not None:
+            self.probe.on_shown = self._shown
+
+    # -- what others tell -----------------------------------------------------------------------------------------
+
+    def _shown(self, word: Word, text: str) -> None:
+        self.stage.recorder.add(Shown(self.stage.now_ns(), word, text))
+        self._latest = word
+
+    def ended(self, status: int) -> None:
+        """The program under test ended by itself."""
+        self._ended = Ended(self.stage.now_ns(), status)
+        self.stage.recorder.add(self._ended)
+
+    # -- the run --------------------------------------------------------------------------------------------------
+
+    async def run(self) -> list[CaseResult]:
+        """Results in the order of the cases. Raises `Unreachable` where no master ever asked."""
+        await self._learn()
+        chosen = [case for case in self.cases if case.about.chosen(self.plan.only)]
+        for case in [c for c in chosen if c.wants != "nothing"]:
+            await self._case(case)
+        for case in [c for c in chosen if c.wants == "nothing"]:
+            self._watched(case)
+        return self.results
+
+    async def _learn(self) -> None:
+        """The habit, what the honest words look like, and how long silence is waited for."""
+        stage = self.stage
+        if not await self._until(lambda: any(isinstance(e, Asked) for e in stage.recorder.since(0)), self.plan.wait_s):
+            raise Unreachable("no master asked for anything", hint=f"within {self.plan.wait_s:g} s")
+        since_ns = stage.now_ns()
+        await self._until(lambda: stage.recorder.count(Asked, since_ns) >= 2 * STEADY, self.plan.patience_s)
+        if self.probe is not None:
+            await self._teach(Word.FIRST)
+            await self._teach(Word.SECOND)
+        habit_since_ns, until_ns = since_ns, stage.now_ns()
+        silent_gap_s = 0.0
+        if self._ended is None:
+            silent_gap_s = await self._silence()
+        self.habit = stage.recorder.habit(habit_since_ns, until_ns, silent_gap_s)
+        stage.timeout_s = self.plan.timeout_s or silent_gap_s or 1.0
+
+    async def _teach(self, word: Word) -> None:
+        assert self.probe is not None
+        self._say(word)
+        since_ns = self.stage.now_ns()
+        await self._polled(STEADY, since_ns, self.plan.patience_s)
+        await asyncio.sleep(TRAIL_S)
+        probe = self.probe
+        if not await self._until(lambda: probe.learn(word), self.plan.patience_s):
+            held = f"the device holds {self.stage.device.word}"
+            raise Unreachable("the probe never showed the value that the device holds, or shows all alike", hint=held)
+
+    async def _silence(self) -> float:
+        """From a request that nobody answers to the next one, in seconds; 0 if there was none."""
+        about = CASES[0].about
+        self.stage.begin(ModbusCase(about, nothing, strikes=1))
+        await self._until(lambda: self.stage.struck > 0, self.plan.patience_s)
+        first_ns = self.stage.first_ns
+        if first_ns:
+            await self._until(lambda: self._next_asked(first_ns) is not None, self.plan.patience_s)
+        self.stage.end()
+        following = self._next_asked(first_ns) if first_ns else None
+        await self._polled(2, self.stage.now_ns(), self.plan.patience_s)
+        return (following - first_ns) / NS_PER_S if following else 0.0
+
+    def _next_asked(self, after_ns: int) -> int | None:
+        return next((e.t_ns for e in self.stage.recorder.since(after_ns + 1) if isinstance(e, Asked)), None)
+
+    # -- one case -------------------------------------------------------------------------------------------------
+
+    async def _case(self, case: ModbusCase) -> None:
+        since_ns = self.stage.now_ns()
+        reason = self._not_here(case)
+        if reason:
+            self._done(case, skipped(reason), since_ns)
+        elif self._ended is not None:
+            self._done(case, inconclusive(f"the master had ended before, exit code {self._ended.status}"), since_ns)
+        elif self.plan.for_s and (since_ns - self._started_ns) / NS_PER_S >= self.plan.for_s:
+            self._done(case, inconclusive(f"not within {self.plan.for_s:g} s (--for)"), since_ns)
+        elif not await self._well():
+            self._done(
+                case, inconclusive("all was not well before it began: the master did not take honest answers"), since_ns
+            )
+        else:
+            self._done(case, await self._play(case), since_ns)
+
+    def _not_here(self, case: ModbusCase) -> str:
+        if not self.traits & set(case.framings):
+            return "there is no such thing on this endpoint"
+        if case.needs and case.needs not in self.plan.has:
+            return f"only with --{case.needs}"
+        if case.about.danger.rank > self.plan.at_most.rank:
+            return f"its danger is {case.about.danger.value}, {self.plan.at_most.value} is allowed"
+        return ""
+
+    async def _well(self) -> bool:
+        """Two honest answers were given, and their word is seen."""
+        since_ns = self.stage.now_ns()
+        return await self._good_again(since_ns)
+
+    async def _good_again(self, since_ns: int) -> bool:
+        return await self._until(
+            lambda: self.stage.recorder.count(Told, since_ns) >= 2 and self._seen(self._word, since_ns),
+            self.plan.patience_s,
+        )
+
+    def _seen(self, word: Word, since_ns: int) -> bool:
+        if self.probe is None:
+            return True
+        return any(isinstance(e, Shown) and e.word is word for e in self.stage.recorder.since(since_ns))
+
+    async def _play(self, case: ModbusCase) -> Finding:
+        stage, before = self.stage, self._word
+        after = Word.SECOND if before is Word.FIRST else Word.FIRST
+        start_ns = stage.now_ns()
+        if case.holds_good:
+            self._say(after)
+            if self.probe is not None:
+                case = case.on(strikes=1_000_000)
+        stage.begin(case)
+        fits = await self._until(lambda: stage.struck > 0, min(self.plan.patience_s, 4 * self.habit.longest_gap_s + 1))
+        if not fits:
+            stage.end()
+            return skipped(f"it sent no {case.wants} to answer so")
+        done = (
+            (lambda: self._seen(after, start_ns))
+            if case.holds_good and self.probe
+            else (lambda: stage.struck >= case.strikes)
+        )
+        await self._until(done, self.plan.patience_s)
+        stage.end()
+        await self._until(lambda: stage.pending == 0, self.plan.patience_s)
+        over_ns = stage.now_ns() if case.holds_good else max(stage.last_ns, stage.first_ns)
+        self._say(after)
+        await self._good_again(over_ns)
+        await asyncio.sleep(TRAIL_S)
+        until_ns = stage.now_ns()
+        events = stage.recorder.since(stage.first_ns)
+        seen = Observation(
+            events, stage.first_ns, over_ns, until_ns, self.habit, before, after,
+            self.probe is not None, self.plan.timeout_s, self.plan.patience_s,
+        )  # fmt: skip
+        return case.about.judge(seen)
+
+    def _watched(self, case: ModbusCase) -> None:
+        now_ns = self.stage.now_ns()
+        reason = self._not_here(case)
+        if reason:
+            self._done(case, skipped(reason), now_ns)
+            return
+        events = self.stage.recorder.since(0)
+        self._done(case, case.about.judge(Observation(events, 0, 0, now_ns, self.habit)), now_ns)
+
+    def _done(self, case: ModbusCase, finding: Finding, since_ns: int) -> None:
+        result = CaseResult(case.about, finding, (self.stage.now_ns() - since_ns) / NS_PER_S)
+        self.results.append(result)
+        self.tell(result)
+
+    # -- small things ---------------------------------------------------------------------------------------------
+
+    def _say(self, word: Word) -> None:
+        self._word = word
+        self.stage.device.word = self.stage.first_word if word is Word.FIRST else self.stage.second_word
+
+    async def _polled(self, count: int, since_ns: int, within_s: float) -> bool:
+        return await self._until(lambda: self.stage.recorder.count(Told, since_ns) >= count, within_s)
+
+    async def _until(self, condition: Callable[[], bool], within_s: float) -> bool:
+        """Whether `condition` came to hold; also over when the master has ended."""
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + within_s
+        while not condition():
+            if loop.time() >= deadline or self._ended is not None:
+                return condition()
+            await asyncio.sleep(POLL_S)
+        return True
+
+
+def is_printed(probe: Probe | None) -> bool:
+    """Whether values are read from what a program prints."""
+    return isinstance(probe, OutputProbe)

@@ -1,0 +1,209 @@
+"""The endpoint that a Modbus master under test talks to: honest, until a play is on. It records everything and judges nothing.
+
+Knows connections and time, no case by name.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+
+from emulators.endpoints.socket_end import SocketEnd
+from emulators.modbus.bank import Table
+from emulators.virtual.wire import MemoryEnd
+from fieldtwin.conformance.modbus_device import (
+    READS,
+    REGISTER_READS,
+    WRITES,
+    HonestDevice,
+    MbapWire,
+    ModbusWire,
+    RtuWire,
+)
+from fieldtwin.conformance.observation import Asked, Came, Garbled, Left, Told
+from fieldtwin.conformance.recorder import Recorder
+from fieldtwin.conformance.scene import Hang, ModbusCase, Move, Say, Scene
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import ByteConnection
+from gateway.core.errors import ConnectionLost
+from gateway.core.nursery import Nursery
+
+BEHIND_S = 0.050
+"""How long after an odd answer the next honest one comes at the soonest."""
+LINE_GAP_S = 0.060
+"""A pause that ends a frame on a line: what is left then is garbage."""
+
+
+class Stage:
+    """Serves every client of the endpoint. `play` is what is on; None: all are answered well.
+
+    `struck` counts misanswered requests, `first_ns` is the first one's time, `last_ns` when the last odd thing was done;
+    `pending` says how many moves still wait for their time.
+    """
+
+    def __init__(
+        self, make_wire: Callable[[], ModbusWire], words: tuple[int, int, int], held: Mapping[tuple[Table, int], int]
+    ) -> None:
+        self.recorder = Recorder()
+        self.first_word, self.second_word, self.poison = words
+        self.device = HonestDevice(self.first_word, held)
+        self.play: ModbusCase | None = None
+        self.timeout_s = 1.0
+        self.struck = self.first_ns = self.last_ns = self.pending = 0
+        self.clients = 0
+        self.on_event: Callable[[], None] = lambda: None
+        self._make_wire = make_wire
+        self._first: Scene | None = None
+        self._loop = asyncio.get_running_loop()
+
+    def now_ns(self) -> int:
+        return round(self._loop.time() * NS_PER_S)
+
+    def begin(self, case: ModbusCase) -> None:
+        """From the next fitting request on `case` is played, until its strikes are used up or `end` is called."""
+        self.play, self._first = case, None
+        self.struck = self.first_ns = self.last_ns = 0
+
+    def end(self) -> None:
+        """All is answered well from now on; moves under way are made."""
+        self.play = None
+
+    async def serve(self, connection: ByteConnection) -> None:
+        """One client until it is gone."""
+        self.clients += 1
+        number, wire = self.clients, self._make_wire()
+        client = _Client(self, connection, wire, number)
+        self.note(Came(self.now_ns(), number))
+        try:
+            async with Nursery() as nursery:
+                client.nursery = nursery
+                await client.read()
+        except ConnectionLost:
+            pass
+        finally:
+            self.note(Left(self.now_ns(), number, client.hung_up))
+
+    def note(self, event: Asked | Told | Garbled | Came | Left) -> None:
+        self.recorder.add(event)
+        self.on_event()
+
+    def moves(self, wire: ModbusWire, request: bytes, tag: int) -> list[Move]:
+        """What is done about a request: honest, or what the play says."""
+        now_ns = self.now_ns()
+        true = self.device.answer(request[1:], now_ns)
+        case = self.play
+        if request[0] == 0 and isinstance(wire, RtuWire):
+            return []  # a broadcast: nobody answers
+        honest: list[Move] = [Say(wire.frame(request, tag, true), good=True)] if true else []
+        if case is None or self.struck >= case.strikes or not true or not _wanted(case, request):
+            return honest
+        false = self.device.answer_with(self.poison, request[1:], now_ns) if request[1] in READS else true
+        scene = Scene(wire, request, tag, true, false, self.struck, self.timeout_s, self._first)
+        made = case.play(scene)
+        self._first = self._first or scene
+        self.struck += 1
+        self.first_ns = self.first_ns or now_ns
+        self.last_ns = now_ns
+        return made
+
+
+def _wanted(case: ModbusCase, request: bytes) -> bool:
+    function = request[1]
+    if case.wants == "register read":
+        return function in REGISTER_READS
+    if case.wants == "read of several":
+        return function in REGISTER_READS and int.from_bytes(request[4:6], "big") > 1
+    return function in (READS if case.wants == "read" else WRITES if case.wants == "write" else ())
+
+
+class _Client:
+    nursery: Nursery
+
+    def __init__(self, stage: Stage, connection: ByteConnection, wire: ModbusWire, number: int) -> None:
+        self.hung_up = False
+        self._stage = stage
+        self._connection = connection
+        self._wire = wire
+        self._number = number
+        self._free_ns = 0
+        self._dirty = False
+
+    async def read(self) -> None:
+        while True:
+            data = await self._next()
+            now_ns = self._stage.now_ns()
+            for request, tag in self._wire.cut(data, now_ns):
+                self._stage.note(Asked(now_ns, self._number, request, tag))
+                self._answer(self._stage.moves(self._wire, request, tag), now_ns)
+            self._dirty = bool(data)
+            if garbage := self._wire.garbage():
+                self._stage.note(Garbled(now_ns, self._number, data[-garbage:]))
+
+    async def _next(self) -> bytes:
+        """The next bytes, or none when a line has paused: what is left of a frame stays unfinished."""
+        if not self._dirty or isinstance(self._wire, MbapWire):
+            return await self._connection.read()
+        try:
+            async with asyncio.timeout(LINE_GAP_S):
+                return await self._connection.read()
+        except TimeoutError:
+            return b""
+
+    def _answer(self, moves: list[Move], now_ns: int) -> None:
+        """Moves keep their order, and honest answers keep behind odd ones: a device does one thing after the other."""
+        start_ns = now_ns
+        if self._free_ns > now_ns and any(isinstance(m, Say) and m.good for m in moves):
+            start_ns = self._free_ns + round(BEHIND_S * NS_PER_S)
+        timed = [(start_ns + round(move.after_s * NS_PER_S), move) for move in moves]
+        odd = [t for t, move in timed if not (isinstance(move, Say) and move.good)]
+        self._free_ns = max([self._free_ns, *odd])
+        if not timed:
+            return
+        self._stage.pending += len(timed)
+        self.nursery.start(self._make(timed), "moves")
+
+    async def _make(self, timed: list[tuple[int, Move]]) -> None:
+        left = len(timed)
+        try:
+            for t_ns, move in timed:
+                if (wait_ns := t_ns - self._stage.now_ns()) > 0:
+                    await asyncio.sleep(wait_ns / NS_PER_S)
+                await self._do(move)
+                left -= 1
+                self._stage.pending -= 1
+        except ConnectionLost:
+            pass  # the master hung up before it was answered
+        finally:
+            self._stage.pending -= left
+            self._stage.on_event()
+
+    async def _do(self, move: Move) -> None:
+        now_ns = self._stage.now_ns()
+        if isinstance(move, Hang):
+            self._stage.last_ns = now_ns
+            self.hung_up = True
+            await _hang_up(self._connection, reset=move.reset)
+            return
+        if not move.good:
+            self._stage.last_ns = now_ns
+        self._stage.note(Told(now_ns, self._number, move.data, move.good))
+        await self._connection.write(move.data)
+
+
+async def _hang_up(connection: ByteConnection, *, reset: bool) -> None:
+    if isinstance(connection, SocketEnd) and reset:
+        connection.evict(reset=True)
+    elif isinstance(connection, MemoryEnd) and reset:
+        connection.wire.cut(ConnectionLost("the connection was reset", where=str(connection.endpoint)))
+    else:
+        await connection.aclose()
+
+
+def wire_for(scheme: str) -> Callable[[], ModbusWire]:
+    """What frames are told by on an endpoint of `scheme`."""
+    return MbapWire if scheme == "tcp" else RtuWire
+
+
+def traits(scheme: str) -> frozenset[str]:
+    """What a case may ask for: ``rtu`` or ``tcp`` framing, and ``stream`` where a connection can be hung up."""
+    return frozenset({"tcp", "stream"} if scheme == "tcp" else {"rtu", "stream"} if scheme == "rtu+tcp" else {"rtu"})

@@ -1,0 +1,135 @@
+"""What a case saw of the master under test: frames and times, and what the master published. Plain values.
+
+Judges get an `Observation` and nothing else, so that they can be tested without a wire.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import TypeVar
+
+from gateway.core.clock import NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A whole request of the master. `target` is what of a request counts as its shape: equal for one that is repeated
+    (Modbus: unit and PDU; SDO: node and the eight bytes). `tag` is the transaction id, 0 where there is none."""
+
+    t_ns: int
+    client: int
+    target: bytes
+    tag: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the device sent; `good` if it was a true answer in an honest frame."""
+
+    t_ns: int
+    client: int
+    data: bytes
+    good: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Garbled:
+    """Bytes of the master that are no request."""
+
+    t_ns: int
+    client: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Came:
+    """A connection of the master, numbered from 1. A serial line and a bus have one that is always there."""
+
+    t_ns: int
+    client: int
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """A connection ended; `by_us` if the case did it."""
+
+    t_ns: int
+    client: int
+    by_us: bool = False
+
+
+class Word(Enum):
+    """What a published value is. FIRST and SECOND are the two that honest answers hold."""
+
+    FIRST = "first"
+    SECOND = "second"
+    POISON = "poison"
+    OTHER = "other"
+    NONE = "none"
+    """No value, or one that stands for none: bad quality, not a number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """What the probe says that the master publishes. `text` is it as it was read."""
+
+    t_ns: int
+    word: Word
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """The program under test ended by itself."""
+
+    t_ns: int
+    status: int
+
+
+Event = Asked | Told | Garbled | Came | Left | Shown | Ended
+E = TypeVar("E", Asked, Told, Garbled, Came, Left, Shown, Ended)
+
+
+@dataclass(frozen=True, slots=True)
+class Habit:
+    """How the master polls while all is well. Seconds.
+
+    `period_s`: shape -> usual time between two requests of it; `longest_gap_s`: between any two requests; `silent_gap_s`: from
+    a request that nobody answered to the next request, 0 where that was not found out; `rate_per_s`: requests.
+    """
+
+    period_s: dict[bytes, float] = field(default_factory=dict)
+    longest_gap_s: float = 1.0
+    silent_gap_s: float = 0.0
+    rate_per_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One case. `begun_ns`: the first request that was misanswered; `over_ns`: the last odd thing that the device did, from
+    then on it was honest; `until_ns`: when the case stopped looking. `before` and `after` are the words that honest answers
+    held before and behind that. `timeout_s`: the master's response timeout as its user says, 0 where nobody said.
+    """
+
+    events: tuple[Event, ...]
+    begun_ns: int
+    over_ns: int
+    until_ns: int
+    habit: Habit = field(default_factory=Habit)
+    before: Word = Word.FIRST
+    after: Word = Word.SECOND
+    probed: bool = False
+    timeout_s: float = 0.0
+    patience_s: float = 10.0
+
+    def of(self, kind: type[E], since_ns: int = 0, until_ns: int | None = None) -> Iterator[E]:
+        """Events of a kind in a time window, both ends included, in order."""
+        for event in self.events:
+            if isinstance(event, kind) and since_ns <= event.t_ns and (until_ns is None or event.t_ns <= until_ns):
+                yield event
+
+    def since_s(self, t_ns: int) -> float:
+        """Seconds since the misbehaviour began."""
+        return (t_ns - self.begun_ns) / NS_PER_S

@@ -1,0 +1,101 @@
+"""What a play has to work with: the request, true and false answers to it, and moves. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.conformance.case import Case
+from fieldtwin.conformance.modbus_device import MbapWire, ModbusWire, mbap
+
+
+@dataclass(frozen=True, slots=True)
+class Say:
+    """Send `data`, `after_s` seconds behind the request."""
+
+    data: bytes
+    after_s: float = 0.0
+    good: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Hang:
+    """End the connection, by a reset where the wire has such a thing."""
+
+    after_s: float = 0.0
+    reset: bool = False
+
+
+Move = Say | Hang
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One request that is to be misanswered.
+
+    `request` is unit id and PDU, `tag` its transaction id. `true` is the honest response PDU, `false` one of the same shape with
+    the poisoned word. `nth` counts the requests of the case from 0. `timeout_s` is the master's response timeout, or the best
+    guess. `first` is the case's first scene, None in it.
+    """
+
+    wire: ModbusWire
+    request: bytes
+    tag: int
+    true: bytes
+    false: bytes
+    nth: int = 0
+    timeout_s: float = 1.0
+    first: Scene | None = None
+
+    @property
+    def unit(self) -> int:
+        return self.request[0]
+
+    @property
+    def function(self) -> int:
+        return self.request[1]
+
+    def good(self, after_s: float = 0.0) -> Say:
+        """The honest answer in a plain frame."""
+        return Say(self.frame(self.true), after_s, good=True)
+
+    def frame(self, pdu: bytes) -> bytes:
+        """A plain frame around any PDU."""
+        return self.wire.frame(self.request, self.tag, pdu)
+
+    def from_unit(self, unit: int, pdu: bytes) -> bytes:
+        """A frame that another unit sent."""
+        return mbap(self.tag, unit, pdu) if isinstance(self.wire, MbapWire) else with_crc(bytes((unit,)) + pdu)
+
+    @property
+    def neighbour(self) -> int:
+        """The id of another unit."""
+        return self.unit % 247 + 1
+
+    def refuse(self, code: int, function: int | None = None) -> bytes:
+        """An exception response in a plain frame."""
+        return self.frame(bytes(((function or self.function) | 0x80, code)))
+
+
+Play = Callable[[Scene], list[Move]]
+Wants = Literal["register read", "read", "write", "read of several", "nothing"]
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusCase:
+    """A case with its play. `strikes`: so many requests are misanswered; `holds_good` where the odd frames hold the honest
+    word, and go on until it was seen. `framings`: where there is such a thing (``rtu``, ``tcp``, ``stream`` for anything that
+    can be hung up). `needs` names an option without which the case makes no sense."""
+
+    about: Case
+    play: Play
+    wants: Wants = "register read"
+    strikes: int = 2
+    holds_good: bool = False
+    framings: tuple[str, ...] = ("rtu", "tcp")
+    needs: str = ""
+
+    def on(self, **changes: object) -> ModbusCase:
+        return replace(self, **changes)  # type: ignore[arg-type]

@@ -1,0 +1,84 @@
+"""Waivers: failures that somebody answers for, until a day that is named.
+
+    waivers:
+      - id: MB-013
+        reason: the driver is replaced in May, ticket 4711
+        expires: 2027-05-31
+
+An id is one of a case, or of a row of the catalogue with all its cases; scenarios use theirs. Whoever has results looks up `of`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from datetime import date
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from gateway.core.yaml_file import YamlFile, load, validate
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    id: Annotated[str, Field(min_length=1)]
+    reason: Annotated[str, Field(min_length=3)]
+    expires: date
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    waivers: list[_Entry]
+
+
+@dataclass(frozen=True, slots=True)
+class Waiver:
+    """`id` fails for a `reason` that is known; the day `expires` is the last one on which that is good enough."""
+
+    id: str
+    reason: str
+    expires: date
+
+    def expired(self, today: date) -> bool:
+        return today > self.expires
+
+
+@dataclass(frozen=True, slots=True)
+class Waivers:
+    """All of a file. `Waivers()` waives nothing."""
+
+    entries: tuple[Waiver, ...] = ()
+
+    def of(self, *ids: str) -> Waiver | None:
+        """The waiver of the first of `ids` that has one."""
+        for id in ids:
+            for waiver in self.entries:
+                if waiver.id == id:
+                    return waiver
+        return None
+
+
+def load_waivers(path: Path, known: Collection[str]) -> Waivers:
+    """Read a file. `known` are the ids that there are; another one, or one that stands twice, is `FileInvalid`."""
+    return read_waivers(load(path), known)
+
+
+def read_waivers(file: YamlFile, known: Collection[str]) -> Waivers:
+    """As `load_waivers`, of a file that was read."""
+    entries = validate(file, _File).waivers
+    seen: set[str] = set()
+    for at, entry in enumerate(entries):
+        if entry.id not in known:
+            near = get_close_matches(entry.id, known, 1)
+            raise file.error(
+                ("waivers", at, "id"), f"no case {entry.id!r}", expected=near[0] if near else "an id such as MB-013"
+            )
+        if entry.id in seen:
+            raise file.error(("waivers", at, "id"), f"{entry.id!r} is waived twice")
+        seen.add(entry.id)
+    return Waivers(tuple(Waiver(e.id, e.reason, e.expires) for e in entries))

@@ -27,15 +27,12 @@ def coverage_section(report: Report, counts: Counts) -> Markup:
         devices = devices_covered(report.system, counts)
         parts.append(el("h3", "Registers and objects"))
         parts += [_device(d) for d in devices]
-        if any(b.endpoint.is_can for b in report.system.buses.values()) or counts.aborts:
-            aborts = _codes("SDO abort codes", counts.aborts, _abort, aborts_missing(counts), len(MEANINGS))
-        else:
-            aborts = Markup("")
-        names = ModbusExceptionReply.NAMES
-        parts.append(
-            _codes("Modbus exception codes", counts.exceptions, _exception, exceptions_missing(counts), len(names))
-        )
-        parts.append(aborts)
+    spoken = {b.endpoint.is_can for b in report.system.buses.values()} if report.system is not None else set()
+    if False in spoken or counts.exceptions:
+        missing, known = exceptions_missing(counts), len(ModbusExceptionReply.NAMES)
+        parts.append(_codes("Modbus exception codes", counts.exceptions, _exception, missing, known))
+    if True in spoken or counts.aborts:
+        parts.append(_codes("SDO abort codes", counts.aborts, _abort, aborts_missing(counts), len(MEANINGS)))
     parts.append(_problems(counts))
     parts += [_transitions(machine, counts) for machine in report.machines]
     parts.append(_pairs(report, counts))

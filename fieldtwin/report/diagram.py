@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.decoding.tags import show_value
 from fieldtwin.report.axis import CHAR, LEFT, RIGHT, WIDTH, Axis, fitted, label, seconds
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.value_lanes import value_lane
@@ -30,6 +31,7 @@ def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
     lanes: list[tuple[float, list[Markup]]] = []
     lanes += [_fault_lane(axis, bar) for bar in window.faults[:MOST_FAULTS]]
     lanes += [_wire_lane(axis, window, bus, system) for bus in _buses(window)]
+    lanes += _scan_lane(axis, window, system)
     for names, steps in ((_chosen(window, window.states), window.states), (_chosen(window, window.tags), window.tags)):
         for name in names:
             tag = _tag(system, name) if steps is window.tags else None
@@ -142,6 +144,23 @@ def _row(exchange: Exchange) -> int:
     return 0 if exchange.latency_ns is not None or exchange.problem == "no reply" else 1
 
 
+def _scan_lane(axis: Axis, window: Window, system: System | None) -> list[tuple[float, list[Markup]]]:
+    """The scans that changed something, each with what it changed; the others left nothing to draw."""
+    changed: dict[int, list[str]] = {}
+    for name, steps in window.states.items():
+        for step in steps:
+            if step.t_ns >= window.start_ns:
+                changed.setdefault(step.t_ns, []).append(f"{name} = {show_value(step.value)}")
+    if not changed:
+        return []
+    every = f"every {system.plc.cycle_ms:g} ms" if system else ""
+    marks = label("scans with changes", every)
+    for t_ns in sorted(changed)[-MOST_MARKS:]:
+        said = "\n".join([seconds(t_ns), *changed[t_ns][:8]])
+        marks.append(el("rect", el("title", said), cls="x scan", x=axis.x(t_ns), y=6.0, width=2.2, height=16.0))
+    return [(34.0, marks)]
+
+
 def _kind(exchange: Exchange) -> str:
     if exchange.ok:
         return "message" if exchange.latency_ns is None else "asked" if not exchange.writes() else "wrote"
@@ -156,17 +175,13 @@ def _short(exchange: Exchange) -> str:
         return f"abort {exchange.abort:08X}h"
     if exchange.problem:
         return f"{exchange.device or f'unit {exchange.unit}'}: {exchange.problem}"
-    text = (
-        exchange.text.partition(": ")[2]
-        if exchange.device and exchange.text.startswith(exchange.device)
-        else exchange.text
-    )
+    name = exchange.device or (f"unit {exchange.unit}" if exchange.unit else "")
+    text = exchange.text.removeprefix(f"{name}: ")
     verb = {"read holding registers": "read", "read input registers": "read", "write registers": "write"}
     for long, short in verb.items():
         if text.startswith(long):
             where = exchange.spans[0] if exchange.spans else ""
             text = f"{short} {str(where).partition(' ')[0]}"
-    name = exchange.device or (f"unit {exchange.unit}" if exchange.unit else "")
     said = f"{name} {text}".strip()
     return said if len(said) <= 46 else said[:45] + "…"
 

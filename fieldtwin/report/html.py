@@ -149,7 +149,10 @@ def _why(scenario: ScenarioResult) -> str:
     if scenario.reason or scenario.verdict is Verdict.PASSED:
         return _cut(scenario.reason, 300)
     first = next((c for c in scenario.checks if c.verdict is scenario.verdict), None)
-    return _cut(f"{first.number}: {first.text}" + (f"; got {first.got}" if first.got else ""), 300) if first else ""
+    if first is None:
+        return ""
+    why = f"; got {first.got}" if first.got else f"; {first.reason}" if first.reason else ""
+    return _cut(f"{first.number}: {first.text}{why}", 300)
 
 
 def _cut(said: str, most: int) -> str:

@@ -316,3 +316,12 @@ def test_results_need_no_protocols() -> None:
     code = "import sys, fieldtwin.report.model; print([m for m in ('pymodbus', 'canopen', 'twin.system') if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30)
     assert ran.stdout == "[]\n"
+
+
+def test_scans_that_changed_something_are_a_lane() -> None:
+    check = replace(FAILED, t_ns=2500 * MS, since_ns=1800 * MS, names=("relay.state",))
+    said = page(report(scenario(checks=(check,)))).said
+    assert "scans with changes every 10 ms" in said.replace(
+        "scans with changes scans with changes", "scans with changes"
+    )
+    assert "2.0100 s relay.state = 'ACTIVE' relay.period_s = 1" in said

@@ -52,6 +52,7 @@ class FieldDevice:
         self, emulated: EmulatedDevice, unit: EmulatedUnit | RecordedDevice | None, node: CanopenNode | None
     ) -> None:
         self.emulated = emulated
+        self.plays = emulated.plays
         self.unit = unit
         self.node = node
         self.journal: HeldJournal = HeldJournal()
@@ -345,6 +346,7 @@ class FieldSide:
                 name: {
                     "profile": d.emulated.profile.name,
                     "recording": str(d.emulated.recording or d.emulated.form.model),
+                    "plays": d.plays,
                     "commands": sorted(d.command_list),
                     "executed": d.executed(),
                     "unlisted": d.unit.unlisted if d.unit is not None else 0,

@@ -10,6 +10,7 @@ from emulators.replay.can_log import SUFFIX
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.profile import DeviceProfile, load_profile
+from gateway.core.recording import shown
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.data_files import find, find_recording
 from twin.system import System
@@ -33,6 +34,13 @@ class EmulatedDevice:
     profile: DeviceProfile
     form: EmulatedForm
     recording: Path | None
+
+    @property
+    def plays(self) -> str:
+        """What stands in for the device, as a person reads it: what is synthetic is never shown as measured."""
+        if self.recording is None:
+            return f"the model {self.form.model}"
+        return f"{self.recording.name} (log of a CAN bus)" if self.recording.suffix == SUFFIX else shown(self.recording)
 
 
 @dataclass(frozen=True)

@@ -289,7 +289,8 @@ def print_summary(summary: dict[str, Any]) -> None:
     data.print(f"[bold]{summary['system']}[/bold] ({kind}), {summary['duration_s']:.1f} s")
     for name, device in summary["devices"].items():
         mark = "[green]good[/green]" if device["state"] == "good" else f"[red]bad[/red] {device['error']}"
-        data.print(f"  {name:<14} {mark}", soft_wrap=True)
+        plays = f", from {device['plays']}" if "plays" in device else ""
+        data.print(f"  {name:<14} {mark}{plays}", soft_wrap=True, highlight=False)
     for program, states in summary["states"].items():
         data.print(f"  {program:<14} {' → '.join(states) or 'no scan seen'}")
     for bus, row in summary["exchanges"].items():

@@ -39,7 +39,7 @@ from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import RecordingReader
+from gateway.core.recording import RecordingReader, shown
 from gateway.wallclock import WallClock
 from twin.data_files import find_recording
 from twin.field import unit_limits
@@ -112,7 +112,9 @@ class DeviceHost:
             add_own_functions(unit, bank, profile)
             talk.print(f"{profile.name}: nothing recorded; every register of its profile begins with 0", soft_wrap=True)
             return unit
-        replay, recorded = load_replay(profile, find_recording(str(recording or f"{Path(profile.path).stem}.jsonl")))
+        path = find_recording(str(recording or f"{Path(profile.path).stem}.jsonl"))
+        replay, recorded = load_replay(profile, path)
+        talk.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
         return ProfiledReplay(profile, replay, recorded)
 
     def replayed(self, path: Path, unit_id: int | None) -> dict[int, ModbusUnit]:
@@ -125,6 +127,7 @@ class DeviceHost:
                     hint=f"fieldtwin emulate PROFILE --recording {path.name} --on ...",
                 )
             replay = ExchangeReplay(reader.exchanges())
+        talk.print(f"plays {shown(path)}", soft_wrap=True)
         wanted = [unit_id] if unit_id is not None else list(replay.units)
         return {number: ReplayUnit(replay, number, f"{path.name}:{number}") for number in wanted}
 
@@ -141,7 +144,9 @@ class DeviceHost:
         name = recording or self._recording_of(profile)
         if name is None:
             raise UsageError(f"{profile.name} needs a recording to play", hint="--recording FILE")
-        track = SignalTrack.load(find_recording(str(name)))
+        path = find_recording(str(name))
+        track = SignalTrack.load(path)
+        talk.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
         return SignalPlayer(track, self._clock.monotonic_ns(), speed=self._speed, at_end=WhenUsedUp.LOOP)
 
     async def serve(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:

@@ -53,6 +53,8 @@ def _say(side: FieldSide, process: FieldProcess, options: FieldOptions) -> None:
     for bus, endpoint in side.listening.items():
         devices = ", ".join(d.name for d in side.system.devices_on(bus))
         talk.print(f"  {bus}: {endpoint}  ({devices})", soft_wrap=True)
+    for name, emulated in side.devices.items():
+        talk.print(f"  {name}: from {emulated.plays}", soft_wrap=True)
     for device, endpoint in side.far.items():
         talk.print(f"  far end of {device}: {endpoint}", soft_wrap=True)
     host = options.control.rpartition(":")[0]

@@ -102,7 +102,7 @@ def summarise(run: Run) -> dict[str, Any]:
         "instance": run.instance.name,
         "duration_s": round(run.elapsed_s, 3),
         "mapping": {str(plant): str(target) for plant, target in run.mapping.items()},
-        "devices": _devices(gateway),
+        "devices": _devices(gateway, run.field_status or {}),
         "states": {program: run.states.sequence(program) for program in run.states.programs},
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
@@ -136,9 +136,12 @@ def summarise(run: Run) -> dict[str, Any]:
     }
 
 
-def _devices(gateway: dict[str, Any]) -> dict[str, Any]:
+def _devices(gateway: dict[str, Any], field: dict[str, Any]) -> dict[str, Any]:
+    """How each device was, and what stood in for it, where something did."""
+    emulated = field.get("devices", {})
     return {
         name: {"state": "good" if d["online"] else "bad", "error": d["error"]}
+        | ({"plays": emulated[name]["plays"]} if name in emulated else {})
         for name, d in gateway.get("devices", {}).items()
     }
 

@@ -123,6 +123,13 @@ def encode_row(t_s: float, values: Sequence[float]) -> bytes:
     return _encoder.encode([t_s, *values]) + b"\n"
 
 
+def shown(path: Path) -> str:
+    """A recording's name and where it comes from, as a person reads it: ``cast.jsonl (synthetic)``. Raises `FileInvalid`."""
+    with RecordingReader(path) as reader:
+        header = reader.header
+    return f"{path.name} ({header.source}{', of an emulator' if header.prototype else ''})"
+
+
 class RecordingReader:
     """A recording being read: `header` at once, then `exchanges()` or `rows()`, once, in the file's order.
 

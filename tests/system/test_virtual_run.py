@@ -42,6 +42,8 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     assert first["published"]["checked"] > 400
     assert first["published"]["wrong"] == 0
     assert first["outputs_safe"] is True
+    assert first["devices"]["ctd"] == {"state": "good", "error": "", "plays": "cast.jsonl (synthetic)"}
+    assert first["devices"]["modem"]["plays"] == "the model mailbox"
     assert first["exchanges"]["line1"]["gateway"] == first["exchanges"]["line1"]["emulators"]
 
 

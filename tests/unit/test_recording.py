@@ -26,6 +26,7 @@ from gateway.core.recording import (
     encode_exchange,
     encode_header,
     encode_row,
+    shown,
 )
 
 SIGNALS = RecordingHeader(
@@ -282,3 +283,17 @@ def test_reading_needs_memory_for_one_line_only(tmp_path: Path) -> None:
         tracemalloc.stop()
     assert path.stat().st_size > 400_000
     assert peak < 200_000
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ('"source":"synthetic"', "tank.jsonl (synthetic)"),
+        ('"source":"measured"', "tank.jsonl (measured)"),
+        ('"source":"measured","prototype":true', "tank.jsonl (measured, of an emulator)"),
+    ],
+)
+def test_where_it_comes_from_is_said(tmp_path: Path, said: str, told: str) -> None:
+    path = tmp_path / "tank.jsonl"
+    path.write_text(f'{{"fieldtwin_recording":1,"device":"mysite/tank","kind":"exchanges",{said}}}\n', encoding="utf-8")
+    assert shown(path) == told

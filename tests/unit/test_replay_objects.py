@@ -150,7 +150,7 @@ def test_a_prototype_whose_node_is_a_log(tmp_path: Path) -> None:
         "winch.yaml": SYSTEM, "winch.prototype.yaml": PROTOTYPE, "idle.st": program, "winch.log": "\n".join(lines)
     }.items():  # fmt: skip
         (tmp_path / name).write_text(text, encoding="ascii")
-    system = load_system(tmp_path / "winch.yaml")
+    system = load_system(str(tmp_path / "winch.yaml"))
     loop = VirtualLoop()
     seen: list[object] = []
 
@@ -171,7 +171,7 @@ def test_a_log_is_for_nodes(tmp_path: Path) -> None:
     (tmp_path / "bus.log").write_text(LOG, encoding="ascii")
     (tmp_path / "p.yaml").write_text(text, encoding="utf-8")
     with pytest.raises(FileInvalid, match="a log of a CAN bus"):
-        load_prototype(load_system(root / "observatory.yaml"), tmp_path / "p.yaml")
+        load_prototype(load_system(str(root / "observatory.yaml")), tmp_path / "p.yaml")
 
 
 def test_at_the_end() -> None:

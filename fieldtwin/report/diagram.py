@@ -116,27 +116,41 @@ def _wire_lane(axis: Axis, window: Window, bus: str, system: System | None) -> t
     exchanges = sorted((e for e in window.exchanges if e.bus == bus), key=lambda e: e.t_ns)
     marks = label(bus, config.endpoint.scheme.upper() if config else "")
     rows = sorted({_row(e) for e in exchanges})
-    edges = dict.fromkeys(rows, 0.0)
-    step = max(1, math.ceil(len(exchanges) / MOST_MARKS))
+    words: list[tuple[int, float, float, str, str]] = []
+    step = {ok: max(1, math.ceil(sum(e.ok is ok for e in exchanges) / MOST_MARKS)) for ok in (True, False)}
     for number, exchange in enumerate(exchanges):
-        if number % step and exchange.ok:
+        if number % step[exchange.ok]:
             continue
-        kind, row = _kind(exchange), rows.index(_row(exchange))
+        kind, top = _kind(exchange), 18.0 + 32 * rows.index(_row(exchange))
         x1, waited = axis.x(exchange.t_ns), exchange.latency_ns
         if kind == "lost":
             following = exchanges[number + 1].t_ns if number + 1 < len(exchanges) else exchange.t_ns + timeout_ns
             waited = min(timeout_ns, max(0, following - exchange.t_ns))
-        x2, top = max(x1 + 2.2, axis.x(exchange.t_ns + (waited or 0))), 18.0 + 32 * row
+        x2 = max(x1 + 2.2, axis.x(exchange.t_ns + (waited or 0)))
         size = {"x": x1, "y": top, "width": x2 - x1, "height": 12.0, "rx": 1}
         marks.append(el("rect", el("title", _tooltip(exchange)), cls=f"x {kind}", **size))
-        words = _short(exchange)
-        if x1 >= edges[_row(exchange)] and x1 + len(words) * CHAR < WIDTH:
-            marks.append(el("text", words, cls=f"words {kind}", x=x1, y=top - 4))
-            edges[_row(exchange)] = x1 + len(words) * CHAR + 10
-    thinned = step > 1 or bus in window.thinned
+        words.append((_RANK.get(kind, 0), top - 4, x1, _short(exchange), kind))
+    thinned = max(step.values()) > 1 or bus in window.thinned
     if thinned:
         marks.append(el("text", "thinned: too many", cls="sub", x=8.0, y=41.0))
-    return max(36.0, 4.0 + 32 * len(rows)) + (10 if thinned else 0), marks
+    return max(36.0, 4.0 + 32 * len(rows)) + (10 if thinned else 0), marks + _words(words)
+
+
+_RANK = {"message": 3, "asked": 2, "wrote": 1}
+"""What is named first where there is not room for all; what went wrong before everything."""
+
+
+def _words(words: list[tuple[int, float, float, str, str]]) -> list[Markup]:
+    """Rank, y, x, text, kind of each: as many as fit beside each other."""
+    placed: dict[float, list[tuple[float, float]]] = {}
+    marks = []
+    for _, y, x1, said, kind in sorted(words):
+        x2 = x1 + len(said) * CHAR + 8
+        taken = placed.setdefault(y, [])
+        if x2 < WIDTH and all(x2 <= a or x1 >= b for a, b in taken):
+            taken.append((x1, x2))
+            marks.append(el("text", said, cls=f"words {kind}", x=x1, y=y))
+    return marks
 
 
 def _row(exchange: Exchange) -> int:

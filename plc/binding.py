@@ -139,6 +139,8 @@ def image_for(
     for tag in watched:
         if tag in own:
             continue
+        if tag not in plant:
+            raise FileInvalid("a tag that does not exist", expected="a device's, or program.variable", got=tag)
         inputs.setdefault(tag, plant[tag])
     return process_image(list(inputs.values()), list(outputs.values()))
 

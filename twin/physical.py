@@ -86,6 +86,7 @@ def programs_of(system: System) -> tuple[ProgramConfig, ...]:
 
 def image_layout(system: System) -> ImageLayout:
     """The process image of a system: what its programs are bound to, and every other number for watchers."""
+    _check_tasks(system)
     folder = str(system.path.parent)
     plant = plant_tags(system)
     bound = []
@@ -106,7 +107,21 @@ def image_layout(system: System) -> ImageLayout:
     try:
         return image_for(bound, plant, dict.fromkeys(watched))
     except FileInvalid as e:
-        raise system.file.error(("plc", "programs"), e.message, expected=e.expected, got=e.got) from e
+        at = next(
+            (("plc", "tasks", n, "single") for n, t in system.plc.tasks.items() if e.got and t.single == e.got), None
+        )
+        raise system.file.error(at or ("plc", "programs"), e.message, expected=e.expected, got=e.got) from e
+
+
+def _check_tasks(system: System) -> None:
+    """Every program is in a task that there is, and one of them runs by itself and looks at the triggers of the others."""
+    names = list(system.plc.tasks) or ["main"]
+    for program, form in system.plc.programs.items():
+        if form.task and form.task not in names:
+            at = ("plc", "programs", program, "task")
+            raise system.file.error(at, "a task that there is not", expected=", ".join(names), got=form.task)
+    if system.plc.tasks and all(form.single for form in system.plc.tasks.values()):
+        raise system.file.error(("plc", "tasks"), "only SINGLE tasks", expected="at least one with interval_ms")
 
 
 def _check_variables(system: System, bound: BoundProgram) -> None:

@@ -137,6 +137,9 @@ def test_a_field_side_that_is_not_there_is_unreachable(invoke: Invoke) -> None:
         ("plc.relay:Relay", "plc.relay:Realy", "plc.relay:Realy", "Realy"),
         ("response: modem.outbox", "respons: modem.outbox", "respons: modem.outbox", "response"),
         ("fieldtwin: 1", "fieldtwin: 2", "fieldtwin: 2", "fieldtwin"),
+        ("    relay:\n", "    relay:\n      task: fats\n", "task: fats", "expected main; got fats"),
+        ("cycle_ms: 10", "tasks: {a: {interval_ms: 9}, b: {single: ctd.nought}}", "single: ctd.nought", "got ctd.nought"),
+        ("cycle_ms: 10", "tasks: {b: {single: modem.link_state}}", "tasks: {b:", "only SINGLE tasks"),
     ],
 )  # fmt: skip
 def test_a_wrong_system_file_is_named_with_line_and_what_was_expected(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
+from emulators.endpoints.bus_runner import AttachedConnection
 from emulators.faults.can_fault import SDO_REPLY, SDO_REQUEST, BusFault, CanFault, CanPiece
 from emulators.faults.engine import WireFaults, in_time
 from emulators.faults.fault import Active
@@ -51,6 +52,10 @@ class FaultyCan(CanConnection):
             if piece.delay_s <= 0:
                 await self.inner.send(piece.frame)
         self._later(p for p in pieces if p.delay_s > 0)
+
+    def withdraw(self, can_ids: Collection[int]) -> list[CanFrame]:
+        """As `inner` can: what is on its way to the bus is taken back; nothing where it cannot."""
+        return self.inner.withdraw(can_ids) if isinstance(self.inner, AttachedConnection) else []
 
     async def aclose(self) -> None:
         self._closed = True

@@ -19,12 +19,16 @@ from emulators.canopen.dictionary import parse_eds
 from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.canopen.serve import serve_node
 from emulators.endpoints.bus_runner import AttachedConnection, BusRunner
+from emulators.endpoints.faulty_can import FaultyCan
+from emulators.faults.engine import WireFaults
+from emulators.faults.frames import Framing
 from emulators.wires.can_bus import CanBus
 from emulators.wires.can_events import Delivery
 from emulators.wires.can_faults import Disturbance, spoil
 from gateway.connections.soft_bus import SoftBus
 from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame, pack_record, unpack_record
+from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
 
 BIT_NS = 8000
@@ -33,6 +37,7 @@ ROWS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "canopen_bus.toml"
 KEYS = {"id", "nodes", "strict", "queue", "spoil", "join", "hear", "say", "told", "end", "errors"}
 MS = 10**6
 UPLOAD = CanFrame(0x605, bytes.fromhex("4001100000000000"))  # 1001h, the error register
+NodeEnd = Callable[[BusRunner, Endpoint], CanConnection]
 Happens = Callable[[BusRunner, AttachedConnection], Awaitable[None]]
 
 
@@ -102,9 +107,7 @@ def test_co_064_can_fd_is_refused() -> None:
 # -- CANopen nodes on a bus with errors -----------------------------------------------------------------------------
 
 
-def on_bus(
-    node_end: Callable[[BusRunner, Endpoint], AttachedConnection], happens: Happens, **options: bool
-) -> list[str]:
+def on_bus(node_end: NodeEnd, happens: Happens, **options: bool) -> list[str]:
     """What another node hears, from the emulated node's boot-up on, with its time in ms; `happens` at 100 ms."""
 
     async def main() -> list[str]:
@@ -177,6 +180,11 @@ def test_co_062_a_node_whose_receive_queue_overflows_says_8110h() -> None:
 # -- synchronous TPDOs that do not get onto the bus within their window ----------------------------------------------
 
 
+def behind_faults(bus: BusRunner, where: Endpoint) -> CanConnection:
+    return FaultyCan(bus.attach(where, "node"), WireFaults(Framing.RAW), 5)
+
+
+@pytest.mark.parametrize("end", [plain, behind_faults])
 @pytest.mark.parametrize(("window_us", "in_front", "said"), [
     (0, 4, ["185#05000000"]),
     (5000, 4, ["185#05000000"]),
@@ -184,7 +192,7 @@ def test_co_062_a_node_whose_receive_queue_overflows_says_8110h() -> None:
     (3000, 3, ["185#05000000"]),
 ], ids=["no window", "inside", "late", "on the wire when it ends"])  # fmt: skip
 def test_co_048_a_synchronous_tpdo_that_waits_beyond_the_window_is_never_sent(
-    window_us: int, in_front: int, said: list[str]
+    window_us: int, in_front: int, said: list[str], end: NodeEnd
 ) -> None:
     """Each frame in front takes about 0.9 ms of the bus, and wins against the TPDO."""
 
@@ -198,6 +206,6 @@ def test_co_048_a_synchronous_tpdo_that_waits_beyond_the_window_is_never_sent(
         for _ in range(in_front):
             await tester.send(CanFrame(0x001, bytes(range(8))))
 
-    heard = [line.split()[1] for line in on_bus(plain, happens)]
+    heard = [line.split()[1] for line in on_bus(end, happens)]
     assert heard[-len(said) :] == said, heard
     assert [frame for frame in heard if frame.startswith("185")] == [frame for frame in said if frame.startswith("185")]

@@ -45,6 +45,10 @@ def _nobody(driver: CanopenDriver) -> None:
     pass
 
 
+START_AGAIN_S = 2.0
+"""Between a node's leaving OPERATIONAL by itself and its being started again."""
+
+
 @dataclass
 class NodeStatus:
     """What the bus knows about one node. `wanted` is set while it has to be brought up (again), `up` while it is."""
@@ -93,6 +97,7 @@ class CanopenBus:
         self.connected = False
         self.opens = 0
         self.error = ""
+        self._stopping = False
         self._not_produced = 0
         self._connector = connector
         self._clock = clock
@@ -377,13 +382,24 @@ class CanopenBus:
             status.wanted.set()
         elif event.kind == "state" and event.state is not NmtState.OPERATIONAL:
             self._on_offline(status.driver)  # what it does with its outputs then is its own affair
+            if event.state is NmtState.PRE_OPERATIONAL and status.online and status.driver.config.start:
+                self._start_again(status)
         elif event.kind == "conflict":
             status.error = "two nodes answer under this node id"
         elif event.kind == "emcy":
             status.emcy_log.add(parse_emcy(event.data), event.t_ns)
 
+    def _start_again(self, status: NodeStatus) -> None:
+        """A node that we started fell back by itself, as 1029h has it after an error (CiA 301, 7.5.2.32): it is brought up
+        anew, by and by, so that one with a lasting error is not asked without end."""
+        if not self._allow_writes or self._stopping:
+            return
+        self._offline(status, Unreachable("the node left OPERATIONAL"))
+        asyncio.get_running_loop().call_later(START_AGAIN_S, status.wanted.set)
+
     async def stop_nodes(self, timeout_s: float) -> None:
         """On the way out: nodes that we started go back to PRE-OPERATIONAL, where they send no process data."""
+        self._stopping = True
         if self._master is None or not self._allow_writes:
             return
         for status in self.nodes.values():

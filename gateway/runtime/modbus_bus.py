@@ -52,6 +52,11 @@ def reason_of(error: FieldtwinError) -> Reason:
     return Reason.UNREACHABLE if isinstance(error, Unreachable) else Reason.WIRE_ERROR
 
 
+MOST_UNANSWERED = 5
+"""On a socket: behind a connection that a firewall or a crash left half open nobody will ever answer (TG 4.2.2)."""
+STREAMS = frozenset({"tcp", "tls", "rtu+tcp"})
+
+
 @dataclass
 class Job:
     """Something to do on the bus before the next poll. `done` is called with None or the error, once."""
@@ -195,8 +200,17 @@ class ModbusBus:
             self._jobs.popleft().done(error)
 
     async def _serve(self, client: ModbusClient, backoff: Backoff) -> None:
+        answered = timeouts = 0
         while True:
             self._wake.clear()
+            counters = client.counters
+            if counters.replies + counters.exceptions != answered:
+                answered, timeouts = counters.replies + counters.exceptions, counters.timeouts
+            elif counters.timeouts - timeouts >= MOST_UNANSWERED and self.config.endpoint.scheme in STREAMS:
+                raise ConnectionLost(
+                    f"{MOST_UNANSWERED} requests in a row were not answered: the connection is made anew",
+                    where=str(self.config.endpoint),
+                )
             if self._halted:
                 self._idle.set()
                 await self._wake.wait()

@@ -25,6 +25,7 @@ COMMANDS = {
     "link": ("fieldtwin.cli.link_command", "The emulated connection on its own: a serial port carried over TCP."),
     "bridge": ("fieldtwin.cli.bridge_command", "Modbus TCP clients to units on a serial line, or the other way round."),
     "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),
+    "check": ("fieldtwin.cli.check_command", "Judge a Modbus or CANopen master: hostile devices, verdicts, waivers."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
     "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),
     "trace": ("fieldtwin.cli.trace_command", "What happened in a run: frames in words, JSON, or waveforms."),

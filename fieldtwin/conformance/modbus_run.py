@@ -15,7 +15,7 @@ from fieldtwin.conformance.line_plays import nothing
 from fieldtwin.conformance.modbus_cases import CASES
 from fieldtwin.conformance.modbus_stage import Stage
 from fieldtwin.conformance.observation import Asked, Ended, Habit, Observation, Shown, Told, Word
-from fieldtwin.conformance.probe import OutputProbe, Probe
+from fieldtwin.conformance.probe import Probe
 from fieldtwin.conformance.results import CaseResult
 from fieldtwin.conformance.scene import ModbusCase
 from gateway.core.clock import NS_PER_S
@@ -67,12 +67,16 @@ class ModbusRun:
 
     def _shown(self, word: Word, text: str) -> None:
         self.stage.recorder.add(Shown(self.stage.now_ns(), word, text))
-        self._latest = word
 
     def ended(self, status: int) -> None:
         """The program under test ended by itself."""
         self._ended = Ended(self.stage.now_ns(), status)
         self.stage.recorder.add(self._ended)
+
+    @property
+    def exit_code(self) -> int | None:
+        """The program's, once it ended by itself."""
+        return self._ended.status if self._ended is not None else None
 
     # -- the run --------------------------------------------------------------------------------------------------
 
@@ -90,6 +94,8 @@ class ModbusRun:
         """The habit, what the honest words look like, and how long silence is waited for."""
         stage = self.stage
         if not await self._until(lambda: any(isinstance(e, Asked) for e in stage.recorder.since(0)), self.plan.wait_s):
+            if self._ended is not None:
+                raise Unreachable(f"the program ended before it asked for anything, exit code {self._ended.status}")
             raise Unreachable("no master asked for anything", hint=f"within {self.plan.wait_s:g} s")
         since_ns = stage.now_ns()
         await self._until(lambda: stage.recorder.count(Asked, since_ns) >= 2 * STEADY, self.plan.patience_s)
@@ -238,8 +244,3 @@ class ModbusRun:
                 return condition()
             await asyncio.sleep(POLL_S)
         return True
-
-
-def is_printed(probe: Probe | None) -> bool:
-    """Whether values are read from what a program prints."""
-    return isinstance(probe, OutputProbe)

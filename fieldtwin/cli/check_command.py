@@ -1,0 +1,231 @@
+"""`fieldtwin check`: masters that we did not write are judged by hostile devices."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from emulators.modbus.bank import Table
+    from fieldtwin.conformance.case import Case
+    from fieldtwin.conformance.results import CaseResult
+
+DANGERS = ("observe", "read", "write", "disrupt")
+_HELD = re.compile(r"^(holding|input|coil|discrete):(\d{1,5})$")
+_RANGE = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
+
+
+@click.group("check")
+def command() -> None:
+    """Judge how a master bears devices that misbehave.
+
+    Exit code 0 when cases passed and none failed; SKIPPED and INCONCLUSIVE neither pass nor fail.
+    """
+
+
+def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of every judgement."""
+    options = [
+        click.option("--only", metavar="IDS", help="These cases or rows only, with commas: MB-013,MB-015a."),
+        click.option(
+            "--at-most",
+            type=click.Choice(DANGERS),
+            default="disrupt",
+            show_default=True,
+            help="Skip cases of a higher danger.",
+        ),
+        click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time."),
+        click.option("--wait", "wait_s", type=Duration(), default="30s", show_default=True, help="For the master to ask."),
+        click.option(
+            "--patience", "patience_s", type=Duration(), default="10s", show_default=True,
+            help="How long the master may take to be back to good; above its longest pause.",
+        ),
+        click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
+        click.option("--junit", type=click.Path(dir_okay=False, path_type=Path), help="Write the verdicts as JUnit XML."),
+        click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
+        json_option,
+    ]  # fmt: skip
+    for option in reversed(options):
+        function = option(function)
+    return function
+
+
+@command.command("modbus-master")
+@click.option(
+    "--listen",
+    metavar="ENDPOINT",
+    help="tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH or rtu:PORT; port 0 takes a free one.",
+)
+@click.option(
+    "--probe",
+    default="",
+    metavar="WHERE",
+    help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], or output.",
+)
+@click.option(
+    "--timeout", "timeout_s", type=Duration(), default="0", help="The master's response timeout, where you know it."
+)
+@click.option(
+    "--values",
+    default="1111,2222,3333",
+    show_default=True,
+    metavar="A,B,BAD",
+    help="What registers hold: two good ones and a poison.",
+)
+@click.option("--none", "none", multiple=True, metavar="VALUE", help="What the probe shows for no value; repeatable.")
+@click.option(
+    "--hold", multiple=True, metavar="TABLE:ADDRESS=VALUE", help="A cell that always holds the same; repeatable."
+)
+@click.option("--echo", is_flag=True, help="The master is set up for a line that echoes.")
+@_shared
+@click.argument("argv", nargs=-1, type=click.UNPROCESSED)
+def modbus_master(
+    listen: str | None,
+    probe: str,
+    timeout_s: float,
+    values: str,
+    none: tuple[str, ...],
+    hold: tuple[str, ...],
+    echo: bool,
+    only: str | None,
+    at_most: str,
+    for_s: float,
+    wait_s: float,
+    patience_s: float,
+    waivers_path: Path | None,
+    junit: Path | None,
+    list_only: bool,
+    as_json: bool,
+    argv: tuple[str, ...],
+) -> int:
+    """Play the hostile device of each row of the Modbus catalogue against a master, and judge it.
+
+    \b
+    fieldtwin check modbus-master --listen tcp://127.0.0.1:5020 --probe tcp://plc:502/holding:100
+    fieldtwin check modbus-master --listen pty:/tmp/line --timeout 1s --probe output -- python my_master.py
+
+    The master polls what it polls, and is left to it. A program behind -- finds the endpoint in FIELDTWIN_ENDPOINT,
+    FIELDTWIN_HOST and FIELDTWIN_PORT, or FIELDTWIN_TTY.
+    """
+    from fieldtwin.conformance.case import Danger
+    from fieldtwin.conformance.modbus_cases import CASES
+    from fieldtwin.conformance.modbus_run import Plan
+    from fieldtwin.conformance.session import Listener, Options, judge_modbus_master
+
+    cases = [case.about for case in CASES]
+    if list_only:
+        return _list(cases, as_json)
+    if not listen:
+        raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
+    plan = Plan(
+        _only(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset({"echo"} if echo else ()), Danger(at_most)
+    )
+    options = Options(Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), _held(hold), argv)
+    return _judged(
+        lambda listener: judge_modbus_master(options, listener),
+        Listener,
+        cases,
+        waivers_path,
+        junit,
+        as_json,
+        str(listen),
+    )
+
+
+def _judged(
+    judge: Callable[..., Any],
+    listener_type: Callable[..., Any],
+    cases: list[Case],
+    waivers_path: Path | None,
+    junit: Path | None,
+    as_json: bool,
+    title: str,
+) -> int:
+    """Run it, show what was found, write the file. The exit code."""
+    from fieldtwin.cli.check_view import Progress, print_results
+    from fieldtwin.conformance.results import as_json as data_of
+    from fieldtwin.conformance.results import as_report, exit_code, waive
+    from fieldtwin.conformance.waivers import Waivers, load_waivers
+    from gateway.wallclock import run
+
+    known = {case.id for case in cases} | {case.row for case in cases}
+    waivers = load_waivers(waivers_path, known) if waivers_path else Waivers()
+    started = datetime.now(UTC)
+    with Progress(len(cases)) as progress:
+        found: list[CaseResult] = run(judge(listener_type(progress.say, progress.tell)))
+    results = [waive(result, waivers, started.date()) for result in found]
+    if junit is not None:
+        from fieldtwin.report.junit import write_junit
+
+        again = "fieldtwin " + shlex.join(sys.argv[1:])
+        write_junit(as_report(results, f"master on {title}", again, started.isoformat(timespec="seconds")), junit)
+    if as_json:
+        json.dump(data_of(results), sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_results(results)
+    return exit_code(results)
+
+
+def _list(cases: list[Case], as_json: bool) -> int:
+    from fieldtwin.cli.check_view import print_cases
+
+    if as_json:
+        keys = ("id", "title", "clause", "does", "must")
+        json.dump([{k: getattr(c, k) for k in keys} | {"danger": c.danger.value} for c in cases], sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        print_cases(cases)
+    return 0
+
+
+def _only(text: str | None, cases: list[Case]) -> frozenset[str]:
+    """``MB-013,15a`` as ids; an unknown one is `UsageError` with the nearest."""
+    from difflib import get_close_matches
+
+    chosen = set()
+    known = {case.id for case in cases} | {case.row for case in cases}
+    prefix = cases[0].id[:3]
+    for part in (text or "").split(","):
+        if not part.strip():
+            continue
+        match = _RANGE.match(part.strip())
+        id = f"{(match[1] or prefix).upper()}{int(match[2]):03}{match[3].lower()}" if match else part.strip()
+        if id not in known:
+            near = get_close_matches(id, known, 1)
+            raise UsageError(f"no case {part.strip()!r}", expected=near[0] if near else "an id such as " + cases[0].id)
+        chosen.add(id)
+    return frozenset(chosen)
+
+
+def _words(text: str) -> tuple[int, int, int]:
+    parts = text.split(",")
+    if len(parts) != 3 or not all(p.strip().isdigit() and 0 < int(p) < 65536 for p in parts) or len(set(parts)) != 3:
+        raise UsageError(
+            "--values", expected="three different numbers from 1 to 65535 such as 1111,2222,3333", got=text
+        )
+    a, b, bad = (int(p) for p in parts)
+    return a, b, bad
+
+
+def _held(texts: tuple[str, ...]) -> dict[tuple[Table, int], int]:
+    held: dict[tuple[Table, int], int] = {}
+    for text in texts:
+        where, _, value = text.partition("=")
+        match = _HELD.match(where)
+        if not match or not value.isdigit() or int(value) > 65535 or int(match[2]) > 65535:
+            raise UsageError("--hold", expected="such as holding:10=5", got=repr(text))
+        held[match[1], int(match[2])] = int(value)  # type: ignore[index]
+    return held

@@ -1,0 +1,101 @@
+"""The program under test: started with the endpoint in its environment, listened to, and ended in the end."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Sequence
+from types import TracebackType
+
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+
+END_WITHIN_S = 3.0
+LAST_LINES = 12
+READ_SIZE = 65_536
+
+
+def environment(endpoint: Endpoint) -> dict[str, str]:
+    """What the program finds the endpoint by. `endpoint` is the master's side of it."""
+    env = {"FIELDTWIN_ENDPOINT": str(endpoint)}
+    if endpoint.is_serial:
+        env["FIELDTWIN_TTY"] = endpoint.path
+    elif endpoint.is_can:
+        env["FIELDTWIN_CHANNEL"] = endpoint.path
+        env["FIELDTWIN_INTERFACE"] = endpoint.interface
+    if not endpoint.is_serial and (not endpoint.is_can or endpoint.interface == "fieldtwin"):
+        host, port = endpoint.address
+        env |= {"FIELDTWIN_HOST": host, "FIELDTWIN_PORT": str(port)}
+    return env
+
+
+class Program:
+    """``async with Program(argv, endpoint, on_text, on_end)``. Ends it, with all that it started, on leaving.
+
+    `on_text` hears what it prints, `on_end` its exit code when it ends by itself. `said` are its last lines.
+    """
+
+    def __init__(
+        self,
+        argv: Sequence[str],
+        endpoint: Endpoint,
+        on_text: Callable[[str], None],
+        on_end: Callable[[int], None],
+    ) -> None:
+        self.said: deque[str] = deque(maxlen=LAST_LINES)
+        self._argv = argv
+        self._env = {**os.environ, "PYTHONUNBUFFERED": "1", **environment(endpoint)}
+        self._on_text, self._on_end = on_text, on_end
+        self._process: asyncio.subprocess.Process | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._rest = ""
+
+    async def __aenter__(self) -> Program:
+        try:
+            self._process = await asyncio.create_subprocess_exec(
+                *self._argv,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.STDOUT,
+                env=self._env,
+                start_new_session=True,
+            )
+        except OSError as e:
+            raise UsageError(f"cannot start {self._argv[0]!r}: {e.strerror or e}") from e
+        self._task = asyncio.create_task(self._listen(), name="program under test")
+        return self
+
+    async def _listen(self) -> None:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        while chunk := await self._process.stdout.read(READ_SIZE):
+            text = chunk.decode(errors="replace")
+            self._on_text(text)
+            *lines, self._rest = (self._rest + text).split("\n")
+            self._rest = self._rest[-READ_SIZE:]
+            self.said.extend(line[:200] for line in lines if line.strip())
+        self._on_end(await self._process.wait())
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
+    ) -> None:
+        assert self._process is not None
+        assert self._task is not None
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+        for number in (signal.SIGTERM, signal.SIGKILL):
+            try:
+                os.killpg(self._process.pid, number)
+            except ProcessLookupError:
+                pass
+            try:
+                async with asyncio.timeout(END_WITHIN_S):
+                    await self._process.wait()
+                break
+            except TimeoutError:
+                continue
+        transport = getattr(self._process, "_transport", None)
+        if transport is not None:
+            transport.close()  # its pipe would be closed by the collector, with a warning

@@ -1,0 +1,115 @@
+"""A judgement on this computer's wires: the endpoint is opened, the program started, the probe attached."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from emulators.endpoints.ports import OsPorts
+from emulators.modbus.bank import Table
+from fieldtwin.conformance.modbus_run import ModbusRun, Plan
+from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
+from fieldtwin.conformance.observation import Word
+from fieldtwin.conformance.probe import Classifier, OutputProbe, Probe, RegisterProbe
+from fieldtwin.conformance.program import Program
+from fieldtwin.conformance.results import CaseResult
+from gateway.connections.os_connector import OsConnector
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.nursery import Nursery
+from gateway.wallclock import WallClock
+
+MAX_CLIENTS = 8
+LISTENING = "tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH or rtu:PORT"
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a user asked for. `words`: the two honest ones and the poison. `probe` as `RegisterProbe` reads it, ``output``, or
+    empty."""
+
+    listen: Endpoint
+    plan: Plan
+    words: tuple[int, int, int]
+    probe: str = ""
+    stands_for_none: frozenset[str] = frozenset()
+    held: Mapping[tuple[Table, int], int] = field(default_factory=dict)
+    command: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Listener:
+    """Who hears what happens: `say` one line of talk, `tell` each result."""
+
+    say: Callable[[str], None]
+    tell: Callable[[CaseResult], None]
+
+
+async def judge_modbus_master(options: Options, listener: Listener) -> list[CaseResult]:
+    """Results in the order of the cases. Raises `UsageError`, `Unreachable` or `EndpointBusy`.
+
+    A signal ends it, and the program with it.
+    """
+    if options.listen.scheme not in ("tcp", "rtu+tcp", "pty", "rtu"):
+        raise UsageError("where the master is listened for", expected=LISTENING, got=str(options.listen))
+    task = asyncio.current_task()
+    assert task is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+    scheme = "rtu" if options.listen.is_serial or options.listen.scheme == "pty" else options.listen.scheme
+    stage = Stage(wire_for(scheme), options.words, options.held)
+    async with AsyncExitStack() as closing:
+        nursery = await closing.enter_async_context(Nursery())
+        theirs = await _open(options.listen, stage, nursery, closing)
+        listener.say(f"listening on {options.listen}; the master's side is {theirs}")
+        probe, on_text = _probe(options, nursery)
+        run = ModbusRun(stage, options.plan, traits(scheme), probe, tell=listener.tell)
+        if not options.command:
+            return await run.run()
+        program = Program(options.command, theirs, on_text, run.ended)
+        try:
+            async with program:
+                results = await run.run()
+        finally:
+            if run.exit_code is not None:
+                listener.say(f"the program ended by itself, exit code {run.exit_code}; the last that it said:")
+                for line in program.said:
+                    listener.say(f"  {line}")
+        return results
+
+
+async def _open(listen: Endpoint, stage: Stage, nursery: Nursery, closing: AsyncExitStack) -> Endpoint:
+    """Serve `listen`; returns the master's side of it."""
+    if listen.scheme in ("tcp", "rtu+tcp"):
+        server = await OsPorts().listen(listen, stage.serve, MAX_CLIENTS)
+        closing.push_async_callback(server.aclose)
+        return server.bound
+    if listen.scheme == "rtu":
+        port = await OsConnector().open_bytes(listen)
+        theirs = listen.with_path("the other end of the line")
+    else:
+        pace = listen.serial if listen.param("baudrate") else None
+        port, named = await OsPorts().serial(Path(listen.path), listen, pace)
+        theirs = Endpoint("rtu", path=named.path, params=listen.params)
+    closing.push_async_callback(port.aclose)
+    nursery.start(stage.serve(port), "line")
+    return theirs
+
+
+def _probe(options: Options, nursery: Nursery) -> tuple[Probe | None, Callable[[str], None]]:
+    """The probe, and who hears what the program prints."""
+    if not options.probe:
+        return None, lambda text: None
+    if options.probe == "output":
+        if not options.command:
+            raise UsageError("nothing prints", expected="a program behind -- for --probe output")
+        words = dict(zip(options.words, (Word.FIRST, Word.SECOND, Word.POISON), strict=True))
+        printed = OutputProbe(words)
+        return printed, printed.feed
+    classifier = Classifier(options.words[2], options.stands_for_none)
+    probe = RegisterProbe(options.probe, OsConnector(), WallClock(), classifier)
+    nursery.start(probe.run(), "probe")
+    return probe, lambda text: None

@@ -101,6 +101,8 @@ def run_many(
         for error in result.errors:
             data.print(f"  {error}", soft_wrap=True, markup=False)
         data.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
+    if failed and (options.random_faults or len(options.faults) > 1):
+        _shrink(options, failed[0])
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
     table.add_row("virtual time", shown_time(options.duration_s * len(results)))
@@ -114,6 +116,23 @@ def run_many(
     data.print(table)
     data.print("[bold red]not ok[/bold red]" if failed else "[bold green]ok[/bold green]")
     return 1 if failed else 0
+
+
+def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
+    """The first failing schedule, as few faults as it takes, as a scenario file in the working directory."""
+    from fieldtwin.running.many_seeds import shrunk
+    from fieldtwin.running.shrink import as_scenario
+
+    talk.print(f"shrinking the faults of seed {failed.seed}", markup=False)
+    faults, result = shrunk(options, failed.seed)
+    if result.ok:
+        talk.print("it does not fail again", markup=False)
+        return
+    path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
+    title = f"what failed with seed {failed.seed}"
+    text = as_scenario(title, options.system, failed.seed, options.duration_s, faults, result.errors)
+    path.write_text(text, encoding="utf-8")
+    data.print(f"seed {failed.seed} takes {len(faults)} of its faults: {path}", soft_wrap=True, markup=False)
 
 
 def _plain(result: SeedResult) -> dict[str, Any]:

@@ -7,7 +7,9 @@ import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
+from typing import Any
 
+from fieldtwin.running.shrink import smallest
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 
 MAX_SEEDS = 100_000
@@ -57,6 +59,19 @@ def run_seed(options: VirtualOptions) -> SeedResult:
         summary["trace"]["events"],
         summary["trace"]["sha256"],
     )
+
+
+def shrunk(options: VirtualOptions, seed: int, most_runs: int = 60) -> tuple[list[dict[str, Any]], SeedResult]:
+    """The fewest faults with which the run of `seed` still fails, and how it fails with them. It must fail with all."""
+    options = replace(options, seed=seed)
+    faults = VirtualRun(options).faults
+    base = replace(options, random_faults=False, faults=())
+
+    def fails(part: Sequence[dict[str, Any]]) -> bool:
+        return not run_seed(replace(base, faults=tuple(part))).ok
+
+    left = smallest(faults, fails, most_runs)
+    return left, run_seed(replace(base, faults=tuple(left)))
 
 
 def run_seeds(

@@ -1,0 +1,63 @@
+"""Faults that a seed chooses, and the few of them that it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulators.faults.schema import parse_fault
+from fieldtwin.running.fault_schedule import CALM_S, MOST, UNSEEN_ON_TCP, random_schedule
+from fieldtwin.running.shrink import as_scenario, smallest
+from gateway.core.yaml_file import parse
+from twin.system import load_system
+
+SYSTEM = load_system("observatory", [])
+
+
+@given(st.integers(0, 10_000), st.floats(10.0, 100_000.0))
+@settings(max_examples=60, deadline=None)
+def test_a_seed_chooses_what_can_be_put_in_and_leaves_the_end_in_peace(seed: int, duration_s: float) -> None:
+    faults = random_schedule(SYSTEM, seed, duration_s)
+    assert faults == random_schedule(SYSTEM, seed, duration_s)
+    assert len(faults) <= MOST
+    for number, said in enumerate(faults, 1):
+        spec = parse_fault(dict(said), number=number)
+        assert spec.until_s is not None
+        assert 0 <= spec.from_s < spec.until_s <= duration_s - min(CALM_S, duration_s / 2) + 0.001
+        assert not (said["device"] == "modem" and spec.kind.name in UNSEEN_ON_TCP)
+
+
+@given(st.sets(st.integers(0, 39), min_size=1, max_size=4), st.integers(4, 40))
+@settings(max_examples=80, deadline=None)
+def test_exactly_what_it_takes_is_left(needed: set[int], count: int) -> None:
+    needed = {n % count for n in needed}
+    asked = 0
+
+    def fails(part: Sequence[int]) -> bool:
+        nonlocal asked
+        asked += 1
+        return needed <= set(part)
+
+    assert set(smallest(range(count), fails, 2_000)) == needed
+    assert asked <= 2_000
+
+
+def test_it_ends_after_so_many_runs() -> None:
+    asked: list[int] = []
+
+    def fails(part: Sequence[int]) -> bool:
+        asked.append(len(part))
+        return False
+
+    assert smallest(range(1000), fails, 50) == list(range(1000))
+    assert len(asked) == 50
+
+
+def test_a_schedule_reads_as_a_scenario_again() -> None:
+    fault = {"id": "f1", "name": "silence", "device": "ctd", "from": 1.5, "until": 3.0, "probability": 0.5}
+    file = parse(as_scenario('it "fails"', "observatory.yaml", 7, 60.0, [fault], ["a wrong value"]), "x.yaml")
+    assert file.data["scenario"] == 'it "fails"'
+    assert file.data["steps"] == [{"fault": fault}, {"pause": "60s"}]
+    assert parse_fault(file.data["steps"][0]["fault"]).until_s == 3.0

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from fieldtwin.__about__ import __version__
 
 if TYPE_CHECKING:
+    from fieldtwin.running.node_scan import scan_can_bus as scan_can_bus
     from fieldtwin.running.options import RunOptions as RunOptions
     from fieldtwin.running.session import RunSession as RunSession
     from fieldtwin.running.summary import summarise as summarise
@@ -26,6 +27,7 @@ _PUBLIC = {
     "load_profile": "gateway.core.profile",
     "load_prototype": "twin.prototype_file",
     "load_system": "twin.system",
+    "scan_can_bus": "fieldtwin.running.node_scan",
     "summarise": "fieldtwin.running.summary",
 }
 
@@ -37,6 +39,7 @@ __all__ = [
     "load_profile",
     "load_prototype",
     "load_system",
+    "scan_can_bus",
     "summarise",
 ]
 

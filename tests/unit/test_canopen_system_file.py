@@ -15,9 +15,12 @@ import pytest
 
 from emulators.canopen.node import CanopenNode
 from emulators.virtual.loop import VirtualLoop
+from fieldtwin import scan_can_bus
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import CanConnection
+from gateway.core.errors import UsageError
 from gateway.core.values import Quality
+from gateway.protocols.canopen.nmt import NmtState
 from gateway.runtime.status import describe
 from twin.prototype_file import load_prototype
 from twin.system import load_system
@@ -193,6 +196,26 @@ def test_a_node_is_booted_configured_and_kept_so(tmp_path: Path, loop: VirtualLo
             await rig.until_lost_and_found()
             assert rig.node.node_id == NODE
             assert rig.holds() == CONFIGURED
+
+    files(tmp_path)
+    loop.run_until_complete(main())
+
+
+def test_who_is_on_the_bus(tmp_path: Path, loop: VirtualLoop) -> None:
+    async def main() -> None:
+        async with winch(tmp_path, loop) as rig:
+            told: list[int] = []
+            (found,) = await scan_can_bus(
+                str(rig.other.endpoint), nodes=range(8, 11), listen_s=0.3, on_progress=told.append,
+                connector=rig.run.net, clock=rig.run.clock,
+            )  # fmt: skip
+            assert (found.node, found.state, found.answers) == (NODE, NmtState.OPERATIONAL, True)
+            assert found.identity is not None
+            assert (found.identity.product, found.identity.revision) == (0x406, 0x10000)
+            assert told == [8, 9, 10]
+            assert rig.status["online"], "the plant does not feel it"
+        with pytest.raises(UsageError, match="nodes are on a CAN bus"):
+            await scan_can_bus("tcp://127.0.0.1:502")
 
     files(tmp_path)
     loop.run_until_complete(main())

@@ -121,7 +121,7 @@ def modbus_master(
     """
     from fieldtwin.conformance.case import Danger
     from fieldtwin.conformance.modbus_cases import CASES
-    from fieldtwin.conformance.modbus_run import Plan
+    from fieldtwin.conformance.run import Plan
     from fieldtwin.conformance.session import Listener, Options, judge_modbus_master
 
     cases = [case.about for case in CASES]

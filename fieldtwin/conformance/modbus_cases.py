@@ -32,6 +32,9 @@ def _watch(id: str, title: str, clause: str, judge: Judge, must: str) -> ModbusC
     return _case(id, title, clause, LOOK, line_plays.nothing, judge, "watches all of the run", must).on(wants="nothing")
 
 
+SILENT = _bad("MB-000", "no reply", "", line_plays.nothing, "is silent")
+"""No case of the catalogue: how the master's timeout is guessed."""
+
 CASES: tuple[ModbusCase, ...] = (
     _bad("MB-002", "bad CRC in a reply", "SL 2.4.1", line_plays.bad_crc, "inverts the CRC").on(framings=RTU),
     _bad("MB-003", "truncated reply", "SL 2.4.1", line_plays.truncated, "sends half a reply",

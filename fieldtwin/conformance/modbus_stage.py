@@ -20,7 +20,7 @@ from fieldtwin.conformance.modbus_device import (
     ModbusWire,
     RtuWire,
 )
-from fieldtwin.conformance.observation import Asked, Came, Garbled, Left, Told
+from fieldtwin.conformance.observation import Asked, Came, Garbled, Left, Told, Word
 from fieldtwin.conformance.recorder import Recorder
 from fieldtwin.conformance.scene import Hang, ModbusCase, Move, Say, Scene
 from gateway.core.clock import NS_PER_S
@@ -49,7 +49,7 @@ class Stage:
         self.device = HonestDevice(self.first_word, held)
         self.play: ModbusCase | None = None
         self.timeout_s = 1.0
-        self.struck = self.first_ns = self.last_ns = self.pending = 0
+        self.strikes = self.struck = self.first_ns = self.last_ns = self.pending = 0
         self.clients = 0
         self.on_event: Callable[[], None] = lambda: None
         self._make_wire = make_wire
@@ -59,9 +59,14 @@ class Stage:
     def now_ns(self) -> int:
         return round(self._loop.time() * NS_PER_S)
 
-    def begin(self, case: ModbusCase) -> None:
-        """From the next fitting request on `case` is played, until its strikes are used up or `end` is called."""
-        self.play, self._first = case, None
+    def hold(self, word: Word) -> int:
+        """All cells hold that word from now on; returns its number."""
+        self.device.word = self.first_word if word is Word.FIRST else self.second_word
+        return self.device.word
+
+    def begin(self, case: ModbusCase, strikes: int) -> None:
+        """From the next fitting request on `case` is played, until `strikes` are used up or `end` is called."""
+        self.play, self.strikes, self._first = case, strikes, None
         self.struck = self.first_ns = self.last_ns = 0
 
     def end(self) -> None:
@@ -95,7 +100,7 @@ class Stage:
         if request[0] == 0 and isinstance(wire, RtuWire):
             return []  # a broadcast: nobody answers
         honest: list[Move] = [Say(wire.frame(request, tag, true), good=True)] if true else []
-        if case is None or self.struck >= case.strikes or not true or not _wanted(case, request):
+        if case is None or self.struck >= self.strikes or not true or not _wanted(case, request):
             return honest
         false = self.device.answer_with(self.poison, request[1:], now_ns) if request[1] in READS else true
         scene = Scene(wire, request, tag, true, false, self.struck, self.timeout_s, self._first)

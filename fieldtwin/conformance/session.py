@@ -11,12 +11,13 @@ from pathlib import Path
 
 from emulators.endpoints.ports import OsPorts
 from emulators.modbus.bank import Table
-from fieldtwin.conformance.modbus_run import ModbusRun, Plan
+from fieldtwin.conformance.modbus_cases import CASES, SILENT
 from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
 from fieldtwin.conformance.observation import Word
 from fieldtwin.conformance.probe import Classifier, OutputProbe, Probe, RegisterProbe
 from fieldtwin.conformance.program import Program
 from fieldtwin.conformance.results import CaseResult
+from fieldtwin.conformance.run import MasterRun, Plan
 from gateway.connections.os_connector import OsConnector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
@@ -66,7 +67,7 @@ async def judge_modbus_master(options: Options, listener: Listener) -> list[Case
         theirs = await _open(options.listen, stage, nursery, closing)
         listener.say(f"listening on {options.listen}; the master's side is {theirs}")
         probe, on_text = _probe(options, nursery)
-        run = ModbusRun(stage, options.plan, traits(scheme), probe, tell=listener.tell)
+        run = MasterRun(stage, CASES, SILENT, options.plan, traits(scheme), probe, listener.tell)
         if not options.command:
             return await run.run()
         program = Program(options.command, theirs, on_text, run.ended)

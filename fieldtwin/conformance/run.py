@@ -1,4 +1,4 @@
-"""Plays the cases against a Modbus master, one after the other, and has each judged.
+"""Plays the cases against a master, one after the other, and has each judged.
 
 First the master's habit is learnt; before each case all is well, after each one too. What cannot be brought about is skipped with
 the reason, what the master did not take part in is inconclusive.
@@ -7,25 +7,64 @@ the reason, what the master did not take part in is inconclusive.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar
 
-from fieldtwin.conformance.case import Danger, Finding, inconclusive, skipped
-from fieldtwin.conformance.line_plays import nothing
-from fieldtwin.conformance.modbus_cases import CASES
-from fieldtwin.conformance.modbus_stage import Stage
+from fieldtwin.conformance.case import Case, Danger, Finding, inconclusive, skipped
 from fieldtwin.conformance.observation import Asked, Ended, Habit, Observation, Shown, Told, Word
 from fieldtwin.conformance.probe import Probe
+from fieldtwin.conformance.recorder import Recorder
 from fieldtwin.conformance.results import CaseResult
-from fieldtwin.conformance.scene import ModbusCase
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import Unreachable
 
 POLL_S = 0.01
 STEADY = 3
 """So many polls make a habit."""
+MANY = 1_000_000
+"""Strikes of a case that goes on until its value was seen."""
 TRAIL_S = 0.3
 """How long a case looks on after the master is back to good: what it publishes late is seen."""
+
+
+class Playable(Protocol):
+    """A case with its play, whatever the protocol: see `C` and `CanopenCase`."""
+
+    @property
+    def about(self) -> Case: ...
+    @property
+    def wants(self) -> str: ...
+    @property
+    def strikes(self) -> int: ...
+    @property
+    def holds_good(self) -> bool: ...
+    @property
+    def framings(self) -> tuple[str, ...]: ...
+    @property
+    def needs(self) -> str: ...
+
+
+C = TypeVar("C", bound=Playable)
+C_contra = TypeVar("C_contra", bound=Playable, contravariant=True)
+
+
+class AnyStage(Protocol[C_contra]):
+    """Where cases are played: see `modbus_stage.Stage`. Times are its `now_ns`."""
+
+    recorder: Recorder
+    timeout_s: float
+    struck: int
+    first_ns: int
+    last_ns: int
+    pending: int
+
+    def now_ns(self) -> int: ...
+    def begin(self, case: C_contra, strikes: int) -> None: ...
+    def end(self) -> None: ...
+    def hold(self, word: Word) -> int:
+        """Hold that word from now on; returns its number."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,20 +83,22 @@ class Plan:
 
 
 @dataclass
-class ModbusRun:
-    """One judgement of a master. `traits` of the endpoint as `modbus_stage.traits` says; `tell` hears each result as it comes."""
+class MasterRun(Generic[C]):
+    """One judgement of a master. `traits` is what the endpoint has, for `framings` of cases; `silent` a case that leaves a
+    request unanswered, by which the master's timeout is guessed. `tell` hears each result as it comes."""
 
-    stage: Stage
+    stage: AnyStage[C]
+    cases: Sequence[C]
+    silent: C
     plan: Plan
     traits: frozenset[str]
     probe: Probe | None = None
-    cases: Iterable[ModbusCase] = CASES
     tell: Callable[[CaseResult], None] = lambda result: None
     results: list[CaseResult] = field(default_factory=list)
     habit: Habit = field(default_factory=Habit)
 
     def __post_init__(self) -> None:
-        self._word = Word.FIRST
+        self._word, self._held = Word.FIRST, 0
         self._ended: Ended | None = None
         self._started_ns = self.stage.now_ns()
         if self.probe is not None:
@@ -117,13 +158,12 @@ class ModbusRun:
         await asyncio.sleep(TRAIL_S)
         probe = self.probe
         if not await self._until(lambda: probe.learn(word), self.plan.patience_s):
-            held = f"the device holds {self.stage.device.word}"
+            held = f"the device holds {self._held}"
             raise Unreachable("the probe never showed the value that the device holds, or shows all alike", hint=held)
 
     async def _silence(self) -> float:
         """From a request that nobody answers to the next one, in seconds; 0 if there was none."""
-        about = CASES[0].about
-        self.stage.begin(ModbusCase(about, nothing, strikes=1))
+        self.stage.begin(self.silent, 1)
         await self._until(lambda: self.stage.struck > 0, self.plan.patience_s)
         first_ns = self.stage.first_ns
         if first_ns:
@@ -138,7 +178,7 @@ class ModbusRun:
 
     # -- one case -------------------------------------------------------------------------------------------------
 
-    async def _case(self, case: ModbusCase) -> None:
+    async def _case(self, case: C) -> None:
         since_ns = self.stage.now_ns()
         reason = self._not_here(case)
         if reason:
@@ -154,7 +194,7 @@ class ModbusRun:
         else:
             self._done(case, await self._play(case), since_ns)
 
-    def _not_here(self, case: ModbusCase) -> str:
+    def _not_here(self, case: C) -> str:
         if not self.traits & set(case.framings):
             return "there is no such thing on this endpoint"
         if case.needs and case.needs not in self.plan.has:
@@ -179,15 +219,13 @@ class ModbusRun:
             return True
         return any(isinstance(e, Shown) and e.word is word for e in self.stage.recorder.since(since_ns))
 
-    async def _play(self, case: ModbusCase) -> Finding:
+    async def _play(self, case: C) -> Finding:
         stage, before = self.stage, self._word
         after = Word.SECOND if before is Word.FIRST else Word.FIRST
         start_ns = stage.now_ns()
         if case.holds_good:
             self._say(after)
-            if self.probe is not None:
-                case = case.on(strikes=1_000_000)
-        stage.begin(case)
+        stage.begin(case, MANY if case.holds_good and self.probe is not None else case.strikes)
         fits = await self._until(lambda: stage.struck > 0, min(self.plan.patience_s, 4 * self.habit.longest_gap_s + 1))
         if not fits:
             stage.end()
@@ -212,7 +250,7 @@ class ModbusRun:
         )  # fmt: skip
         return case.about.judge(seen)
 
-    def _watched(self, case: ModbusCase) -> None:
+    def _watched(self, case: C) -> None:
         now_ns = self.stage.now_ns()
         reason = self._not_here(case)
         if reason:
@@ -221,7 +259,7 @@ class ModbusRun:
         events = self.stage.recorder.since(0)
         self._done(case, case.about.judge(Observation(events, 0, 0, now_ns, self.habit)), now_ns)
 
-    def _done(self, case: ModbusCase, finding: Finding, since_ns: int) -> None:
+    def _done(self, case: C, finding: Finding, since_ns: int) -> None:
         result = CaseResult(case.about, finding, (self.stage.now_ns() - since_ns) / NS_PER_S)
         self.results.append(result)
         self.tell(result)
@@ -230,7 +268,7 @@ class ModbusRun:
 
     def _say(self, word: Word) -> None:
         self._word = word
-        self.stage.device.word = self.stage.first_word if word is Word.FIRST else self.stage.second_word
+        self._held = self.stage.hold(word)
 
     async def _polled(self, count: int, since_ns: int, within_s: float) -> bool:
         return await self._until(lambda: self.stage.recorder.count(Told, since_ns) >= count, within_s)

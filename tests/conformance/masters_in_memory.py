@@ -1,0 +1,86 @@
+"""Masters in memory and in virtual time, judged by the cases: ours, and ones that are wrong on purpose."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.ports import MemoryNet
+from fieldtwin.conformance.modbus_cases import CASES, SILENT
+from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
+from fieldtwin.conformance.observation import Word
+from fieldtwin.conformance.probe import Classifier
+from fieldtwin.conformance.results import CaseResult
+from fieldtwin.conformance.run import MasterRun, Plan
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FieldtwinError
+from gateway.core.nursery import Nursery
+from gateway.protocols.modbus.client import ModbusClient
+
+WORDS = (1111, 2222, 3333)
+PERIOD_S = 0.3
+TIMEOUT_S = 0.2
+Publish = Callable[[str], None]
+Master = Callable[[MemoryNet, Endpoint, VirtualClock, Publish], Coroutine[object, object, None]]
+
+
+class Told:
+    """A probe that the master calls."""
+
+    def __init__(self) -> None:
+        self._classifier = Classifier(WORDS[2])
+        self.on_shown: Callable[[Word, str], None] = lambda word, text: None
+
+    def learn(self, word: Word) -> bool:
+        return self._classifier.learn(word)
+
+    def publish(self, text: str) -> None:
+        self.on_shown(self._classifier.word(text), text)
+
+
+async def ours(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+    """The project's client as a driver uses it: a bad answer is no value, a lost connection is opened again."""
+    while True:
+        client = ModbusClient.at(endpoint, await net.open_bytes(endpoint), clock, timeout_s=TIMEOUT_S)
+        try:
+            while not client.closed:
+                try:
+                    reply = await client.read_registers(17, "holding", 107, 2)
+                    publish(str(reply.registers[0]))
+                except FieldtwinError:
+                    pass
+                await asyncio.sleep(PERIOD_S)
+        finally:
+            await client.aclose()
+
+
+def judge(
+    master: Master, url: str, *only: str, timeout_s: float = TIMEOUT_S, probed: bool = True
+) -> dict[str, CaseResult]:
+    """Case id -> result of a master that is asked over `url` in memory."""
+    loop = VirtualLoop()
+
+    async def main() -> list[CaseResult]:
+        net, plant, told = MemoryNet(loop), Endpoint.parse(url), Told()
+        clock = VirtualClock(loop)
+        stage = Stage(wire_for(plant.scheme), WORDS, {})
+        plan = Plan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
+        run = MasterRun(stage, CASES, SILENT, plan, traits(plant.scheme), told if probed else None)
+        async with Nursery() as nursery:
+            if plant.is_serial:
+                end, _ = await net.serial(Path(plant.path), plant, plant.serial)
+                nursery.start(stage.serve(end), "stage")
+            else:
+                listener = await net.listen(plant, stage.serve, 8)
+                plant = listener.bound
+            nursery.start(master(net, plant, clock, told.publish), "master")
+            results = await run.run()
+        if not plant.is_serial:
+            await listener.aclose()
+        return results
+
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        return {r.case.id: r for r in runner.run(main())}

@@ -3,8 +3,10 @@
 Control verbs (gateway.core.control, on the configured Unix socket):
 
     ready     {"ready": true, "state": ...}: the image is attached and the tasks were started
-    get       everything a display shows: state, error, statistics, inputs with quality and age, outputs, variables, forces
-    image     {"tags": ["ctd.*"]} (all, without): of each value, quality, time, age, unit, limits, force, what programs see
+    get       everything a display shows: state, error, statistics, forces; unless {"brief": true}, every tag's value and what is
+              retained besides, which with thousands of tags takes longer than there is between two scans
+    image     {"tags": [...]}, 64 at most: of each value, quality, time, age, unit, limits, force, what programs see; without
+              tags, the names of all
     force     {"tag": ..., "value": ..., "by": ...}: until `unforce` {"tag": ...}, or all with {"all": true}
     pause     execute nothing more, outputs stay; `go` goes on; `step` {"count": n} executes n scans while paused
     why       {"tag": ...}: which program last changed it, when, and what it saw
@@ -113,8 +115,7 @@ class PlcProcess:
 
     async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
         now_ns, runner = monotonic_ns(), self._runner
-        outputs = runner.outputs.last()
-        return {
+        brief = {
             **runner.describe(),
             "pid": os.getpid(),
             "gateway_alive": runner.gateway_alive,
@@ -122,16 +123,25 @@ class PlcProcess:
             "realtime": self._realtime.describe(),
             "acts": dict(self._acts.counts),
             "programs": {p.name: type(p.program).__name__ for p in runner.programs},
+        }
+        if args.get("brief") is True:
+            return brief
+        outputs = runner.outputs.last()
+        return {
+            **brief,
+            "retained": runner.retained.values(),
             "inputs": {tag: value.describe(now_ns) for tag, value in runner.inputs().items()},
             "outputs": outputs,
             "variables": {f"{p.name}.{v.name}": outputs[tag] for p in runner.programs for v, tag in p.published()},
         }
 
     async def _tags(self, args: dict[str, Any]) -> dict[str, Any]:
-        patterns = args.get("tags", [])
-        if not isinstance(patterns, list) or not all(isinstance(p, str) for p in patterns):
-            raise UsageError("which tags", expected='a list such as ["ctd.*"]', got=repr(patterns))
-        return {"tags": self._view.describe(patterns, monotonic_ns(), utc_ns())}
+        if "tags" not in args:
+            return {"names": self._view.names()}
+        names = args["tags"]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise UsageError("which tags", expected='a list such as ["ctd.pressure"]', got=repr(names))
+        return {"tags": self._view.describe(names, monotonic_ns(), utc_ns())}
 
     def _note(self, action: str, args: dict[str, Any], **details: Any) -> None:
         self._acts.note(action, _by(args), utc_ns(), **details)

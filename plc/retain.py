@@ -231,5 +231,8 @@ class Retained:
         return {
             "start": self.start,
             "saves": self._file.saves if self._file else 0,
-            "variables": self._values() if self._file else {},
         }
+
+    def values(self) -> dict[str, Any]:
+        """What is kept now, by program and variable: plain data."""
+        return self._values() if self._file else {}

@@ -296,7 +296,7 @@ class Runner:
         raise UsageError(f"no tag {tag!r} in the process image", expected="one that status shows")
 
     def _is_now(self, tag: str, inputs: bool) -> Scalar | None:
-        return self.entries[0].scan.inputs()[tag].value if inputs else self.outputs.last()[tag]
+        return self.input(tag).value if inputs else self.outputs.last()[tag]
 
     def _variables_of(self, tag: str, inputs: bool) -> list[tuple[Program, str]]:
         """Which variables of programs a tag stands for."""
@@ -314,13 +314,13 @@ class Runner:
     def inputs(self) -> dict[str, TagValue]:
         return self.entries[0].scan.inputs()
 
-    def seen_otherwise(self) -> dict[str, dict[str, TagValue]]:
+    def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
         """Of all tasks: `Scan.seen_otherwise`."""
-        found: dict[str, dict[str, TagValue]] = {}
-        for entry in self.entries:
-            for tag, by_variable in entry.scan.seen_otherwise().items():
-                found.setdefault(tag, {}).update(by_variable)
-        return found
+        return {name: seen for entry in self.entries for name, seen in entry.scan.seen_otherwise(tag).items()}
+
+    def input(self, tag: str) -> TagValue:
+        """`Scan.input` of the first task."""
+        return self.entries[0].scan.input(tag)
 
     @property
     def gateway_alive(self) -> bool:

@@ -99,6 +99,9 @@ class Scan:
         self._seen: dict[str, Callable[[], dict[str, Scalar | None]]] = {}
         for bound in programs:
             self._bind_inputs(bound)
+        self._by_tag: dict[str, list[_Input]] = {}
+        for item in self._plain:
+            self._by_tag.setdefault(item.tag, []).append(item)
         for item in self._messages:
             self.output_image.reads(item.tag, self._reader)
         self._snapshot = self._reader.latest
@@ -236,15 +239,19 @@ class Scan:
         """Every tag of INPUTS as the last scan found it, before substitution and forces: all BAD while the gateway is dead."""
         return {name: self._seen_at(i) for name, i in self._reader.shape.index.items()}
 
-    def seen_otherwise(self) -> dict[str, dict[str, TagValue]]:
-        """Inputs that are bad and that an input's policy stands in for: by tag, ``program.variable`` and what it sees."""
-        found: dict[str, dict[str, TagValue]] = {}
-        for item in self._plain:
+    def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
+        """The variables (``program.variable``) that see something else than what input `tag` is, since it is bad: by policy."""
+        found: dict[str, TagValue] = {}
+        for item in self._by_tag.get(tag, ()):
             there = self._looked_up(item)
             seen = item.apply(there)
             if seen is not there:
-                found.setdefault(item.tag, {})[f"{item.owner}.{item.name}"] = seen
+                found[f"{item.owner}.{item.name}"] = seen
         return found
+
+    def input(self, tag: str) -> TagValue:
+        """A tag of INPUTS as the last scan found it, before substitution and forces: BAD while the gateway is dead."""
+        return self._seen_at(self._reader.shape.index[tag])
 
     def outputs(self) -> dict[str, Scalar | None]:
         """Every tag of OUTPUTS as last published by a scan that succeeded; a message tag's last sequence."""

@@ -11,10 +11,14 @@ from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from typing import Any
 
+from gateway.core.errors import UsageError
 from gateway.core.image import INPUTS, OUTPUTS, Image, TagSpec
 from gateway.core.values import Quality, TagValue
 from plc.forces import Force
 from plc.runner import Runner
+
+MAX_AT_ONCE = 64
+"""Tags in one answer: what is asked between two scans must not make the next one late. Some 1 ms with its encoding."""
 
 
 def matches(tag: str, pattern: str) -> bool:
@@ -30,30 +34,33 @@ class TagView:
         self._outputs = image.reader(OUTPUTS)
         self._specs = {region.name: {tag.name: tag for tag in region.tags} for region in image.layout.regions}
 
-    def describe(self, patterns: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
-        """JSON-able: the tags that match one of `patterns` (see `matches`; all, without any), inputs first.
+    def names(self) -> list[str]:
+        """Every tag once, inputs first."""
+        return list(self._specs[INPUTS] | self._specs[OUTPUTS])
+
+    def describe(self, names: Sequence[str], now_ns: int, utc_ns: int) -> list[dict[str, Any]]:
+        """JSON-able, in the order of `names`; a tag of both regions gives two, the input first. Raises `UsageError` for more
+        than `MAX_AT_ONCE`, or one that there is not.
 
         `now_ns` is monotonic, the tags' clock, and `utc_ns` the same instant.
         """
-
-        def wanted(tag: str) -> bool:
-            return not patterns or any(matches(tag, p) for p in patterns)
-
-        inputs = {tag: value for tag, value in self._runner.inputs().items() if wanted(tag)}
-        snapshot = self._outputs.snapshot()
-        outputs = {tag: snapshot.value(tag) for tag in self._specs[OUTPUTS] if wanted(tag)}
-        seen = self._runner.seen_otherwise()
-        forces = self._runner.forces
-        rows = []
-        for side, values, forced in ((INPUTS, inputs, forces.inputs), (OUTPUTS, outputs, forces.outputs)):
-            for tag, value in values.items():
-                row = _row(self._specs[side][tag], value, forced.get(tag), now_ns, utc_ns)
-                row["side"] = side.removesuffix("s")
-                row["seen"] = {
+        if len(names) > MAX_AT_ONCE:
+            raise UsageError("too many tags at once", expected=f"at most {MAX_AT_ONCE}", got=str(len(names)))
+        runner, snapshot, rows = self._runner, self._outputs.snapshot(), []
+        for name in names:
+            row = {}
+            if spec := self._specs[INPUTS].get(name):
+                row = _row(spec, runner.input(name), runner.forces.inputs.get(name), now_ns, utc_ns)
+                seen = {
                     variable: {"value": as_seen.value, "quality": str(as_seen.quality)}
-                    for variable, as_seen in (seen.get(tag, {}) if side == INPUTS else {}).items()
+                    for variable, as_seen in runner.seen_otherwise(name).items()
                 }
-                rows.append(row)
+                rows.append({**row, "side": "input", "seen": seen})
+            if spec := self._specs[OUTPUTS].get(name):
+                row = _row(spec, snapshot.value(name), runner.forces.outputs.get(name), now_ns, utc_ns)
+                rows.append({**row, "side": "output", "seen": {}})
+            if not row:
+                raise UsageError(f"no tag {name!r} in the process image", expected="one that `image` lists")
         return rows
 
 

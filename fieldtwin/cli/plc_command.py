@@ -43,10 +43,10 @@ def _sure(question: str, yes: bool) -> None:
     click.confirm(question, abort=True, err=True)
 
 
-def _status(instance: str) -> dict[str, Any]:
+def _status(instance: str, brief: bool) -> dict[str, Any]:
     from fieldtwin.running.plc_client import talk_to
 
-    found = talk_to(instance, lambda client: client.call("get"))
+    found = talk_to(instance, lambda client: client.call("get", brief=brief))
     assert isinstance(found, dict)
     return found
 
@@ -78,7 +78,7 @@ def status(instance: str, as_json: bool) -> int:
     """State, cycle statistics of each task, forces, retained variables, counters."""
     from fieldtwin.cli.plc_views import print_status, tags_as_data
 
-    found = _status(instance)
+    found = _status(instance, brief=not as_json)
     if as_json:
         return _emit({**found, "tags": tags_as_data(_tags(instance, ()))})
     print_status(found)

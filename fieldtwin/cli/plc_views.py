@@ -15,7 +15,7 @@ from fieldtwin.cli.talk import data, talk
 from gateway.core.control import ControlClient
 from gateway.core.errors import UsageError
 from plc.prove import Proof, Result
-from plc.tag_view import matches
+from plc.tag_view import MAX_AT_ONCE, matches
 
 REFRESH_S = 0.25
 IN_A_PIPE = 500
@@ -31,14 +31,25 @@ Row = dict[str, Any]
 """One tag as the PLC's `image` verb describes it."""
 
 
-async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row]:
-    """The tags that match, outputs after inputs. Raises `UsageError` for a pattern that nothing matches."""
-    rows: list[Row] = (await client.call("image", tags=list(patterns)))["tags"]
+async def chosen_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[str]:
+    """The names that match. Raises `UsageError` for a pattern that nothing matches."""
+    names: list[str] = (await client.call("image"))["names"]
     for pattern in patterns:
-        if not any(matches(row["tag"], pattern) for row in rows):
-            known = [row["tag"] for row in (await client.call("image"))["tags"]]
-            raise UsageError(f"no tag {pattern!r}", expected=", ".join(known[:12]) + (", ..." if known[12:] else ""))
-    return rows
+        if not any(matches(name, pattern) for name in names):
+            raise UsageError(f"no tag {pattern!r}", expected=", ".join(names[:12]) + (", ..." if names[12:] else ""))
+    return [name for name in names if not patterns or any(matches(name, p) for p in patterns)]
+
+
+async def ask_rows(client: ControlClient, names: list[str]) -> list[Row]:
+    """Rows of tags, inputs before outputs, asked for in pieces so that no scan is late for it."""
+    rows: list[Row] = []
+    for at in range(0, len(names), MAX_AT_ONCE):
+        rows += (await client.call("image", tags=names[at : at + MAX_AT_ONCE]))["tags"]
+    return sorted(rows, key=lambda row: row["side"])  # which keeps their order otherwise
+
+
+async def ask_tags(client: ControlClient, patterns: tuple[str, ...]) -> list[Row]:
+    return await ask_rows(client, await chosen_tags(client, patterns))
 
 
 def tags_as_data(rows: list[Row]) -> dict[str, Row]:
@@ -111,9 +122,10 @@ def _print_table(table: Table) -> None:
 async def watch_live(path: Path, patterns: tuple[str, ...]) -> None:
     client = await ControlClient.connect_unix(path)
     try:
+        names = await chosen_tags(client, patterns)
         with Live(console=data, auto_refresh=False, transient=True) as live:
             while True:
-                live.update(tag_table(await ask_tags(client, patterns)), refresh=True)
+                live.update(tag_table(await ask_rows(client, names)), refresh=True)
                 await asyncio.sleep(REFRESH_S)
     finally:
         await client.aclose()

@@ -247,16 +247,16 @@ class RunSession:
     async def refresh(self) -> None:
         """Ask every process for its status."""
         self.gateway_status = await self._get(self._clients.get("gateway"))
-        self.plc_status = await self._get(self._clients.get("plc"))
+        self.plc_status = await self._get(self._clients.get("plc"), brief=True)
         self.field_status = await self._get(self._field.client if self._field else None)
         if self.options.field_host and self.field_status is None:
             self.note_error(f"the field side at {self.options.field_host} was lost: nobody knows what its devices held")
 
-    async def _get(self, client: ControlClient | None) -> dict[str, Any] | None:
+    async def _get(self, client: ControlClient | None, **args: Any) -> dict[str, Any] | None:
         if client is None:
             return None
         try:
-            answer: dict[str, Any] = await client.call("get")
+            answer: dict[str, Any] = await client.call("get", **args)
         except FieldtwinError:
             return None  # it is dying or gone: _notice_deaths says so with its reason
         return answer

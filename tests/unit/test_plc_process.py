@@ -302,10 +302,14 @@ def test_forces_pause_steps_and_reasons_over_the_control_channel(tmp_path: Path)
             await eventually(lambda: gateway.reader.snapshot().value("ctd.sample_period_s").value == 9)
             assert gateway.reader.snapshot().value("ctd.sample_period_s").quality is Quality.SIMULATED
             assert (await client.call("get"))["forces"]["ctd.sample_period_s"]["by"] == "test"
-            [commanded] = (await client.call("image", tags=["ctd.sample_period_s", "no.*"]))["tags"]
+            assert "relay.state" in (await client.call("image"))["names"]
+            [commanded] = (await client.call("image", tags=["ctd.sample_period_s"]))["tags"]
             assert (commanded["quality"], commanded["forced"]["by"]) == ("simulated", "test")
             with pytest.raises(RemoteError, match="which tags"):
                 await client.call("image", tags="ctd.*")
+            with pytest.raises(RemoteError, match=r"no tag 'no\.such'"):
+                await client.call("image", tags=["no.such"])
+            assert "outputs" not in await client.call("get", brief=True)
             for args in ({"tag": "no.such", "value": 1}, {"value": 1}, {"tag": "ctd.sample_period_s", "value": "x"}):
                 with pytest.raises(RemoteError):
                     await client.call("force", **args)

@@ -16,7 +16,7 @@ from plc.binding import BoundProgram, InputBinding, image_for
 from plc.config import PlcConfig, ProgramConfig
 from plc.runner import Runner
 from plc.states import ANY, StateMachine, StateTable, Transition
-from plc.tag_view import TagView
+from plc.tag_view import TagView, matches
 
 MS = 1_000_000
 UTC_NS = 1_700_000_000_000_000_000
@@ -61,8 +61,9 @@ class Rig:
         self.writer.publish([level], self.now_ns)
         self.runner.run_once()
 
-    def rows(self, *patterns: str, later_ms: int = 0) -> dict[str, dict[str, Any]]:
-        return {r["tag"]: r for r in self.view.describe(patterns, self.now_ns + later_ms * MS, UTC_NS)}
+    def rows(self, later_ms: int = 0) -> dict[str, dict[str, Any]]:
+        names = self.view.names()
+        return {r["tag"]: r for r in self.view.describe(names, self.now_ns + later_ms * MS, UTC_NS)}
 
 
 def test_every_tag_has_what_an_engineer_asks_for(tmp_path: Path) -> None:
@@ -78,9 +79,18 @@ def test_every_tag_has_what_an_engineer_asks_for(tmp_path: Path) -> None:
     assert (pump["unit"], pump["limits"]) == ("rpm", [0.0, 1500.0])
     load = rows["pump.load"]
     assert (load["value"], load["quality"], load["unit"], load["limits"]) == (None, "bad", "%", [0.0, 100.0])
-    assert list(rig.rows("pump.*")) == list(rig.rows("pump")) == ["pump.speed", "pump.load"]
-    assert list(rig.rows("*.level", "pump.load")) == ["tank.level", "pump.load"]
-    assert not rig.rows("pum")
+    assert rig.view.names() == ["tank.level", "pump.speed", "pump.load"]
+    with pytest.raises(UsageError, match="at most 64"):
+        rig.view.describe(["tank.level"] * 65, 0, 0)
+    with pytest.raises(UsageError, match=r"no tag 'tank\.\*'"):
+        rig.view.describe(["tank.*"], 0, 0)
+
+
+def test_patterns() -> None:
+    for pattern in ("pump.speed", "pump.*", "*.speed", "pump", "*"):
+        assert matches("pump.speed", pattern)
+    for pattern in ("pum", "speed", "pump.spee", "Pump"):
+        assert not matches("pump.speed", pattern)
 
 
 @pytest.mark.parametrize(

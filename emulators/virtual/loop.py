@@ -8,12 +8,12 @@ in which they were asked for, timers by (when, sequence); no set of tasks is eve
 from __future__ import annotations
 
 import asyncio
-import heapq
 import sys
 from asyncio import events
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
-from contextvars import Context
+from contextvars import Context, copy_context
+from heapq import heapify, heappop, heappush
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
@@ -41,6 +41,53 @@ class Deadlock(Bug):
     """Nothing is ready and no timer is set, or callbacks call each other for ever at one instant."""
 
 
+class _Call(asyncio.Handle):
+    """A handle made in fewer steps: on a virtual loop they are most of what is made, and there is no debug mode to look for."""
+
+    __slots__ = ()
+    _callback: Callable[..., object]
+    _args: tuple[Any, ...]
+    _context: Context
+    _cancelled: bool
+
+    def __init__(
+        self, callback: Callable[..., object], args: tuple[Any, ...], loop: VirtualLoop, context: Context | None
+    ) -> None:
+        self._callback = callback
+        self._args = args
+        self._context = copy_context() if context is None else context
+        self._cancelled = False
+        self._loop = loop
+        self._repr = self._source_traceback = None
+
+
+class _Timer(asyncio.TimerHandle):
+    """As `_Call`, with a time."""
+
+    __slots__ = ()
+    _callback: Callable[..., object]
+    _args: tuple[Any, ...]
+    _context: Context
+    _cancelled: bool
+
+    def __init__(
+        self,
+        when_ns: int,
+        callback: Callable[..., object],
+        args: tuple[Any, ...],
+        loop: VirtualLoop,
+        context: Context | None,
+    ) -> None:
+        self._callback = callback
+        self._args = args
+        self._context = copy_context() if context is None else context
+        self._cancelled = False
+        self._loop = loop
+        self._repr = self._source_traceback = None
+        self._when = when_ns / NS_PER_S
+        self._scheduled = True  # as asyncio's own loops do: cancel() then tells us
+
+
 def _way_out(name: str) -> Callable[..., NoReturn]:
     def refuse(self: VirtualLoop, *args: Any, **kwargs: Any) -> NoReturn:
         raise escape(f"loop.{name}")
@@ -56,8 +103,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self.now_ns = start_ns
         self.callbacks = 0
         """How many were run."""
-        self._ready: deque[asyncio.Handle] = deque()
-        self._timers: list[tuple[int, int, asyncio.TimerHandle | asyncio.Future[None]]] = []
+        self._ready: deque[_Call | _Timer] = deque()
+        self._timers: list[tuple[int, int, _Timer | asyncio.Future[None]]] = []
         self._sequence = 0
         self._cancelled = 0
         self._tasks = 0
@@ -74,7 +121,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def call_soon(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        handle = asyncio.Handle(callback, args, self, context)
+        handle = _Call(callback, args, self, context)
         self._ready.append(handle)
         return handle
 
@@ -92,24 +139,24 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
         """As `call_at`, to the nanosecond. What is past is due at this instant, behind what is ready."""
-        timer = asyncio.TimerHandle(when_ns / NS_PER_S, callback, args, self, context)
+        timer = _Timer(when_ns, callback, args, self, context)
         self._sequence += 1
-        heapq.heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, timer))
-        timer._scheduled = True  # type: ignore[attr-defined]  # as asyncio's own loops do: cancel() then tells us
+        now_ns = self.now_ns
+        heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, self._sequence, timer))
         return timer
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
         """A future that is done at `when_ns`: what a clock's sleep awaits, in fewer steps than by `call_at_ns`."""
         future: asyncio.Future[None] = asyncio.Future(loop=self)
         self._sequence += 1
-        heapq.heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, future))
+        heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, future))
         return future
 
     def _timer_handle_cancelled(self, timer: asyncio.TimerHandle) -> None:
         self._cancelled += 1
         if self._cancelled > _COMPACT_ABOVE and 2 * self._cancelled > len(self._timers):
             self._timers = [entry for entry in self._timers if not entry[2].cancelled()]
-            heapq.heapify(self._timers)
+            heapify(self._timers)
             self._cancelled = 0
 
     # -- futures and tasks --------------------------------------------------------------------------------------------
@@ -172,8 +219,13 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         ready, pop, budget = self._ready, self._ready.popleft, STUCK_AFTER
         while ready:
             handle = pop()
-            if not handle.cancelled():
-                handle._run()
+            if not handle._cancelled:
+                try:
+                    handle._context.run(handle._callback, *handle._args)
+                except (SystemExit, KeyboardInterrupt):
+                    raise
+                except BaseException as e:  # as asyncio does: nobody else is there to catch it
+                    self.call_exception_handler({"message": f"in {handle}", "exception": e, "handle": handle})
                 budget -= 1
             if self._stopping:
                 self.callbacks += STUCK_AFTER - budget
@@ -186,22 +238,20 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def _advance(self) -> None:
         timers = self._timers
         while timers and timers[0][2].cancelled():
-            if isinstance(heapq.heappop(timers)[2], asyncio.TimerHandle):
-                self._cancelled -= 1
+            self._cancelled -= isinstance(heappop(timers)[2], _Timer)
         if not timers:
             raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
         self.now_ns = now_ns = timers[0][0]
         while timers and timers[0][0] == now_ns:
-            due = heapq.heappop(timers)[2]
-            if isinstance(due, asyncio.Future):
-                if not due.done():
-                    due.set_result(None)
-                continue
-            due._scheduled = False  # type: ignore[attr-defined]
-            if due.cancelled():
-                self._cancelled -= 1
-            else:
-                self._ready.append(due)
+            due = heappop(timers)[2]
+            if isinstance(due, _Timer):
+                due._scheduled = False
+                if due._cancelled:
+                    self._cancelled -= 1
+                else:
+                    self._ready.append(due)
+            elif not due.done():
+                due.set_result(None)
 
     def _who_waits(self) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())

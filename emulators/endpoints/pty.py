@@ -147,6 +147,7 @@ class PtyEnd(ByteConnection):
         self._loop.add_reader(self._master, self._on_readable)
 
     def _on_readable(self) -> None:
+        now_ns = self._now_ns()  # first: what this process does about it takes no time on the line
         try:
             data = os.read(self._master, READ_SIZE)
         except BlockingIOError:
@@ -157,7 +158,7 @@ class PtyEnd(ByteConnection):
         _raise_idle_flags(self._spare)
         if self._inward is not None:
             self._stop_reading()  # what follows goes behind it, and waits in the pty
-            end_ns = self._inward.send(self._now_ns(), len(data))
+            end_ns = self._inward.send(now_ns, len(data))
             self._on_its_way = self._loop.call_at(end_ns / NS_PER_S, self._arrived, data)
         elif not self.feed(data):
             self._stop_reading()

@@ -7,7 +7,9 @@ import os
 import selectors
 import socket
 import sys
+import threading
 import time
+from typing import Any
 
 import pytest
 
@@ -41,11 +43,50 @@ def test_a_wait_is_ended_by_the_timer_and_never_early(wait_s: float) -> None:
 
 def test_the_timer_ends_a_wait_that_epoll_would_have_slept_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the timer can end it: the time given to epoll itself is far off."""
-    monkeypatch.setattr(selectors.EpollSelector, "select", lambda self, timeout: self._selector.poll(30.0, 1))
+    monkeypatch.setattr(
+        selectors.EpollSelector, "select", lambda self, timeout: self._selector.poll(30.0 * bool(timeout), 1)
+    )
     with selector() as subject:
         began_s = time.monotonic()
         subject.select(0.002)
         assert time.monotonic() - began_s < 20
+
+
+def test_what_comes_while_the_end_of_a_wait_is_looked_away_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wallclock, "LEAD_SHARE", 1)
+    monkeypatch.setattr(wallclock, "LEAD_NS", 20_000_000_000)
+    here, there = socket.socketpair()
+    with selector() as subject, here, there:
+        subject.register(here, selectors.EVENT_READ)
+        threading.Timer(0.01, there.send, (b"x",)).start()
+        began_s = time.monotonic()
+        [(key, _)] = subject.select(10)
+        assert key.fileobj is here
+        assert time.monotonic() - began_s < 5
+
+
+def test_nothing_spins_before_the_end_of_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A timer that ran out while something else ended its wait is told in the next one: that one goes on all the same."""
+    asked: list[float | None] = []
+    select = selectors.EpollSelector.select
+
+    def counted(self: selectors.EpollSelector, timeout: float | None = None) -> Any:
+        asked.append(timeout)
+        return select(self, timeout)
+
+    monkeypatch.setattr(selectors.EpollSelector, "select", counted)
+    monkeypatch.setattr(wallclock, "LEAD_NS", 0)
+    here, there = socket.socketpair()
+    with selector() as subject, here, there:
+        subject.register(here, selectors.EVENT_READ)
+        there.send(b"x")
+        assert subject.select(1e-6)
+        here.recv(1)
+        time.sleep(0.001)
+        began_s = time.monotonic()
+        assert subject.select(0.02) == []
+        assert time.monotonic() - began_s >= 0.02
+    assert len(asked) < 10
 
 
 def test_what_is_ready_is_told_beside_a_timer_that_ran_out() -> None:

@@ -207,6 +207,7 @@ class DeviceHost:
         played: SignalPlayer | CanLog | None = None
         if recording is not None and recording.suffix == SUFFIX:
             played = CanLog(find_recording(str(recording)))
+            talk.print(f"{profile.name} plays {played.path.name} (a log of a CAN bus)", soft_wrap=True)
         elif recording or self._recording_of(profile):
             played = self._player(profile, recording)
         node = emulated_node(profile, node_id or profile.form.factory.node, played, self._clock.monotonic_ns()).node

@@ -45,6 +45,8 @@ class FaultyEnd(ByteConnection):
         self._flush: asyncio.TimerHandle | None = None
         inner.intercept = self._heard
         faults.listeners.append(self._put_in)
+        for active in faults.active.values():  # what was put in before this connection came
+            self._put_in(active)
 
     # -- as a connection ------------------------------------------------------------------------------------------------
 

@@ -108,7 +108,14 @@ class FaultyCan(CanConnection):
             return
         pieces = active.fault.appears(self.node, active.random)
         wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
-        self._later(CanPiece(p.frame, p.delay_s + wait_s) for p in pieces)
+        for piece in pieces:
+            self._loop.call_later(piece.delay_s + wait_s, self._add, active, piece.frame)
+
+    def _add(self, active: Active, frame: CanFrame) -> None:
+        """A frame that only the fault sends, while it is in."""
+        if self._faults.active.get(active.id) is active and in_time(active, self._now_ns()):
+            active.struck += 1
+            self._start(frame)
 
     def _later(self, pieces: Iterable[CanPiece]) -> None:
         for piece in pieces:

@@ -21,6 +21,9 @@ class BootStorm(CanFault):
     summary = "the node sends `count` boot-up messages, `every_ms` apart"
     form = Form
 
+    def aims_at(self, frame: CanFrame, node: int) -> bool:
+        return False  # it only adds
+
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return as_is(frame)
 

@@ -22,6 +22,9 @@ class EmcyBurst(CanFault):
     summary = "the node sends `count` EMCY messages of `code`, `every_ms` apart"
     form = Form
 
+    def aims_at(self, frame: CanFrame, node: int) -> bool:
+        return False  # it only adds
+
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return as_is(frame)
 

@@ -9,7 +9,7 @@ from emulators.faults.fault import ValueFault
 
 class NotANumber(ValueFault):
     name = "nan"
-    summary = "the value is not a number; an integer takes what its type has for that"
+    summary = "no number; an integer register holds what its type has for that, an integer object what it held"
 
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
         return float("nan")

@@ -24,6 +24,7 @@ from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.trace import Event, Kind, Trace
+from gateway.core.clock import NS_PER_MS
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError
 from gateway.core.values import Quality, TagValue
@@ -38,6 +39,8 @@ SETTLE_S = 10.0
 """How long a command that is still under way may take after the run's time is over."""
 LAST_REPLIES_S = 0.5
 ASKED_KEPT = 64
+CAN_WIRE_NS = 10 * NS_PER_MS
+"""What a frame may need on a CAN bus: several attempts, behind others."""
 TRACE_KEPT = 20_000
 MAX_ERRORS = 100
 
@@ -202,9 +205,12 @@ class VirtualRun:
             if told is not None:
                 told(name, value)
             if value.quality is Quality.GOOD:
-                # A value is of the moment in which its reply was complete; the device answered after it was asked.
-                asked = self._asked.get(bus_of.get(name.partition(".")[0], ""), ())
-                asked_ns = next((start_ns + t for t in reversed(asked) if start_ns + t <= value.t_ns), value.t_ns)
+                # A value is of the moment in which its reply was complete; the device answered after it was asked. What a node
+                # sends unasked was on the wire for a while, longer where it had to be sent again.
+                bus = bus_of.get(name.partition(".")[0])
+                asked = () if bus is None else self._asked.get(bus, ())
+                unasked_ns = value.t_ns - (CAN_WIRE_NS if bus is None else 0)
+                asked_ns = next((start_ns + t for t in reversed(asked) if start_ns + t <= value.t_ns), unasked_ns)
                 self.oracle.published(name, value.raw, value.value, asked_ns, loop.now_ns)
 
         return put

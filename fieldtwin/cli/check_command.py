@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 DANGERS = ("observe", "read", "write", "disrupt")
 _HELD = re.compile(r"^(holding|input|coil|discrete):(\d{1,5})$")
+_OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$")
 _RANGE = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 
 
@@ -132,7 +133,7 @@ def modbus_master(
     plan = Plan(
         _only(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset({"echo"} if echo else ()), Danger(at_most)
     )
-    options = Options(Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), _held(hold), argv)
+    options = Options(Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), _held(hold), command=argv)
     return _judged(
         lambda listener: judge_modbus_master(options, listener),
         Listener,
@@ -142,6 +143,102 @@ def modbus_master(
         as_json,
         str(listen),
     )
+
+
+@command.command("canopen-master")
+@click.option(
+    "--listen", metavar="ENDPOINT", help="can:fieldtwin/HOST:PORT, which is made, or can:socketcan/INTERFACE."
+)
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), default=125_000, show_default=True, help="bit/s")
+@click.option(
+    "--node", "nodes", multiple=True, type=click.IntRange(1, 127), help="A node that boots by itself; repeatable."
+)
+@click.option("--heartbeat", "heartbeat_s", type=Duration(), default="1s", show_default=True, help="0: none.")
+@click.option("--size", type=click.Choice(["2", "4"]), default="4", show_default=True, help="Bytes of an object.")
+@click.option(
+    "--hold",
+    multiple=True,
+    metavar="INDEX:SUB=HEX",
+    help="An object's bytes as sent, such as 6041:00=3702; repeatable.",
+)
+@click.option(
+    "--probe",
+    default="",
+    metavar="WHERE",
+    help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], or output.",
+)
+@click.option(
+    "--timeout", "timeout_s", type=Duration(), default="0", help="The master's SDO timeout, where you know it."
+)
+@click.option(
+    "--values",
+    default="1111,2222,3333",
+    show_default=True,
+    metavar="A,B,BAD",
+    help="What objects hold: two good ones and a poison.",
+)
+@click.option("--none", "none", multiple=True, metavar="VALUE", help="What the probe shows for no value; repeatable.")
+@_shared
+@click.argument("argv", nargs=-1, type=click.UNPROCESSED)
+def canopen_master(
+    listen: str | None,
+    bitrate: int,
+    nodes: tuple[int, ...],
+    heartbeat_s: float,
+    size: str,
+    hold: tuple[str, ...],
+    probe: str,
+    timeout_s: float,
+    values: str,
+    none: tuple[str, ...],
+    only: str | None,
+    at_most: str,
+    for_s: float,
+    wait_s: float,
+    patience_s: float,
+    waivers_path: Path | None,
+    junit: Path | None,
+    list_only: bool,
+    as_json: bool,
+    argv: tuple[str, ...],
+) -> int:
+    """Play the hostile nodes of the CANopen catalogue against a master, and judge it.
+
+    \b
+    fieldtwin check canopen-master --listen can:fieldtwin/127.0.0.1:29536 --probe output -- python my_master.py
+    fieldtwin check canopen-master --listen can:socketcan/vcan0 --node 5 --probe tcp://plc:502/holding:100
+
+    Every node id answers SDO. A program behind -- finds the bus in FIELDTWIN_ENDPOINT, FIELDTWIN_INTERFACE and
+    FIELDTWIN_CHANNEL, which are python-can's names.
+    """
+    from fieldtwin.conformance.canopen_cases import CASES
+    from fieldtwin.conformance.case import Danger
+    from fieldtwin.conformance.run import Plan
+    from fieldtwin.conformance.session import Listener, Options, judge_canopen_master
+
+    cases = [case.about for case in CASES]
+    if list_only:
+        return _list(cases, as_json)
+    if not listen:
+        raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
+    plan = Plan(_only(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset(), Danger(at_most))
+    options = Options(
+        Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), command=argv, objects=_objects(hold),
+        size=int(size), nodes=frozenset(nodes), heartbeat_s=heartbeat_s, bitrate=bitrate,
+    )  # fmt: skip
+    return _judged(
+        lambda listener: judge_canopen_master(options, listener), Listener, cases, waivers_path, junit, as_json, listen
+    )
+
+
+def _objects(texts: tuple[str, ...]) -> dict[tuple[int, int], bytes]:
+    held = {}
+    for text in texts:
+        match = _OBJECT.match(text)
+        if not match:
+            raise UsageError("--hold", expected="such as 6041:00=3702", got=repr(text))
+        held[int(match[1], 16), int(match[2], 16)] = bytes.fromhex(match[3])
+    return held
 
 
 def _judged(

@@ -35,6 +35,16 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True)
+class Sent:
+    """A frame of the master that asks nobody for an answer: NMT, SYNC, a PDO, an SDO abort. `data` is two bytes of identifier
+    (big-endian), then the frame's."""
+
+    t_ns: int
+    client: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class Garbled:
     """Bytes of the master that are no request."""
 
@@ -88,8 +98,8 @@ class Ended:
     status: int
 
 
-Event = Asked | Told | Garbled | Came | Left | Shown | Ended
-E = TypeVar("E", Asked, Told, Garbled, Came, Left, Shown, Ended)
+Event = Asked | Told | Sent | Garbled | Came | Left | Shown | Ended
+E = TypeVar("E", Asked, Told, Sent, Garbled, Came, Left, Shown, Ended)
 
 
 @dataclass(frozen=True, slots=True)

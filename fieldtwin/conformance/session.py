@@ -11,13 +11,16 @@ from pathlib import Path
 
 from emulators.endpoints.ports import OsPorts
 from emulators.modbus.bank import Table
+from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
+from fieldtwin.conformance.canopen_cases import SILENT as CANOPEN_SILENT
+from fieldtwin.conformance.canopen_stage import CanopenStage
 from fieldtwin.conformance.modbus_cases import CASES, SILENT
 from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
 from fieldtwin.conformance.observation import Word
 from fieldtwin.conformance.probe import Classifier, OutputProbe, Probe, RegisterProbe
 from fieldtwin.conformance.program import Program
 from fieldtwin.conformance.results import CaseResult
-from fieldtwin.conformance.run import MasterRun, Plan
+from fieldtwin.conformance.run import C, MasterRun, Plan
 from gateway.connections.os_connector import OsConnector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
@@ -25,13 +28,14 @@ from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 
 MAX_CLIENTS = 8
+CAN_TRAITS = frozenset({"can"})
 LISTENING = "tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH or rtu:PORT"
 
 
 @dataclass(frozen=True)
 class Options:
     """What a user asked for. `words`: the two honest ones and the poison. `probe` as `RegisterProbe` reads it, ``output``, or
-    empty."""
+    empty. From `objects` on it is for CANopen only: fixed objects, bytes of all others, nodes that boot by themselves."""
 
     listen: Endpoint
     plan: Plan
@@ -39,6 +43,11 @@ class Options:
     probe: str = ""
     stands_for_none: frozenset[str] = frozenset()
     held: Mapping[tuple[Table, int], int] = field(default_factory=dict)
+    objects: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
+    size: int = 4
+    nodes: frozenset[int] = frozenset()
+    heartbeat_s: float = 1.0
+    bitrate: int = 125_000
     command: Sequence[str] = ()
 
 
@@ -53,33 +62,63 @@ class Listener:
 async def judge_modbus_master(options: Options, listener: Listener) -> list[CaseResult]:
     """Results in the order of the cases. Raises `UsageError`, `Unreachable` or `EndpointBusy`.
 
-    A signal ends it, and the program with it.
+    SIGTERM ends it, and the program with it.
     """
     if options.listen.scheme not in ("tcp", "rtu+tcp", "pty", "rtu"):
         raise UsageError("where the master is listened for", expected=LISTENING, got=str(options.listen))
-    task = asyncio.current_task()
-    assert task is not None
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
     scheme = "rtu" if options.listen.is_serial or options.listen.scheme == "pty" else options.listen.scheme
     stage = Stage(wire_for(scheme), options.words, options.held)
     async with AsyncExitStack() as closing:
         nursery = await closing.enter_async_context(Nursery())
         theirs = await _open(options.listen, stage, nursery, closing)
-        listener.say(f"listening on {options.listen}; the master's side is {theirs}")
         probe, on_text = _probe(options, nursery)
         run = MasterRun(stage, CASES, SILENT, options.plan, traits(scheme), probe, listener.tell)
-        if not options.command:
+        return await _judged(run, options, theirs, on_text, listener)
+
+
+async def judge_canopen_master(options: Options, listener: Listener) -> list[CaseResult]:
+    """The same for the SDO client and NMT master on a CAN bus, which is made here if it is a software one."""
+    if not options.listen.is_can:
+        expected = "can:fieldtwin/HOST:PORT or can:socketcan/INTERFACE"
+        raise UsageError("where the master is listened for", expected=expected, got=str(options.listen))
+    stage = CanopenStage(
+        options.words,
+        size=options.size,
+        held=dict(options.objects),
+        nodes=sorted(options.nodes),
+        heartbeat_s=options.heartbeat_s,
+    )
+    async with AsyncExitStack() as closing:
+        bus = await OsPorts().can_bus(options.listen, options.bitrate, paced=True)
+        closing.push_async_callback(bus.aclose)
+        connection = await bus.join("hostile nodes")
+        closing.push_async_callback(connection.aclose)
+        nursery = await closing.enter_async_context(Nursery())
+        nursery.start(stage.serve(connection), "nodes")
+        probe, on_text = _probe(options, nursery)
+        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, options.plan, CAN_TRAITS, probe, listener.tell)
+        return await _judged(run, options, bus.bound, on_text, listener)
+
+
+async def _judged(
+    run: MasterRun[C], options: Options, theirs: Endpoint, on_text: Callable[[str], None], listener: Listener
+) -> list[CaseResult]:
+    """The run, beside the program if there is one."""
+    task = asyncio.current_task()
+    assert task is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+    listener.say(f"listening on {options.listen}; the master's side is {theirs}")
+    if not options.command:
+        return await run.run()
+    program = Program(options.command, theirs, on_text, run.ended)
+    try:
+        async with program:
             return await run.run()
-        program = Program(options.command, theirs, on_text, run.ended)
-        try:
-            async with program:
-                results = await run.run()
-        finally:
-            if run.exit_code is not None:
-                listener.say(f"the program ended by itself, exit code {run.exit_code}; the last that it said:")
-                for line in program.said:
-                    listener.say(f"  {line}")
-        return results
+    finally:
+        if run.exit_code is not None:
+            listener.say(f"the program ended by itself, exit code {run.exit_code}; the last that it said:")
+            for line in program.said:
+                listener.say(f"  {line}")
 
 
 async def _open(listen: Endpoint, stage: Stage, nursery: Nursery, closing: AsyncExitStack) -> Endpoint:

@@ -1,0 +1,76 @@
+"""The rows of the CANopen catalogue that concern masters and can be judged from the bus. Clauses are CiA 301 v4.2 unless said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fieldtwin.conformance import canopen_plays as plays
+from fieldtwin.conformance import judges
+from fieldtwin.conformance.canopen_judges import aborts_with, legal_nmt, legal_sync, reconfigures
+from fieldtwin.conformance.canopen_scene import CanopenCase, CanPlay
+from fieldtwin.conformance.case import Case, Danger, Judge
+
+READ, CUT, LOOK = Danger.READ, Danger.DISRUPT, Danger.OBSERVE
+
+
+def _case(
+    id: str, title: str, clause: str, danger: Danger, play: CanPlay, judge: Judge, does: str, must: str
+) -> CanopenCase:
+    return CanopenCase(Case(id, title, clause, danger, does, must, judge), play)
+
+
+def _watch(id: str, title: str, clause: str, judge: Judge, must: str) -> CanopenCase:
+    return _case(id, title, clause, LOOK, plays.nothing, judge, "watches all of the run", must).on(wants="nothing")
+
+
+SILENT = _case("CO-000", "no reply", "", READ, plays.nothing, judges.rejects, "is silent", "")
+"""No case of the catalogue: how the master's timeout is guessed."""
+BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block upload")  # noqa: E731
+
+CASES: tuple[CanopenCase, ...] = (
+    _case("CO-001", "toggle bit repeated in a segment", "7.2.4", READ, plays.same_toggle, aborts_with(0x05030000),
+          "repeats the toggle bit in the second segment", "abort with 05030000").on(strikes=1),
+    _case("CO-004", "unknown command specifier", "7.2.4", READ, plays.unknown_command, aborts_with(0x05040001),
+          "answers with E0h", "abort with 05040001").on(strikes=1),
+    _case("CO-005", "a reply for another object", "canopen-stack #132", READ, plays.other_object, judges.rejects,
+          "answers for another index", "never take it for the one that was asked for"),
+    _case("CO-008", "missing index", "7.2.4", READ, plays.no_object, judges.survives, "aborts with 06020000", "go on"),
+    _case("CO-013", "segmented total differs from the indicated size", "7.2.4", READ, plays.other_length, judges.rejects,
+          "indicates 14 bytes and ends after a few", "refuse the value").on(strikes=1),
+    BLOCK(_case("CO-015", "block CRC mismatch", "7.2.4", READ, plays.wrong_crc, aborts_with(0x05040004),
+          "ends a block upload with another CRC", "abort with 05040004").on(strikes=1)),
+    BLOCK(_case("CO-016", "segment lost in a block", "CN #205", READ, plays.loses(5), judges.accepts,
+          "leaves out a segment", "acknowledge the last good one").on(holds_good=True)),
+    BLOCK(_case("CO-017", "segment lost in the last sub-block", "py #618", READ, plays.loses(-2), judges.accepts,
+          "leaves out the last segment but one", "recover").on(holds_good=True)),
+    BLOCK(_case("CO-021", "switch from block to normal upload", "7.2.4", READ, plays.expedited_instead, judges.accepts,
+          "answers a block upload by an expedited one", "take it").on(holds_good=True)),
+    _case("CO-023", "response after the client's timeout", "catalogue", READ, plays.late, judges.late_same_shape,
+          "answers after 1.5 timeouts", "discard it, never pair it with the next request").on(strikes=1),
+    _case("CO-025", "a responder floods garbage", "py #409", CUT, plays.flood, judges.survives,
+          "sends 30 replies that nobody understands, then the right one", "go on, in bounds"),
+    _case("CO-026", "SDO shorter than 8 bytes", "CN #584", READ, plays.short, judges.either,
+          "leaves out the unused bytes", "ignore it, or take it by option").on(holds_good=True, strikes=2),
+    _case("CO-027", "NMT reset during a transfer", "7.3.2.2.1", READ, plays.restarts, judges.survives,
+          "does not answer, but boots", "give the transfer up; go on"),
+    _case("CO-029", "expedited without the size bit", "7.2.4", READ, plays.no_size, judges.accepts,
+          "leaves the size to the object", "take the object's own length").on(holds_good=True, strikes=4),
+    _case("CO-034", "boot-up storm", "catalogue", CUT, plays.boot_storm, judges.survives, "20 nodes boot at once",
+          "go on").on(strikes=1),
+    _case("CO-035", "unexpected boot-up", "catalogue", READ, plays.boots, reconfigures,
+          "boots without being told to", "configure and start it again").on(strikes=1),
+    _case("CO-039a", "heartbeat of length 0", "7.2.8", READ, plays.heartbeat(b""), judges.survives,
+          "sends an empty heartbeat", "ignore it"),
+    _case("CO-039b", "heartbeat of an unknown state", "7.2.8", READ, plays.heartbeat(b"\x55"), judges.survives,
+          "says that its state is 55h", "ignore it"),
+    _case("CO-042", "two nodes with one id", "catalogue", READ, plays.twin, judges.rejects,
+          "answers twice, with another value the second time", "never take the second for a later request"),
+    _case("CO-052", "EMCY burst", "7.2.7", CUT, plays.emcy_burst, judges.survives, "sends 20 EMCY", "go on").on(strikes=1),
+    _case("CO-053", "EMCY shorter than 8 bytes", "7.2.7", READ, plays.emcy_short, judges.survives,
+          "sends an EMCY of 3 bytes", "go on"),
+    _case("CO-060", "extended id with a CANopen number", "catalogue", READ, plays.extended, judges.rejects,
+          "answers with a 29-bit identifier", "ignore it"),
+    _watch("CO-033", "NMT of another length, node > 127", "7.2.8", legal_nmt, "never send one"),
+    _watch("CO-047", "SYNC of the wrong length", "7.2.5", legal_sync, "never send one"),
+)  # fmt: skip
+"""In the order in which they are played; observers judge the whole run in the end."""

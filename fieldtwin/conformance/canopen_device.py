@@ -1,0 +1,73 @@
+"""The honest CANopen nodes under the hostile one: every object exists and holds one word, every node answers SDO.
+
+Pure: frames and `now` in, frames out. A node comes to life when it is first asked or commanded.
+"""
+
+from __future__ import annotations
+
+from emulators.canopen.sdo_server import SdoServer
+
+TIMEOUT_NS = 2_000_000_000
+LONG_BYTES = 1000
+"""What a block upload gives, the word again and again: two sub-blocks."""
+BOOT_UP, PRE_OPERATIONAL, OPERATIONAL, STOPPED = 0x00, 0x7F, 0x05, 0x04
+_STATES = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PRE_OPERATIONAL}
+_RESETS = frozenset({0x81, 0x82})
+_FIXED = {(0x1001, 0): b"\0", (0x1008, 0): b"fieldtwin", (0x1018, 0): b"\x04"}
+
+
+class OneWordObjects:
+    """Every object reads as `word` in `size` bytes, little-endian; what was written reads back."""
+
+    def __init__(self, word: int, size: int, held: dict[tuple[int, int], bytes]) -> None:
+        self.word = word
+        self.long = False
+        self._size = size
+        self._written = {**_FIXED, **held}
+
+    def read(self, index: int, subindex: int, now_ns: int) -> bytes:
+        raw = self._written.get((index, subindex))
+        if raw is not None:
+            return raw
+        word = self.word.to_bytes(self._size, "little")
+        return word * (LONG_BYTES // self._size) if self.long else word
+
+    def begin_write(self, index: int, subindex: int, size: int | None) -> int | None:
+        return None
+
+    def write(self, index: int, subindex: int, raw: bytes, now_ns: int) -> None:
+        self._written[index, subindex] = raw
+
+
+class HonestNode:
+    """One node: its SDO server and its NMT state."""
+
+    def __init__(self, word: int, size: int, held: dict[tuple[int, int], bytes]) -> None:
+        self.objects = OneWordObjects(word, size, held)
+        self.state = PRE_OPERATIONAL
+        self._size = size
+        self._server = SdoServer(self.objects, TIMEOUT_NS)
+
+    def answer(self, request: bytes, now_ns: int) -> list[bytes]:
+        """The SDO replies, several for a sub-block; none while STOPPED."""
+        if self.state == STOPPED:
+            return []
+        self.objects.long = request[0] >> 5 == 5
+        return self._server.request(request, now_ns)
+
+    def poisoned(self, request: bytes, poison: int) -> bytes:
+        """An expedited upload response with another word."""
+        return (
+            bytes((0x43 | (4 - self._size) << 2,))
+            + request[1:4]
+            + poison.to_bytes(self._size, "little").ljust(4, b"\0")
+        )
+
+    def command(self, specifier: int) -> bool:
+        """NMT; True where a boot-up message is due."""
+        if specifier in _RESETS:
+            self.state = PRE_OPERATIONAL
+            self._server.reset()
+            return True
+        self.state = _STATES.get(specifier, self.state)
+        return False

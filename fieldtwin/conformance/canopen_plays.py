@@ -1,0 +1,137 @@
+"""What a hostile CANopen node does (CiA 301 v4.2, 7.2.4 for SDO). Pure: a request in, frames out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fieldtwin.conformance.canopen_scene import CanPlay, CanScene, SayFrame
+from gateway.core.canframe import CanFrame
+
+HEARTBEAT, EMCY = 0x700, 0x080
+LATE = 1.5
+STORM = range(100, 120)
+
+
+def nothing(scene: CanScene) -> list[SayFrame]:
+    return []
+
+
+def same_toggle(scene: CanScene) -> list[SayFrame]:
+    """A segmented upload whose second segment has the toggle bit of the first."""
+    if scene.opens:
+        scene.memory["segments"] = 0
+        return [scene.reply(b"\x41" + scene.request[1:4] + (14).to_bytes(4, "little"))]
+    if "segments" not in scene.memory:
+        return scene.honest()
+    scene.memory["segments"] += 1
+    last = scene.memory["segments"] > 1
+    return [scene.reply(bytes((0x01 if last else 0x00,)) + scene.poison.ljust(7, b"\0"))]
+
+
+def other_length(scene: CanScene) -> list[SayFrame]:
+    """A segmented upload that ends before the length that was indicated."""
+    if scene.opens:
+        scene.memory["segments"] = 0
+        return [scene.reply(b"\x41" + scene.request[1:4] + (14).to_bytes(4, "little"))]
+    if "segments" not in scene.memory:
+        return scene.honest()
+    return [scene.reply(bytes((0x01 | (7 - len(scene.poison)) << 1,)) + scene.poison.ljust(7, b"\0"))]
+
+
+def unknown_command(scene: CanScene) -> list[SayFrame]:
+    return [scene.reply(b"\xe0" + scene.false[1:])] if scene.opens else scene.honest()
+
+
+def other_object(scene: CanScene) -> list[SayFrame]:
+    if not scene.opens:
+        return scene.honest()
+    return [scene.reply(scene.false[:1] + bytes((scene.false[1] ^ 0x01,)) + scene.false[2:])]
+
+
+def no_object(scene: CanScene) -> list[SayFrame]:
+    return [scene.reply(b"\x80" + scene.request[1:4] + (0x06020000).to_bytes(4, "little"))]
+
+
+def wrong_crc(scene: CanScene) -> list[SayFrame]:
+    """Block upload: the check sum of the end frame is another one."""
+    if len(scene.true) == 1 and scene.true[0][0] & 0xE3 == 0xC1:
+        end = scene.true[0]
+        return [scene.reply(end[:1] + bytes((end[1] ^ 0xFF,)) + end[2:])]
+    return [scene.reply(data) for data in scene.true]
+
+
+def loses(at: int) -> CanPlay:
+    """Block upload: a segment of each first try of a sub-block is lost; `at` as of a list."""
+
+    def play(scene: CanScene) -> list[SayFrame]:
+        frames = [scene.reply(data) for data in scene.true]
+        full = len(frames) == 127
+        if len(frames) < 3 or (at > 0) != full or scene.memory.get("lost"):
+            return frames
+        scene.memory["lost"] = 1
+        del frames[at]
+        return frames
+
+    return play
+
+
+def expedited_instead(scene: CanScene) -> list[SayFrame]:
+    """Block upload is answered by an ordinary one, as pst allows."""
+    if not scene.opens:
+        return scene.honest()
+    size = len(scene.poison)
+    word = scene.memory["word"].to_bytes(size, "little").ljust(4, b"\0")
+    return [scene.reply(bytes((0x43 | (4 - size) << 2,)) + scene.request[1:4] + word)]
+
+
+def late(scene: CanScene) -> list[SayFrame]:
+    return [scene.reply(scene.false, LATE * scene.timeout_s)]
+
+
+def flood(scene: CanScene) -> list[SayFrame]:
+    junk = [scene.reply(bytes((0xE0 + i % 32,)) + bytes(7)) for i in range(30)]
+    return [*junk, *scene.honest(0.010)] if scene.opens else scene.honest()
+
+
+def short(scene: CanScene) -> list[SayFrame]:
+    """The bytes of the reply that hold something, and not one more."""
+    if not scene.opens:
+        return scene.honest()
+    used = 4 + (4 - (scene.true[0][0] >> 2 & 3))
+    return [scene.reply(scene.true[0][: min(used, 7)])]
+
+
+def restarts(scene: CanScene) -> list[SayFrame]:
+    return [replace(scene.frame(HEARTBEAT, b"\0"), after_s=0.050)]
+
+
+def boots(scene: CanScene) -> list[SayFrame]:
+    return [*scene.honest(), replace(scene.frame(HEARTBEAT, b"\0"), after_s=0.010)]
+
+
+def no_size(scene: CanScene) -> list[SayFrame]:
+    return [scene.reply(b"\x42" + scene.true[0][1:])] if scene.opens else scene.honest()
+
+
+def heartbeat(data: bytes) -> CanPlay:
+    return lambda scene: [scene.frame(HEARTBEAT, data), *scene.honest()]
+
+
+def twin(scene: CanScene) -> list[SayFrame]:
+    return [*scene.honest(), scene.reply(scene.false, 0.003)] if scene.opens else scene.honest()
+
+
+def emcy_short(scene: CanScene) -> list[SayFrame]:
+    return [scene.frame(EMCY, b"\x10\x81\x11"), *scene.honest()]
+
+
+def emcy_burst(scene: CanScene) -> list[SayFrame]:
+    return [*(scene.frame(EMCY, bytes((i, 0x10, 0x01, 0, 0, 0, 0, 0))) for i in range(20)), *scene.honest()]
+
+
+def boot_storm(scene: CanScene) -> list[SayFrame]:
+    return [*(SayFrame(CanFrame(HEARTBEAT + n, b"\0")) for n in STORM), *scene.honest()]
+
+
+def extended(scene: CanScene) -> list[SayFrame]:
+    return [SayFrame(CanFrame(0x580 + scene.node, scene.false, extended=True))]

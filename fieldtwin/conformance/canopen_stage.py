@@ -1,0 +1,178 @@
+"""The bus that a CANopen master under test joins: honest nodes, until a play is on. It records everything and judges nothing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Collection
+
+from fieldtwin.conformance.canopen_device import BOOT_UP, HonestNode
+from fieldtwin.conformance.canopen_scene import CanopenCase, CanScene, SayFrame
+from fieldtwin.conformance.observation import Asked, Garbled, Sent, Told, Word
+from fieldtwin.conformance.recorder import Recorder
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import CanConnection
+from gateway.core.errors import ConnectionLost
+from gateway.core.nursery import Nursery
+
+SDO_REQUEST, HEARTBEAT, NMT = 0x600, 0x700, 0x000
+ABORT, UPLOAD, BLOCK_UPLOAD = 0x80, 2, 5
+BEHIND_S = 0.050
+MASTER = 1
+
+
+class CanopenStage:
+    """As `modbus_stage.Stage`. `size` is how many bytes an object has, `heartbeat_s` how often nodes that are known say that they
+    live (0: never), `nodes` are those that boot by themselves."""
+
+    def __init__(
+        self,
+        words: tuple[int, int, int],
+        *,
+        size: int = 4,
+        held: dict[tuple[int, int], bytes] | None = None,
+        nodes: Collection[int] = (),
+        heartbeat_s: float = 1.0,
+    ) -> None:
+        self.recorder = Recorder()
+        self.timeout_s = 1.0
+        self.strikes = self.struck = self.first_ns = self.last_ns = self.pending = 0
+        self._words, self._size, self._held = words, size, held or {}
+        self._word = words[0]
+        self._nodes: dict[int, HonestNode] = {n: self._born() for n in nodes}
+        self._heartbeat_s = heartbeat_s
+        self._case: CanopenCase | None = None
+        self._memory: dict[str, int] | None = None
+        self._free_ns = 0
+        self._loop = asyncio.get_running_loop()
+
+    def now_ns(self) -> int:
+        return round(self._loop.time() * NS_PER_S)
+
+    def hold(self, word: Word) -> int:
+        """All objects hold that word from now on; returns its number."""
+        self._word = self._words[0] if word is Word.FIRST else self._words[1]
+        for node in self._nodes.values():
+            node.objects.word = self._word
+        return self._word
+
+    def begin(self, case: CanopenCase, strikes: int) -> None:
+        """From the next fitting transfer on `case` is played, until `strikes` are used up or `end` is called."""
+        self._case, self.strikes, self._memory = case, strikes, None
+        self.struck = self.first_ns = self.last_ns = 0
+
+    def end(self) -> None:
+        """All is answered well from now on; frames under way are sent."""
+        self._case = None
+
+    async def serve(self, connection: CanConnection) -> None:
+        """Until the bus is gone."""
+        self._connection = connection
+        async with Nursery() as nursery:
+            self._nursery = nursery
+            for node in self._nodes:
+                await connection.send(CanFrame(HEARTBEAT + node, bytes((BOOT_UP,))))
+            if self._heartbeat_s:
+                nursery.start(self._live(), "heartbeats")
+            while True:
+                await self._heard(await connection.recv())
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    async def _heard(self, frame: CanFrame) -> None:
+        now_ns, node = self.now_ns(), frame.can_id - SDO_REQUEST
+        if frame.error or frame.extended or frame.remote:
+            return
+        if not 1 <= node <= 127:
+            self.recorder.add(Sent(now_ns, MASTER, frame.can_id.to_bytes(2, "big") + frame.data))
+            if frame.can_id == NMT and len(frame.data) == 2:
+                await self._commanded(frame.data[0], frame.data[1])
+        elif len(frame.data) != 8:
+            self.recorder.add(Garbled(now_ns, MASTER, frame.data))
+        elif frame.data[0] == ABORT:
+            self.recorder.add(Sent(now_ns, MASTER, frame.can_id.to_bytes(2, "big") + frame.data))
+            self._node(node).answer(frame.data, now_ns)
+            self._memory = None
+        else:
+            self._asked(node, frame.data, now_ns)
+
+    def _asked(self, node: int, request: bytes, now_ns: int) -> None:
+        server = self._node(node)
+        true = tuple(server.answer(request, now_ns))
+        opens = request[0] >> 5 == UPLOAD or (request[0] >> 5 == BLOCK_UPLOAD and request[0] & 3 == 0)
+        if opens or request[0] >> 5 == 1:
+            self.recorder.add(Asked(now_ns, MASTER, bytes((node,)) + request))
+        case = self._case
+        if case is None or not true:
+            self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
+            return
+        if opens:
+            fits = request[0] >> 5 == (BLOCK_UPLOAD if case.wants == "block upload" else UPLOAD)
+            self._memory = None
+            if fits and case.wants != "nothing" and self.struck < self.strikes:
+                self._memory = {"word": self._word}
+                self.first_ns = self.first_ns or now_ns
+                self.struck += 1
+        if self._memory is None:
+            self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
+            return
+        poison = self._words[2]
+        scene = CanScene(
+            node, request, true, server.poisoned(request, poison), poison.to_bytes(self._size, "little"), opens,
+            self.struck - 1, self.timeout_s, self._memory,
+        )  # fmt: skip
+        self.last_ns = now_ns
+        self._send(case.play(scene), now_ns)
+
+    def _send(self, moves: list[SayFrame], now_ns: int) -> None:
+        """Frames keep their order, and honest answers keep behind odd ones that are still to come."""
+        if not moves:
+            return
+        start_ns = now_ns
+        if self._free_ns > now_ns and any(m.good for m in moves):
+            start_ns = self._free_ns + round(BEHIND_S * NS_PER_S)
+        timed = [(start_ns + round(m.after_s * NS_PER_S), m) for m in moves]
+        self._free_ns = max([self._free_ns, *(t for t, m in timed if not m.good)])
+        self.pending += len(timed)
+        self._nursery.start(self._make(timed), "frames")
+
+    async def _make(self, timed: list[tuple[int, SayFrame]]) -> None:
+        left = len(timed)
+        try:
+            for t_ns, move in timed:
+                if (wait_ns := t_ns - self.now_ns()) > 0:
+                    await asyncio.sleep(wait_ns / NS_PER_S)
+                now_ns = self.now_ns()
+                if not move.good:
+                    self.last_ns = now_ns
+                self.recorder.add(Told(now_ns, MASTER, move.frame.data, move.good))
+                await self._connection.send(move.frame)
+                left -= 1
+                self.pending -= 1
+        except ConnectionLost:
+            pass  # the bus is gone: `serve` says so
+        finally:
+            self.pending -= left
+
+    # -- nodes ----------------------------------------------------------------------------------------------------
+
+    def _born(self) -> HonestNode:
+        return HonestNode(self._word, self._size, self._held)
+
+    def _node(self, node: int) -> HonestNode:
+        if node not in self._nodes:
+            self._nodes[node] = self._born()
+        return self._nodes[node]
+
+    async def _commanded(self, specifier: int, addressed: int) -> None:
+        if 1 <= addressed <= 127:
+            self._node(addressed)
+        for number, node in list(self._nodes.items()):
+            if addressed in (0, number) and node.command(specifier):
+                await self._connection.send(CanFrame(HEARTBEAT + number, bytes((BOOT_UP,))))
+
+    async def _live(self) -> None:
+        while True:
+            await asyncio.sleep(self._heartbeat_s)
+            for number, node in list(self._nodes.items()):
+                await self._connection.send(CanFrame(HEARTBEAT + number, bytes((node.state,))))

@@ -10,6 +10,8 @@ from collections import deque
 from dataclasses import dataclass
 
 CAPACITY = 200_000
+SHARED, LEAST = 1_000_000, 1_000
+"""Entries of all devices of a process together, some 60 bytes each; and what a device has of them at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,12 @@ class HeldJournal:
         self.number = 0
         """Of the latest entry; they count from 1."""
 
+    def keep(self, capacity: int) -> None:
+        """Keep at most `capacity` entries from now on; the newest stay."""
+        self._tags = deque(self._tags, capacity)
+        self._raws = deque(self._raws, capacity)
+        self._times = deque(self._times, capacity)
+
     @property
     def dropped(self) -> int:
         """Entries that fell off."""
@@ -55,3 +63,8 @@ class HeldJournal:
         numbers = range(self.number, self.number - count, -1)
         newest = zip(numbers, reversed(self._tags), reversed(self._raws), reversed(self._times), strict=False)
         return [Held(*entry) for entry in newest][::-1]
+
+
+def share_of(devices: int) -> int:
+    """How many entries each of so many devices in a process keeps."""
+    return min(CAPACITY, max(LEAST, SHARED // max(1, devices)))

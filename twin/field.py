@@ -16,7 +16,7 @@ from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
 from emulators.emulator import EmulatedUnit
 from emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
-from emulators.journal import HeldJournal
+from emulators.journal import HeldJournal, share_of
 from emulators.modbus.ascii import AsciiSlave
 from emulators.modbus.bank import RegisterBank
 from emulators.modbus.line import LineSlave
@@ -113,6 +113,8 @@ class FieldSide:
             for bus in self.prototype.buses.values():
                 if bus.listen is not None:
                     await self._open_bus(bus, bus.listen)
+            for device in self.devices.values():
+                device.journal.keep(share_of(len(self.devices)))
         except BaseException:
             await self.aclose()
             raise

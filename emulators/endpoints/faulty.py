@@ -225,6 +225,7 @@ class FaultyEnd(ByteConnection):
 
     def _appear(self, active: Active, hang: Hang) -> None:
         if active.id in self._faults.active and in_time(active, self._now_ns()):
+            active.struck += 1
             self._hang(hang, [])
 
     def _hang(self, hang: Hang, last: list[bytes]) -> None:

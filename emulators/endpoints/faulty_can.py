@@ -87,7 +87,7 @@ class FaultyCan(CanConnection):
             return None
         now_ns = self._now_ns()
         pieces: list[CanPiece] | None = None
-        for active in tuple(self._faults.active.values()):
+        for active in self._faults.in_at(now_ns):
             fault = active.fault
             if not isinstance(fault, CanFault) or (active.units and self.node not in active.units):
                 continue

@@ -25,6 +25,13 @@ class WireFaults:
     def take_away(self, id: str) -> bool:
         return self.active.pop(id, None) is not None
 
+    def in_at(self, now_ns: int) -> list[Active]:
+        """Those whose time has come, in the order in which they were put in. Those whose time is over are forgotten."""
+        over = [id for id, active in self.active.items() if active.until_ns is not None and now_ns >= active.until_ns]
+        for id in over:
+            del self.active[id]
+        return [active for active in self.active.values() if active.from_ns <= now_ns]
+
     def refuses(self, now_ns: int) -> bool:
         """Whether nobody can connect now."""
         return any(
@@ -34,7 +41,7 @@ class WireFaults:
     def decide(self, frame: Frame, now_ns: int) -> Outcome | None:
         """What becomes of the frame; None: nothing happens to it. Several faults strike one after the other."""
         outcome: Outcome | None = None
-        for active in tuple(self.active.values()):
+        for active in self.in_at(now_ns):
             if isinstance(active.fault, WireFault) and active.strikes(frame, now_ns):
                 outcome = _joined(outcome, frame, active.fault, active)
         return outcome

@@ -1,0 +1,146 @@
+"""Every fault end to end, in virtual time: why the tag was not good, what the program saw, and how soon all was well again.
+
+No value that a device did not hold is ever published as good. A row without reasons is one that nobody may notice.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import pytest
+from faults_rig import Seen, through
+
+from emulators.faults.registry import FAULTS
+
+NOBODY: frozenset[str] = frozenset()
+
+
+class Row(NamedTuple):
+    """`why`: what the tag's quality says while it lasts. `well_s`: within how long after its end all is well."""
+
+    wire: str
+    name: str
+    why: str
+    well_s: float
+    said: dict[str, Any] = {}  # noqa: RUF012  nobody changes it
+
+
+ROWS = [
+    Row("line", "drop", "timeout", 2.0),
+    Row("lan", "drop", "timeout", 2.0),
+    Row("line", "delay", "", 0.1),
+    Row("lan", "delay", "", 0.1),
+    Row("line", "jitter", "", 0.1),
+    Row("lan", "jitter", "", 0.1),
+    Row("line", "duplicate", "", 0.1),
+    Row("lan", "duplicate", "", 0.1),
+    Row("line", "reorder", "", 0.1),
+    Row("lan", "reorder", "", 0.1),
+    Row("line", "split", "", 0.1),
+    Row("lan", "split", "", 0.1),
+    Row("line", "pause", "", 0.1),
+    Row("lan", "pause", "", 0.1),
+    Row("line", "coalesce", "", 0.1),
+    Row("lan", "coalesce", "", 0.1),
+    Row("line", "corrupt-bits", "wire_error timeout", 2.0),
+    Row("line", "corrupt-crc", "wire_error", 2.0),
+    Row("line", "corrupt-length", "wire_error", 2.0),
+    Row("lan", "corrupt-length", "timeout", 2.0),
+    Row("line", "wrong-unit", "timeout", 2.0),
+    Row("lan", "wrong-unit", "timeout", 2.0),
+    Row("line", "wrong-function", "wire_error", 2.0, {"code": 3}),
+    Row("lan", "wrong-function", "wire_error", 2.0, {"code": 3}),
+    Row("line", "wrong-transaction", "", 0.1),
+    Row("lan", "wrong-transaction", "timeout", 2.0),
+    Row("line", "truncate", "timeout", 2.0),
+    Row("lan", "truncate", "timeout", 2.0),
+    Row("line", "garbage", "", 0.1),
+    Row("lan", "garbage", "", 0.1),
+    Row("line", "noise", "", 0.1),
+    Row("line", "echo", "wire_error", 2.0),
+    Row("line", "late-reply", "timeout stale", 2.0),
+    Row("lan", "late-reply", "timeout stale", 2.0),
+    Row("line", "exception", "refused", 1.0),
+    Row("lan", "exception", "refused", 1.0),
+    Row("line", "busy", "stale", 1.5),
+    Row("lan", "busy", "stale", 1.5),
+    Row("line", "silence", "timeout", 2.0),
+    Row("lan", "silence", "timeout", 2.0),
+    Row("line", "half-open", "timeout", 2.0),
+    Row("lan", "half-open", "timeout unreachable", 2.5),
+    Row("line", "reset", "timeout", 2.0),
+    Row("lan", "reset", "unreachable", 2.5),
+    Row("line", "disconnect", "timeout", 2.0),
+    Row("lan", "disconnect", "unreachable", 2.5),
+    Row("line", "wrong-baud", "timeout wire_error", 2.0),
+    Row("line", "wrong-parity", "timeout wire_error", 2.0),
+    Row("line", "collision", "wire_error timeout", 2.0),
+    Row("can", "lost-frame", "heartbeat_lost timeout stale", 1.5),
+    Row("can", "error-frame", "", 0.1, {"every": 4}),
+    Row("can", "bus-off", "", 0.5),
+    Row("can", "duplicate-node", "not_operational", 1.5),
+    Row("sdo", "sdo-abort", "refused", 1.0),
+    Row("text", "sdo-toggle", "wire_error", 1.0),
+    Row("text", "lost-segment", "timeout", 1.0),
+    Row("can", "heartbeat-loss", "heartbeat_lost", 1.5),
+    Row("can", "heartbeat-late", "", 0.1, {"most_ms": 250}),
+    Row("can", "emcy-burst", "", 0.1),
+    Row("can", "sync-jitter", "", 0.1),
+    Row("can", "boot-storm", "not_operational", 1.0),
+    Row("line", "stuck", "", 0.1),
+    Row("can", "stuck", "", 0.1),
+    Row("line", "drift", "", 0.1, {"per_s": 1000.0}),
+    Row("can", "drift", "", 0.1, {"per_s": 10.0, "register": "slope_long"}),
+    Row("line", "spike", "", 0.1, {"by": 5000.0, "probability_each": 1.0, "register": "pressure"}),
+    Row("can", "spike", "", 0.1, {"by": 50.0, "probability_each": 1.0, "register": "slope_long"}),
+    Row("line", "nan", "not_a_number", 1.5),
+    Row("can", "nan", "", 0.1),
+    Row("line", "out-of-range", "", 0.1),
+    Row("can", "out-of-range", "", 0.1),
+    Row("line", "set", "", 0.1, {"value": 12.5, "register": "pressure"}),
+    Row("can", "set", "", 0.1, {"value": -12.5, "register": "slope_long"}),
+]
+
+ASKED_FOR = {
+    ("line", "set"): 12.5,
+    ("can", "set"): -12.5,
+    ("line", "out-of-range"): 1e9,
+    ("can", "out-of-range"): 327.67,
+}
+SHIFTED_BY = {("line", "drift"): 100, ("can", "drift"): 5, ("line", "spike"): 4000, ("can", "spike"): 40}
+
+
+def test_the_table_has_every_fault() -> None:
+    assert {row.name for row in ROWS} == set(FAULTS)
+
+
+def test_each_fault_is_seen_for_what_it_is_and_is_over_when_it_is_over() -> None:
+    run = through([(row.wire, row.name, row.said) for row in ROWS])
+    assert run.errors == []
+    wrong = [f"{row.wire} {row.name}: {what}" for row in ROWS for what in _wrong(row, run.seen[row.wire, row.name])]
+    assert wrong == []
+    told = run.oracle.describe()
+    assert told["wrong"] == 0, told
+    assert told["checked"] > 3000
+
+
+def _wrong(row: Row, seen: Seen) -> list[str]:
+    found = []
+    if not seen.struck:
+        found.append("it never struck")
+    expected = set(row.why.split())
+    if not seen.reasons <= expected or (expected and not seen.reasons):
+        found.append(f"not good because {sorted(seen.reasons)} instead of {row.why or 'never'}")
+    if not expected and seen.program_saw:
+        found.append("the program saw it")
+    if seen.well_s is None or seen.well_s > row.well_s + 0.05:
+        found.append(f"well after {seen.well_s} s instead of {row.well_s}")
+    key = (row.wire, row.name)
+    late = seen.values[len(seen.values) * 3 // 4 :]
+    if key in ASKED_FOR and late != [pytest.approx(ASKED_FOR[key])] * len(late):
+        found.append(f"the values were {late}")
+    if key in SHIFTED_BY and not late[-1] > SHIFTED_BY[key]:
+        found.append(f"the values were {late}")
+    if row.name == "stuck" and len(set(late)) != 1:
+        found.append(f"the values were {late}")
+    return found

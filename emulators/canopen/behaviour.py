@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 
 from emulators.canopen import codec
 from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.dictionary import Entry, Key
+from emulators.canopen.dictionary import Key
 from emulators.canopen.emcy import Emergency
 from emulators.canopen.node_data import NodeData
 from emulators.canopen.service import Core, NmtState, Service, Source
@@ -35,8 +35,8 @@ class Objects:
 
     def number(self, index: int, subindex: int = 0, default: Number = 0) -> Number:
         """The live value; `default` where the node has no such object."""
-        entry = self._data.dictionary.entry(index, subindex)
-        return default if entry is None else codec.decode(entry.data_type, self._data.get(index, subindex))
+        data_type = self._data.types.get((index, subindex))
+        return default if data_type is None else codec.decode(data_type, self._data.get(index, subindex))
 
     def whole(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """The live value of an integer object."""
@@ -172,33 +172,29 @@ class Behaviour(Service):
         return values | quiet | told
 
     def _situation(self, now_ns: int, written: Collection[Key], played: Mapping[Key, bytes]) -> Situation:
-        numbers = {key: codec.decode(self._type(key), raw) for key, raw in played.items() if self._is_number(key)}
+        types = self._data.types
+        numbers = {
+            key: codec.decode(data_type, raw)
+            for key, raw in played.items()
+            if (data_type := types.get(key)) is not None and codec.is_number(data_type)
+        }
         return Situation(now_ns, self._objects, numbers, written, self._emergency.active, self._core.state)
 
     def _played(self, now_ns: int) -> dict[Key, bytes]:
         return {} if self._source is None else self._source(now_ns)
 
-    def _is_number(self, key: Key) -> bool:
-        entry = self._data.dictionary.entry(*key)
-        return entry is not None and codec.is_number(entry.data_type)
-
-    def _type(self, key: Key) -> int:
-        entry = self._data.dictionary.entry(*key)
-        assert entry is not None  # asked for what `_is_number` found
-        return entry.data_type
-
     def _encoded(self, numbers: Mapping[Key, Number]) -> dict[Key, bytes]:
         out: dict[Key, bytes] = {}
         for key, number in numbers.items():
-            entry = self._data.dictionary.entry(*key)
-            if entry is not None:
-                out[key] = codec.encode(entry.data_type, _held(entry, number))
+            data_type = self._data.types.get(key)
+            if data_type is not None:
+                out[key] = codec.encode(data_type, _held(data_type, number))
         return out
 
 
-def _held(entry: Entry, number: Number) -> Number:
+def _held(data_type: int, number: Number) -> Number:
     """The number within its type; a device's registers saturate. What is no number is 0 in an integer."""
-    bounds = codec.integer_range(entry.data_type)
+    bounds = codec.integer_range(data_type)
     if bounds is None:
         return number
     if isinstance(number, float) and not math.isfinite(number):

@@ -17,42 +17,39 @@ REAL64 = 0x11
 
 _SIGNED = {0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
 _UNSIGNED = {0x05: 8, 0x06: 16, 0x07: 32, 0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
-_REAL = {REAL32: "<f", REAL64: "<d"}
+_REAL = {REAL32: struct.Struct("<f"), REAL64: struct.Struct("<d")}
 _TIME_BYTES = {0x0C: 6, 0x0D: 6}
 """TIME_OF_DAY and TIME_DIFFERENCE: 48 bits on the wire, opaque here."""
+
+# By data type: these are asked for with every value.
+_INTEGER_BYTES = {BOOLEAN: 1} | {data_type: bits // 8 for data_type, bits in (_SIGNED | _UNSIGNED).items()}
+_BYTES = _INTEGER_BYTES | _TIME_BYTES | {data_type: real.size for data_type, real in _REAL.items()}
+_RANGES = (
+    {BOOLEAN: (0, 1)}
+    | {data_type: (-(1 << bits - 1), (1 << bits - 1) - 1) for data_type, bits in _SIGNED.items()}
+    | {data_type: (0, (1 << bits) - 1) for data_type, bits in _UNSIGNED.items()}
+)
 
 
 def size_bytes(data_type: int) -> int | None:
     """Bytes that a value of `data_type` takes in an SDO; None where each value has its own length."""
-    if data_type == BOOLEAN:
-        return 1
-    if data_type in _REAL:
-        return struct.calcsize(_REAL[data_type])
-    if data_type in _TIME_BYTES:
-        return _TIME_BYTES[data_type]
-    bits = _SIGNED.get(data_type) or _UNSIGNED.get(data_type)
-    return bits // 8 if bits else None
+    return _BYTES.get(data_type)
 
 
 def is_number(data_type: int) -> bool:
     """Whether values have an order, so that limits mean something."""
-    return data_type == BOOLEAN or data_type in _SIGNED or data_type in _UNSIGNED or data_type in _REAL
+    return data_type in _INTEGER_BYTES or data_type in _REAL
 
 
 def integer_range(data_type: int) -> tuple[int, int] | None:
     """The smallest and largest value of an integer type or BOOLEAN; None for others."""
-    if data_type == BOOLEAN:
-        return 0, 1
-    if data_type in _SIGNED:
-        half = 1 << (_SIGNED[data_type] - 1)
-        return -half, half - 1
-    return (0, (1 << _UNSIGNED[data_type]) - 1) if data_type in _UNSIGNED else None
+    return _RANGES.get(data_type)
 
 
 def decode(data_type: int, raw: bytes) -> int | float:
     """The number in `raw`, which must have the type's size. Little endian, two's complement."""
     if data_type in _REAL:
-        value: float = struct.unpack(_REAL[data_type], raw)[0]
+        value: float = _REAL[data_type].unpack(raw)[0]
         return value
     return int.from_bytes(raw, "little", signed=data_type in _SIGNED)
 
@@ -64,9 +61,9 @@ def encode(data_type: int, value: int | float) -> bytes:
     """
     try:
         if data_type in _REAL:
-            return struct.pack(_REAL[data_type], value)
+            return _REAL[data_type].pack(value)
         whole = int(value)
-        size = size_bytes(data_type)
+        size = _BYTES.get(data_type)
         if size is None:
             raise ValueError("the type holds no number")
         return whole.to_bytes(size, "little", signed=data_type in _SIGNED and whole < 0)

@@ -122,6 +122,9 @@ class CanopenNode:
         self._sdo = SdoChannels(core, view, timeout_ns, context.sdo_block, tolerate_short=context.tolerate_short_sdo)
         view.add(self._sdo)
         self._services = (self._sdo, *services)
+        # Most services never wait for a time; those that do are asked with every frame and every tick.
+        self._tickers = [s.tick for s in self._services if type(s).tick is not Service.tick]
+        self._wakers = [s.wake_at_ns for s in self._services if type(s).wake_at_ns is not Service.wake_at_ns]
         if self._behaviour is not None:
             self._behaviour.connect(core, self._emergency, self._tpdos.changed)
 
@@ -173,7 +176,7 @@ class CanopenNode:
         """When `tick` is due next; None when only a frame can make the node do something."""
         if self.state is NmtState.INITIALISING:
             return self._lss.wake_at_ns() if self._lss else None
-        return min((t for service in self._services if (t := service.wake_at_ns()) is not None), default=None)
+        return min([t for wake_at_ns in self._wakers if (t := wake_at_ns()) is not None], default=None)
 
     # -- what can happen to it ------------------------------------------------------------------------------------
 
@@ -267,8 +270,8 @@ class CanopenNode:
 
     def _run_due(self, now_ns: int) -> None:
         if self.state is not NmtState.INITIALISING:
-            for service in self._services:
-                service.tick(now_ns)
+            for tick in self._tickers:
+                tick(now_ns)
         elif self._lss is not None:
             self._lss.tick(now_ns)
 

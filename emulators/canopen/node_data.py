@@ -36,6 +36,9 @@ class NodeData:
 
     def __init__(self, dictionary: Dictionary, node_id: int, factory: Mapping[Key, bytes] | None = None) -> None:
         self.dictionary = dictionary
+        self.types = {entry.key: entry.data_type for entry in dictionary.entries()}
+        """The data type of every entry."""
+        self._sizes = {entry.key: entry.size for entry in dictionary.entries()}
         self._given = dict(factory or {})
         for key, raw in self._given.items():
             self._sized(key, raw)
@@ -81,7 +84,8 @@ class NodeData:
         Raises `UsageError` when there is no such entry or the length is not its type's.
         """
         key = (index, subindex)
-        self._sized(key, raw)
+        if self._sizes.get(key, -1) != len(raw):
+            self._sized(key, raw)
         changed = self._live[key] != raw
         self._live[key] = bytes(raw)
         self.version += changed and index < 0x2000

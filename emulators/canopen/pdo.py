@@ -59,6 +59,9 @@ class PdoParameters:
         self.index = index
         self.map_index = index + MAPPING_OFFSET
         self.transmit = index >= 0x1800
+        self._mapping: list[Mapped] = []
+        self._mapping_of = -1
+        """The version of the values that `_mapping` was made of."""
 
     @property
     def cob(self) -> int:
@@ -96,6 +99,11 @@ class PdoParameters:
 
     def mapping(self) -> list[Mapped]:
         """The entries in use; a count beyond what fits is not followed (a data sheet can default to nonsense)."""
+        if self._mapping_of != self._data.version:
+            self._mapping, self._mapping_of = self._read_mapping(), self._data.version
+        return self._mapping
+
+    def _read_mapping(self) -> list[Mapped]:
         count = self._data.number(self.map_index)
         entries = [Mapped.from_value(self._data.number(self.map_index, sub)) for sub in range(1, count + 1)]
         return entries if sum(entry.bits for entry in entries) <= MAX_BITS else []

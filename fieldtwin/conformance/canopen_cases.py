@@ -30,8 +30,8 @@ BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block 
 CASES: tuple[CanopenCase, ...] = (
     _case("CO-001", "toggle bit repeated in a segment", "7.2.4", READ, plays.same_toggle, aborts_with(0x05030000),
           "repeats the toggle bit in the second segment", "abort with 05030000").on(strikes=1),
-    _case("CO-004", "unknown command specifier", "7.2.4", READ, plays.unknown_command, aborts_with(0x05040001),
-          "answers with E0h", "abort with 05040001").on(strikes=1),
+    _case("CO-004", "unknown command specifier", "7.2.4", READ, plays.unknown_command, aborts_with(0x05040001, 0x05040000),
+          "answers with E0h", "abort with 05040001, or with 05040000 once it has waited").on(strikes=1),
     _case("CO-005", "a reply for another object", "canopen-stack #132", READ, plays.other_object, judges.rejects,
           "answers for another index", "never take it for the one that was asked for"),
     _case("CO-008", "missing index", "7.2.4", READ, plays.no_object, judges.survives, "aborts with 06020000", "go on"),

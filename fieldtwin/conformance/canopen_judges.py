@@ -9,8 +9,8 @@ from fieldtwin.conformance.observation import Asked, Observation, Sent
 ABORT, NMT, SYNC, SDO_REQUEST = 0x80, 0x000, 0x080, 0x600
 
 
-def aborts_with(code: int) -> Judge:
-    """The master ends the transfer by this abort code, so that the node knows."""
+def aborts_with(code: int, *others: int) -> Judge:
+    """The master ends the transfer by this abort code, or one of `others`, so that the node knows."""
 
     def aborted(seen: Observation) -> Finding | None:
         codes = [
@@ -18,7 +18,7 @@ def aborts_with(code: int) -> Judge:
             for s in seen.of(Sent, seen.begun_ns)
             if SDO_REQUEST < _id(s) < SDO_REQUEST + 0x80 and s.data[2:3] == bytes((ABORT,))
         ]
-        if code in codes:
+        if {code, *others} & set(codes):
             return None
         if codes:
             return failed(f"aborted with {codes[0]:08X}h; expected {code:08X}h")

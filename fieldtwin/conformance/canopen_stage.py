@@ -42,6 +42,7 @@ class CanopenStage:
         self._nodes: dict[int, HonestNode] = {n: self._born() for n in nodes}
         self._heartbeat_s = heartbeat_s
         self._case: CanopenCase | None = None
+        self._playing: CanopenCase | None = None
         self._memory: dict[str, int] | None = None
         self._free_ns = 0
         self._loop = asyncio.get_running_loop()
@@ -62,7 +63,7 @@ class CanopenStage:
         self.struck = self.first_ns = self.last_ns = 0
 
     def end(self) -> None:
-        """All is answered well from now on; frames under way are sent."""
+        """All that begins from now on is answered well; what is under way is played to its end."""
         self._case = None
 
     async def serve(self, connection: CanConnection) -> None:
@@ -102,18 +103,10 @@ class CanopenStage:
         opens = request[0] >> 5 == UPLOAD or (request[0] >> 5 == BLOCK_UPLOAD and request[0] & 3 == 0)
         if opens or request[0] >> 5 == 1:
             self.recorder.add(Asked(now_ns, MASTER, bytes((node,)) + request))
-        case = self._case
-        if case is None or not true:
-            self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
-            return
         if opens:
-            fits = request[0] >> 5 == (BLOCK_UPLOAD if case.wants == "block upload" else UPLOAD)
-            self._memory = None
-            if fits and case.wants != "nothing" and self.struck < self.strikes:
-                self._memory = {"word": self._word}
-                self.first_ns = self.first_ns or now_ns
-                self.struck += 1
-        if self._memory is None:
+            self._memory = self._begun(request, now_ns)
+        case = self._playing
+        if case is None or self._memory is None or not true:
             self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
             return
         poison = self._words[2]
@@ -123,6 +116,17 @@ class CanopenStage:
         )  # fmt: skip
         self.last_ns = now_ns
         self._send(case.play(scene), now_ns)
+
+    def _begun(self, request: bytes, now_ns: int) -> dict[str, int] | None:
+        """A transfer begins. What its play keeps in mind, where it is one for the case; it is played to its end."""
+        self._playing = case = self._case
+        if case is None or self.struck >= self.strikes:
+            return None
+        if request[0] >> 5 != {"upload": UPLOAD, "block upload": BLOCK_UPLOAD}.get(case.wants):
+            return None
+        self.first_ns = self.first_ns or now_ns
+        self.struck += 1
+        return {"word": self._word}
 
     def _send(self, moves: list[SayFrame], now_ns: int) -> None:
         """Frames keep their order, and honest answers keep behind odd ones that are still to come."""

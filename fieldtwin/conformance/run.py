@@ -238,9 +238,12 @@ class MasterRun(Generic[C]):
         await self._until(done, self.plan.patience_s)
         stage.end()
         await self._until(lambda: stage.pending == 0, self.plan.patience_s)
-        over_ns = stage.now_ns() if case.holds_good else max(stage.last_ns, stage.first_ns)
         self._say(after)
+        over_ns = stage.now_ns() if case.holds_good else max(stage.last_ns, stage.first_ns)
         await self._good_again(over_ns)
+        while stage.last_ns > over_ns:  # a transfer under way went on
+            over_ns = stage.last_ns
+            await self._good_again(over_ns)
         await asyncio.sleep(TRAIL_S)
         until_ns = stage.now_ns()
         events = stage.recorder.since(stage.first_ns)

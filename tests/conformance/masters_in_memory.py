@@ -9,6 +9,9 @@ from pathlib import Path
 from emulators.virtual.clock import VirtualClock
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.ports import MemoryNet
+from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
+from fieldtwin.conformance.canopen_cases import SILENT as CANOPEN_SILENT
+from fieldtwin.conformance.canopen_stage import CanopenStage
 from fieldtwin.conformance.modbus_cases import CASES, SILENT
 from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
 from fieldtwin.conformance.observation import Word
@@ -18,6 +21,8 @@ from fieldtwin.conformance.run import MasterRun, Plan
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError
 from gateway.core.nursery import Nursery
+from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
 from gateway.protocols.modbus.client import ModbusClient
 
 WORDS = (1111, 2222, 3333)
@@ -80,6 +85,55 @@ def judge(
             results = await run.run()
         if not plant.is_serial:
             await listener.aclose()
+        return results
+
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        return {r.case.id: r for r in runner.run(main())}
+
+
+async def our_canopen(
+    net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish, block: bool = False
+) -> None:
+    """The project's CANopen master: reads an object, starts the node at first and whenever it boots."""
+    async with Nursery() as nursery:
+        connection = await net.open_can(endpoint, 125_000)
+        boots: asyncio.Queue[bool] = asyncio.Queue()
+        boots.put_nowait(True)
+
+        def heard(event: NodeEvent) -> None:
+            if event.kind == "boot-up" and event.unexpected:
+                boots.put_nowait(True)
+
+        canopen = CanopenMaster(connection, clock, sdo_timeout_s=TIMEOUT_S, on_event=heard)
+        canopen.add_node(5)
+        nursery.start(canopen.run(), "master")
+        while True:
+            if not boots.empty():
+                boots.get_nowait()
+                await canopen.nmt(NmtCommand.START, 5)
+            try:
+                raw = await canopen.sdo_upload(5, 0x2000, 0, length=None if block else 4, block=block)
+                publish(str(int.from_bytes(raw[:4], "little")))
+            except FieldtwinError:
+                pass
+            await asyncio.sleep(PERIOD_S)
+
+
+def judge_canopen(master: Master, *only: str, timeout_s: float = TIMEOUT_S) -> dict[str, CaseResult]:
+    """Case id -> result of a CANopen master on a bus in memory."""
+    loop = VirtualLoop()
+
+    async def main() -> list[CaseResult]:
+        net, told, clock = MemoryNet(loop), Told(), VirtualClock(loop)
+        bus = await net.can_bus(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=True)
+        stage = CanopenStage(WORDS, nodes=(5,))
+        plan = Plan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
+        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, plan, frozenset({"can"}), told)
+        async with Nursery() as nursery:
+            nursery.start(stage.serve(await bus.join("nodes")), "nodes")
+            nursery.start(master(net, bus.bound, clock, told.publish), "master")
+            results = await run.run()
+        await bus.aclose()
         return results
 
     with asyncio.Runner(loop_factory=lambda: loop) as runner:

@@ -1,0 +1,344 @@
+"""What each fault makes of a frame, byte by byte: on a line, in ASCII, behind an MBAP header; of CAN frames; of numbers."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulators.faults.can_fault import BusFault, CanFault
+from emulators.faults.engine import WireFaults
+from emulators.faults.fault import Active, Aim, Hang, Outcome, Piece, ValueFault, WireFault
+from emulators.faults.frames import Assembler, Frame, Framing, Way, understood
+from emulators.faults.registry import FAULTS
+from emulators.faults.schema import parse_fault
+from gateway.core.canframe import CanFrame
+
+
+def crc(data: bytes) -> bytes:
+    """CRC-16 of Modbus (polynomial 0xA001 reflected, start 0xFFFF), low byte first."""
+    value = 0xFFFF
+    for byte in data:
+        value ^= byte
+        for _ in range(8):
+            value = (value >> 1) ^ (0xA001 if value & 1 else 0)
+    return value.to_bytes(2, "little")
+
+
+def line(adu: str) -> bytes:
+    """An RTU frame."""
+    data = bytes.fromhex(adu)
+    return data + crc(data)
+
+
+def ascii_(adu: str) -> bytes:
+    data = bytes.fromhex(adu)
+    return b":" + data.hex().upper().encode() + f"{-sum(data) & 0xFF:02X}".encode() + b"\r\n"
+
+
+REPLY = "1103 04 000A 0102"
+ON_LINE, IN_ASCII, ON_TCP = line(REPLY), ascii_(REPLY), bytes.fromhex("0007 0000 0007" + REPLY)
+
+
+def made(name: str, **said: Any) -> Any:
+    return parse_fault({"name": name, **said}).make()
+
+
+def struck(name: str, data: bytes, framing: Framing = Framing.RTU, **said: Any) -> Outcome:
+    fault = made(name, **said)
+    assert isinstance(fault, WireFault)
+    frame = understood(Way.REPLY, framing, data)
+    assert frame.pdu, "the frame of a test is a whole one"
+    return fault.strike(frame, Random(7))
+
+
+def pieces(outcome: Outcome) -> list[tuple[bytes, float]]:
+    return [(piece.data, piece.delay_s) for piece in outcome.pieces]
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "expected"),
+    [
+        ("drop", {}, []),
+        ("silence", {}, []),
+        ("disconnect", {}, []),
+        ("delay", {"by_ms": 70}, [(ON_LINE, 0.07)]),
+        ("late-reply", {"by_ms": 400}, [(ON_LINE, 0.4)]),
+        ("coalesce", {"every_ms": 20}, [(ON_LINE, 0.02)]),
+        ("duplicate", {"times": 2, "after_ms": 5}, [(ON_LINE, 0.0), (ON_LINE, 0.005), (ON_LINE, 0.005)]),
+        ("reorder", {"most_ms": 90}, [(ON_LINE, 0.09)]),
+        ("split", {"at": 3, "pause_ms": 1}, [(ON_LINE[:3], 0.0), (ON_LINE[3:], 0.001)]),
+        ("pause", {"pause_ms": 40}, [(ON_LINE[:4], 0.0), (ON_LINE[4:], 0.04)]),
+        ("corrupt-crc", {}, [(ON_LINE[:-1] + bytes((ON_LINE[-1] ^ 0x5A,)), 0.0)]),
+        ("corrupt-length", {"by": 2}, [(line("1103 06 000A 0102"), 0.0)]),
+        ("wrong-unit", {"unit_id": 9}, [(line("0903 04 000A 0102"), 0.0)]),
+        ("wrong-function", {"code": 4}, [(line("1104 04 000A 0102"), 0.0)]),
+        ("wrong-transaction", {}, [(ON_LINE, 0.0)]),
+        ("truncate", {"count": 2}, [(ON_LINE[:-2], 0.0)]),
+        ("exception", {"code": 4}, [(line("1183 04"), 0.0)]),
+        ("busy", {}, [(line("1183 06"), 0.0)]),
+        ("wrong-parity", {}, [(bytes(b for b in ON_LINE if b.bit_count() % 2 == 0), 0.0)]),
+    ],
+)
+def test_on_a_line(name: str, said: dict[str, Any], expected: list[tuple[bytes, float]]) -> None:
+    assert pieces(struck(name, ON_LINE, **said)) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "expected"),
+    [
+        ("corrupt-length", {"by": -1}, "0007 0000 0006" + REPLY),
+        ("wrong-transaction", {"by": 3}, "000A 0000 0007" + REPLY),
+        ("wrong-unit", {"unit_id": 9}, "0007 0000 0007 0903 04 000A 0102"),
+        ("wrong-function", {"code": 4}, "0007 0000 0007 1104 04 000A 0102"),
+        ("exception", {"code": 2}, "0007 0000 0003 1183 02"),
+        ("busy", {}, "0007 0000 0003 1183 06"),
+        ("corrupt-crc", {}, "0007 0000 0007" + REPLY),
+    ],
+)
+def test_behind_an_mbap_header(name: str, said: dict[str, Any], expected: str) -> None:
+    assert pieces(struck(name, ON_TCP, Framing.MBAP, **said)) == [(bytes.fromhex(expected), 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "expected"),
+    [
+        ("wrong-unit", {"unit_id": 9}, ascii_("0903 04 000A 0102")),
+        ("exception", {"code": 2}, ascii_("1183 02")),
+    ],
+)
+def test_in_ascii(name: str, said: dict[str, Any], expected: bytes) -> None:
+    assert pieces(struck(name, IN_ASCII, Framing.ASCII, **said)) == [(expected, 0.0)]
+
+
+def test_the_check_sum_of_ascii() -> None:
+    ((spoilt, _),) = pieces(struck("corrupt-crc", IN_ASCII, Framing.ASCII))
+    assert spoilt != IN_ASCII
+    assert (spoilt[:-4], spoilt[-2:]) == (IN_ASCII[:-4], b"\r\n")
+
+
+def test_what_is_left_to_chance() -> None:
+    ((spoilt, _),) = pieces(struck("corrupt-bits", ON_LINE, bits=3))
+    assert sum((a ^ b).bit_count() for a, b in zip(spoilt, ON_LINE, strict=True)) == 3
+    ((behind, _),) = pieces(struck("garbage", ON_LINE, count=5))
+    assert behind[:-5] == ON_LINE
+    before, frame = pieces(struck("noise", ON_LINE, count=5, lead_ms=2))
+    assert (len(before[0]), frame) == (5, (ON_LINE, 0.002))
+    ((_, late_s),) = pieces(struck("jitter", ON_LINE, most_ms=20))
+    assert 0 <= late_s <= 0.02
+    ((talked_over, _),) = pieces(struck("collision", ON_LINE, at=2))
+    assert talked_over[:2] == ON_LINE[:2]
+    assert talked_over != ON_LINE
+    assert all(a & b == a for a, b in zip(talked_over, ON_LINE, strict=True))
+    assert len(pieces(struck("wrong-baud", ON_LINE, factor=2.0))[0][0]) == 2 * len(ON_LINE)
+    assert pieces(struck("wrong-baud", ON_LINE, factor=0.01)) == []
+
+
+def test_an_echo_goes_back_first() -> None:
+    assert struck("echo", ON_LINE).pieces == (Piece(ON_LINE, back=True), Piece(ON_LINE))
+
+
+def test_what_becomes_of_a_connection() -> None:
+    assert struck("reset", ON_TCP, Framing.MBAP, at=4) == Outcome((Piece(ON_TCP[:4]),), Hang.RESET)
+    assert struck("half-open", ON_TCP, Framing.MBAP) == Outcome(hang=Hang.HALF_OPEN)
+    assert made("disconnect").appears() is Hang.CLOSE
+    assert made("disconnect").refuses
+
+
+def test_the_next_frame_goes_before_the_reordered() -> None:
+    fault = made("reorder", most_ms=50)
+    first, second = (understood(Way.REPLY, Framing.RTU, line(f"1103 02 000{n}")) for n in (1, 2))
+    (held,) = fault.strike(first, Random(1)).pieces
+    assert [piece.data for piece in fault.strike(second, Random(1)).pieces] == [second.data, first.data]
+    assert held.gone is not None
+    assert held.gone()  # it went behind the other
+    (alone,) = fault.strike(first, Random(1)).pieces
+    assert alone.gone is not None
+    assert not alone.gone()  # nobody came
+
+
+NODE = 5
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "frame", "expected"),
+    [
+        ("lost-frame", {}, (0x185, "0102"), []),
+        ("heartbeat-loss", {}, (0x705, "05"), []),
+        ("heartbeat-loss", {}, (0x185, "05"), None),
+        ("duplicate-node", {}, (0x705, "05"), [(0x705, "05", 0.0), (0x705, "7f", 0.001)]),
+        ("sdo-abort", {"code": 0x06090011}, (0x585, "4b176000ff000000"), [(0x585, "8017600011000906", 0.0)]),
+        ("sdo-abort", {}, (0x605, "4017600000000000"), None),
+        ("sdo-toggle", {}, (0x585, "00616263"), [(0x585, "10616263", 0.0)]),
+        ("sdo-toggle", {}, (0x585, "4b176000ff000000"), None),
+        ("lost-segment", {}, (0x585, "00616263"), []),
+        ("lost-segment", {}, (0x585, "4117600020000000"), None),
+        ("emcy-burst", {}, (0x185, "01"), None),
+        ("boot-storm", {}, (0x705, "05"), None),
+    ],
+)
+def test_on_a_can_bus(
+    name: str, said: dict[str, Any], frame: tuple[int, str], expected: list[tuple[int, str, float]] | None
+) -> None:
+    """None: it does not aim at that."""
+    fault = made(name, **said)
+    assert isinstance(fault, CanFault)
+    sent = CanFrame(frame[0], bytes.fromhex(frame[1]))
+    assert fault.aims_at(sent, NODE) is (expected is not None)
+    if expected is not None:
+        after = [(p.frame.can_id, p.frame.data.hex(), p.delay_s) for p in fault.strike(sent, NODE, Random(1))]
+        assert after == expected
+
+
+def test_what_a_node_says_unasked() -> None:
+    emcy = made("emcy-burst", count=3, code=0x8110, every_ms=2).appears(NODE, Random(1))
+    assert [(p.frame.can_id, p.frame.data[:2], p.delay_s) for p in emcy] == [
+        (0x85, b"\x10\x81", n * 0.002) for n in range(3)
+    ]
+    boots = made("boot-storm", count=3, every_ms=50).appears(NODE, Random(1))
+    assert [(p.frame, p.delay_s) for p in boots] == [(CanFrame(0x705, b"\0"), n * 0.05) for n in range(3)]
+
+
+def test_what_comes_late_on_a_can_bus() -> None:
+    (beat,) = made("heartbeat-late", most_ms=300).strike(CanFrame(0x705, b"\5"), NODE, Random(1))
+    assert 0 < beat.delay_s <= 0.3
+    sync = made("sync-jitter", most_ms=5)
+    assert sync.ways == frozenset((Way.REQUEST,))
+    assert sync.aims_at(CanFrame(0x80, b""), NODE)
+    (heard,) = sync.strike(CanFrame(0x80, b""), NODE, Random(1))
+    assert 0 < heard.delay_s <= 0.005
+
+
+def test_what_is_of_the_wire_itself() -> None:
+    assert (made("error-frame").attempts, made("bus-off").attempts) == (None, 32)
+    assert isinstance(made("bus-off"), BusFault)
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "expected"),
+    [
+        ("stuck", {}, 3.0),
+        ("drift", {"per_s": 0.5}, 11.0),
+        ("spike", {"by": -4, "probability_each": 1.0}, 6.0),
+        ("spike", {"by": -4, "probability_each": 0.0}, 10.0),
+        ("out-of-range", {"value": -1e6}, -1e6),
+        ("set", {"value": 1.25}, 1.25),
+    ],
+)
+def test_of_a_value(name: str, said: dict[str, Any], expected: float) -> None:
+    fault = made(name, **said)
+    assert isinstance(fault, ValueFault)
+    assert fault.distort(10.0, 2.0, 3.0, Random(1)) == expected
+
+
+def test_no_number() -> None:
+    assert math.isnan(made("nan").distort(10.0, 2.0, 3.0, Random(1)))
+
+
+# -- aim ------------------------------------------------------------------------------------------------------------------
+
+
+def active(**aim: Any) -> Active:
+    addresses = aim.pop("addresses", None)
+    units = aim.pop("units", ())
+    until_ns = aim.pop("until_ns", None)
+    from_ns = aim.pop("from_ns", 0)
+    fault = made("drop")
+    return Active("x", fault, Aim(**aim), Random("seed x"), from_ns, until_ns, units=units, addresses=addresses)
+
+
+REQUEST = understood(Way.REQUEST, Framing.RTU, line("1103 0010 0002"))
+
+
+def hits(fault: Active, times: int = 8, frame: Frame = REQUEST) -> list[int]:
+    """Which of so many frames, a second apart, it strikes; from 1."""
+    return [n for n in range(1, times + 1) if fault.strikes(frame, n * 1_000_000_000)]
+
+
+@pytest.mark.parametrize(
+    ("aim", "struck"),
+    [
+        ({}, [1, 2, 3, 4, 5, 6, 7, 8]),
+        ({"nth": 3}, [3]),
+        ({"every": 3}, [3, 6]),
+        ({"from_ns": 3_000_000_000, "until_ns": 6_000_000_000}, [3, 4, 5]),
+        ({"units": (0x11,)}, [1, 2, 3, 4, 5, 6, 7, 8]),
+        ({"units": (0x12,)}, []),
+        ({"function": 3, "nth": 1}, [1]),
+        ({"function": 4}, []),
+        ({"addresses": range(0x10, 0x11), "nth": 1}, [1]),
+        ({"addresses": range(0x11, 0x20)}, []),
+        ({"direction": "reply"}, []),
+        ({"direction": "request", "nth": 1}, [1]),
+        ({"direction": "both", "nth": 1}, [1]),
+        ({"probability": 0.0}, []),
+    ],
+)
+def test_what_is_aimed_at(aim: dict[str, Any], struck: list[int]) -> None:
+    assert hits(active(**aim)) == struck
+
+
+def test_chance_is_the_seeds() -> None:
+    first, second = hits(active(probability=0.5), 64), hits(active(probability=0.5), 64)
+    assert first == second
+    assert 16 < len(first) < 48
+
+
+def test_faults_strike_one_after_the_other() -> None:
+    faults = WireFaults(Framing.RTU)
+    for name, said in (("wrong-unit", {"unit_id": 9}), ("delay", {"by_ms": 10}), ("truncate", {"count": 1})):
+        fault = made(name, **said)
+        faults.put_in(Active(name, fault, Aim(), Random(1), 0, 5))
+    outcome = faults.decide(understood(Way.REPLY, Framing.RTU, ON_LINE), 1)
+    assert outcome is not None
+    assert pieces(outcome) == [(line("0903 04 000A 0102")[:-1], 0.01)]
+    assert faults.decide(understood(Way.REPLY, Framing.RTU, ON_LINE), 5) is None
+    assert not faults.active, "what is over is forgotten"
+
+
+# -- frames ---------------------------------------------------------------------------------------------------------------
+
+PDUS = st.binary(min_size=2, max_size=60)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(PDUS, max_size=4), st.sampled_from([Framing.MBAP, Framing.ASCII]), st.randoms(use_true_random=False))
+def test_frames_are_found_however_they_are_cut(pdus: list[bytes], framing: Framing, random: Random) -> None:
+    frames = [
+        ascii_("11" + pdu.hex()) if framing is Framing.ASCII else bytes(5) + bytes((len(pdu) + 1, 0x11)) + pdu
+        for pdu in pdus
+    ]
+    stream = b"".join(frames)
+    assembler, found = Assembler(Way.REPLY, framing), []
+    while stream:
+        n = random.randint(1, len(stream))
+        found += assembler.feed(stream[:n])
+        stream = stream[n:]
+    assert [f.data for f in found] == frames
+    assert [(f.unit, f.pdu) for f in found] == [(0x11, pdu) for pdu in pdus]
+    assert assembler.flush() == []
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.binary(max_size=700), max_size=5), st.sampled_from(Framing))
+def test_no_byte_is_lost_or_made(chunks: list[bytes], framing: Framing) -> None:
+    assembler = Assembler(Way.REQUEST, framing)
+    frames = [f for chunk in chunks for f in assembler.feed(chunk)] + assembler.flush()
+    assert b"".join(f.data for f in frames) == b"".join(chunks)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.binary(max_size=40),
+    st.sampled_from(Framing),
+    st.sampled_from([k for k in FAULTS.values() if issubclass(k, WireFault)]),
+)
+def test_every_fault_takes_every_frame(data: bytes, framing: Framing, kind: type[WireFault]) -> None:
+    fault = kind(kind.form())
+    for way in Way:
+        outcome = fault.strike(understood(way, framing, data), Random(1))
+        assert all(isinstance(piece.data, bytes) and piece.delay_s >= 0 for piece in outcome.pieces)

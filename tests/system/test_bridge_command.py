@@ -127,7 +127,7 @@ def test_pymodbus_clients_through_the_bridge_and_read_only_unless_told(tmp_path:
     run(main(), timeout_s=40)
 
 
-def test_what_cannot_be_bridged_is_said(tmp_path: Path) -> None:
+def test_what_cannot_be(tmp_path: Path) -> None:
     for args, says, code in (
         (("tcp://127.0.0.1:0", "can:socketcan/can0"), "Modbus is not spoken there", 2),
         (("tcp://127.0.0.1:0", "rtu:/dev/ttyNONE", "--role", "x"), "roles are in clients' certificates", 2),

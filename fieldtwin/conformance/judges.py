@@ -43,7 +43,7 @@ def goes_on(seen: Observation) -> Finding | None:
         return failed(
             f"the master ended, exit code {ended.status}, {seen.since_s(ended.t_ns):.2f} s after the first odd answer"
         )
-    asked = next(seen.of(Asked, seen.over_ns), None)
+    asked = next(seen.of(Asked, seen.over_ns + 1), None)
     if asked is None:
         return failed(
             f"no request for {(seen.until_ns - seen.over_ns) / NS_PER_S:.1f} s after the last odd answer: it is wedged"
@@ -124,7 +124,7 @@ either = all_of(*DUTIES, needs_probe)
 def answers_at_once(seen: Observation) -> Finding | None:
     """A short frame is seen when it is there: the next request comes sooner than after silence."""
     told = next(seen.of(Told, seen.begun_ns), None)
-    asked = next(seen.of(Asked, told.t_ns), None) if told else None
+    asked = next(seen.of(Asked, told.t_ns + 1), None) if told else None
     if told is None or asked is None:
         return inconclusive("no request after the short frame")
     gap_s = (asked.t_ns - told.t_ns) / NS_PER_S

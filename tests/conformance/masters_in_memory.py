@@ -28,6 +28,8 @@ from gateway.protocols.modbus.client import ModbusClient
 WORDS = (1111, 2222, 3333)
 PERIOD_S = 0.3
 TIMEOUT_S = 0.2
+LAZY_S = 0.3
+"""How long masters rest between two polls."""
 Publish = Callable[[str], None]
 Master = Callable[[MemoryNet, Endpoint, VirtualClock, Publish], Coroutine[object, object, None]]
 

@@ -1,0 +1,150 @@
+"""The judges, on observations written by hand: frames and times in, a verdict out."""
+
+from __future__ import annotations
+
+import pytest
+
+from fieldtwin.conformance import judges
+from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
+from fieldtwin.conformance.canopen_judges import legal_nmt, legal_sync
+from fieldtwin.conformance.case import Judge
+from fieldtwin.conformance.habits import bounded_addresses, broadcasts_wait, legal_requests, no_broadcast_reads
+from fieldtwin.conformance.modbus_cases import CASES
+from fieldtwin.conformance.observation import (
+    Asked,
+    Came,
+    Ended,
+    Event,
+    Garbled,
+    Habit,
+    Observation,
+    Sent,
+    Shown,
+    Told,
+    Word,
+)
+from fieldtwin.report.model import Verdict
+from gateway.core.clock import NS_PER_S
+
+READ = bytes((17, 3, 0, 107, 0, 2))
+S = NS_PER_S
+START = 100 * S
+
+
+def _seen(*events: Event, over_s: float = 1.0, until_s: float = 5.0, **more: object) -> Observation:
+    settings: dict[str, object] = {"habit": Habit(rate_per_s=1.0), "probed": True, **more}
+    return Observation(events, START, START + round(over_s * S), START + round(until_s * S), **settings)  # type: ignore[arg-type]
+
+
+def _at(s: float) -> int:
+    return START + round(s * S)
+
+
+def _good() -> list[Event]:
+    """It asks, is answered oddly, asks again, and publishes what it is told then."""
+    return [
+        Asked(_at(0), 1, READ),
+        Told(_at(0.1), 1, b"odd", False),
+        Asked(_at(2), 1, READ),
+        Told(_at(2.1), 1, b"good", True),
+        Shown(_at(2.2), Word.SECOND, "2222"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("more", "says"),
+    [
+        ([Shown(_at(0.5), Word.POISON, "3333")], "published 3333, the value of the bad frame, 0.50 s"),
+        ([Shown(_at(0.5), Word.OTHER, "0")], "published 0, which no honest answer held"),
+        ([Garbled(_at(3), 1, b"\xff\xff")], "2 bytes that are no request: ff ff"),
+        ([Ended(_at(0.7), 3)], "the master ended, exit code 3, 0.70 s"),
+        ([Asked(_at(1 + i / 10), 1, READ) for i in range(40)], "41 requests in 5.0 s"),
+        ([Came(_at(1 + i / 10), i) for i in range(40)], "40 connections in 5.0 s"),
+    ],
+)
+def test_what_no_master_may_do(more: list[Event], says: str) -> None:
+    events = sorted([*_good(), *more], key=lambda e: e.t_ns)
+    finding = judges.rejects(_seen(*events))
+    assert finding.verdict is Verdict.FAILED
+    assert says.replace("41", str(42)) in finding.reason or says in finding.reason
+
+
+def test_a_good_master_passes_and_what_came_before_counts_for_nothing() -> None:
+    before = Shown(_at(-1), Word.POISON, "3333")
+    assert judges.rejects(_seen(before, *_good())).verdict is Verdict.PASSED
+
+
+def test_a_master_that_is_silent_afterwards_is_wedged() -> None:
+    finding = judges.survives(_seen(*_good()[:2]))
+    assert finding.verdict is Verdict.FAILED
+    assert "no request for 4.0 s" in finding.reason
+
+
+def test_a_master_that_never_publishes_again_fails_only_where_a_probe_looks() -> None:
+    assert "not published within 4.0 s" in judges.survives(_seen(*_good()[:4])).reason
+    assert judges.survives(_seen(*_good()[:4], probed=False)).verdict is Verdict.PASSED
+    assert judges.rejects(_seen(*_good()[:4], probed=False)).verdict is Verdict.SKIPPED
+
+
+def test_an_odd_frame_that_is_right_is_taken_before_the_plain_one_comes() -> None:
+    taken = Shown(_at(0.3), Word.SECOND, "2222")
+    assert judges.accepts(_seen(*_good()[:2], taken, *_good()[2:])).verdict is Verdict.PASSED
+    assert "were not taken" in judges.accepts(_seen(*_good())).reason
+
+
+@pytest.mark.parametrize(("gap_s", "verdict"), [(0.2, Verdict.PASSED), (0.95, Verdict.FAILED), (0.6, Verdict.PASSED)])
+def test_a_short_frame_is_seen_at_once(gap_s: float, verdict: Verdict) -> None:
+    events = [Asked(_at(0), 1, READ), Told(_at(0), 1, b"x", False), Asked(_at(gap_s), 1, READ)]
+    habit = Habit(longest_gap_s=0.3, silent_gap_s=1.0, rate_per_s=5)
+    assert judges.short_frame(_seen(*events, over_s=0, habit=habit, probed=False)).verdict is verdict
+
+
+def test_whoever_polls_no_sooner_than_its_timeout_cannot_be_judged_by_that() -> None:
+    events = [Asked(_at(0), 1, READ), Told(_at(0), 1, b"x", False), Asked(_at(1), 1, READ)]
+    habit = Habit(longest_gap_s=1.0, silent_gap_s=1.0)
+    assert judges.short_frame(_seen(*events, over_s=0, habit=habit, probed=False)).verdict is Verdict.INCONCLUSIVE
+
+
+@pytest.mark.parametrize(
+    ("judge", "target", "verdict"),
+    [
+        (legal_requests, "11 03 00 00 00 7d", Verdict.PASSED),
+        (legal_requests, "11 03 00 00 00 7e", Verdict.FAILED),
+        (legal_requests, "11 03 00 00 00 00", Verdict.FAILED),
+        (legal_requests, "11 01 00 00 07 d1", Verdict.FAILED),
+        (bounded_addresses, "11 03 ff ff 00 01", Verdict.PASSED),
+        (bounded_addresses, "11 03 ff ff 00 02", Verdict.FAILED),
+        (no_broadcast_reads, "00 03 00 00 00 01", Verdict.FAILED),
+        (no_broadcast_reads, "00 06 00 00 00 01", Verdict.PASSED),
+        (broadcasts_wait, "11 06 00 00 00 01", Verdict.SKIPPED),
+    ],
+)
+def test_requests_against_the_standard(judge: Judge, target: str, verdict: Verdict) -> None:
+    assert judge(_seen(Asked(_at(0), 1, bytes.fromhex(target)))).verdict is verdict
+
+
+@pytest.mark.parametrize(("pause_s", "verdict"), [(0.1, Verdict.PASSED), (0.09, Verdict.FAILED)])
+def test_units_get_time_for_a_broadcast(pause_s: float, verdict: Verdict) -> None:
+    broadcast = bytes.fromhex("00 06 00 00 00 01")
+    assert broadcasts_wait(_seen(Asked(_at(0), 1, broadcast), Asked(_at(pause_s), 1, READ))).verdict is verdict
+
+
+def test_nmt_and_sync_against_the_standard() -> None:
+    def sent(text: str) -> Observation:
+        return _seen(Sent(_at(0), 1, bytes.fromhex(text)))
+
+    assert legal_nmt(sent("0000 01 05")).verdict is Verdict.PASSED
+    assert legal_nmt(sent("0000 01 80")).verdict is Verdict.FAILED
+    assert legal_nmt(sent("0000 01")).verdict is Verdict.FAILED
+    assert legal_sync(sent("0080 07")).verdict is Verdict.PASSED
+    assert legal_sync(sent("0080 07 07")).verdict is Verdict.FAILED
+    assert legal_sync(sent("0000 01 05")).verdict is Verdict.SKIPPED
+
+
+@pytest.mark.parametrize("cases", [CASES, CANOPEN_CASES], ids=["modbus", "canopen"])
+def test_every_case_says_what_it_is(cases: tuple[object, ...]) -> None:
+    abouts = [case.about for case in cases]  # type: ignore[attr-defined]
+    assert len({about.id for about in abouts}) == len(abouts)
+    for about in abouts:
+        assert all((about.title, about.clause, about.does, about.must)), about.id
+        assert about.role == "master"

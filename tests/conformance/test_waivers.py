@@ -1,0 +1,91 @@
+"""Waivers, and what becomes of results under them."""
+
+from __future__ import annotations
+
+import json
+from datetime import date
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from fieldtwin.conformance.case import Finding, failed, passed, skipped
+from fieldtwin.conformance.modbus_cases import CASES
+from fieldtwin.conformance.results import CaseResult, as_json, as_report, exit_code, waive
+from fieldtwin.conformance.waivers import Waivers, read_waivers
+from fieldtwin.report.junit import write_junit
+from fieldtwin.report.model import Verdict
+from gateway.core.errors import FileInvalid
+from gateway.core.yaml_file import parse
+
+KNOWN = {"MB-013", "MB-015", "MB-015a"}
+CASE = next(c.about for c in CASES if c.about.id == "MB-015a")
+GOOD = """waivers:
+  - id: MB-015
+    reason: replaced in May
+    expires: 2027-05-31
+"""
+
+
+def _waivers(text: str = GOOD) -> Waivers:
+    return read_waivers(parse(text, "w.yaml"), KNOWN)
+
+
+def _waived(finding: Finding, day: date) -> CaseResult:
+    return waive(CaseResult(CASE, finding), _waivers(), day)
+
+
+def test_a_failure_is_waived_up_to_and_on_the_last_day() -> None:
+    result = _waived(failed("published 3333"), date(2027, 5, 31))
+    assert result.verdict is Verdict.SKIPPED
+    assert result.reason == "waived: replaced in May, until 2027-05-31 (failed: published 3333)"
+    assert exit_code([result]) == 1, "nothing passed"
+    assert exit_code([result, CaseResult(CASE, passed())]) == 0
+
+
+@pytest.mark.parametrize("finding", [failed("published 3333"), passed(), skipped("no such request")])
+def test_an_expired_waiver_is_a_failure_that_says_so_whatever_was_found(finding: Finding) -> None:
+    result = _waived(finding, date(2027, 6, 1))
+    assert result.verdict is Verdict.FAILED
+    assert "its waiver expired on 2027-05-31 (replaced in May)" in result.reason
+
+
+def test_what_passes_needs_no_waiver() -> None:
+    assert _waived(passed(), date(2027, 1, 1)).verdict is Verdict.PASSED
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("MB-015", "MB-51a", "w.yaml:2:5: no case 'MB-51a'; expected MB-015a"),
+        ("2027-05-31", "soon", "w.yaml:4"),
+        ("    reason: replaced in May\n", "", "w.yaml:2"),
+        ("reason", "raeson", "raeson"),
+        (
+            "    expires: 2027-05-31\n",
+            "    expires: 2027-05-31\n  - {id: MB-015, reason: again, expires: 2027-05-31}\n",
+            "twice",
+        ),
+    ],
+)
+def test_a_bad_file_is_told_with_its_place(old: str, new: str, says: str) -> None:
+    with pytest.raises(FileInvalid) as error:
+        _waivers(GOOD.replace(old, new))
+    assert says in str(error.value)
+
+
+def test_results_as_json_and_junit(tmp_path: Path) -> None:
+    results = [CaseResult(CASE, failed("published 3333"), 1.5), CaseResult(CASE, skipped("no probe"))]
+    first, second = as_json(results)
+    assert json.loads(json.dumps(first))["danger"] == "read"
+    assert (first["verdict"], second["verdict"]) == ("failed", "skipped")
+    write_junit(
+        as_report(results, "master", "fieldtwin check modbus-master", "2027-01-01T00:00:00+00:00"), tmp_path / "j.xml"
+    )
+    suite = ET.parse(tmp_path / "j.xml").getroot().find("testsuite")
+    assert suite is not None
+    assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("2", "1", "1")
+    failure = suite.find("testcase/failure")
+    assert failure is not None
+    assert "published 3333" in failure.get("message", "")
+    assert "--only MB-015a" in (failure.text or "")

@@ -1,0 +1,152 @@
+"""Masters that are wrong on purpose, each in one way: the case that is about it fails, with a reason that names it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import pytest
+from masters_in_memory import LAZY_S, Publish, judge, judge_canopen
+
+from emulators.modbus.rtu_receiver import crc16, with_crc
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.ports import MemoryNet
+from fieldtwin.report.model import Verdict
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import ByteConnection
+from gateway.core.endpoint import Endpoint
+
+REQUEST = bytes((17, 3, 0, 107, 0, 2))
+TIMEOUT_S = 0.2
+Take = Callable[[bytes], int | None]
+
+
+def _first_register(reply: bytes) -> int:
+    return int.from_bytes(reply[3:5], "big")
+
+
+def _believes_all(reply: bytes) -> int | None:
+    return _first_register(reply) if len(reply) >= 7 and reply[1] < 0x80 else None
+
+
+def _checks_crc_only(reply: bytes) -> int | None:
+    return _first_register(reply) if len(reply) >= 7 and crc16(reply) == 0 and reply[1] < 0x80 else None
+
+
+def _zero_for_refusals(reply: bytes) -> int | None:
+    if len(reply) == 5:
+        return 0
+    return _first_register(reply) if reply[:3] == b"\x11\x03\x04" and crc16(reply) == 0 and len(reply) == 9 else None
+
+
+async def _answer(line: ByteConnection) -> bytes:
+    """All that comes within the timeout, up to a pause of 5 ms."""
+    got = b""
+    try:
+        async with asyncio.timeout(TIMEOUT_S):
+            got = await line.read()
+        while True:
+            async with asyncio.timeout(0.030):
+                got += await line.read()
+    except TimeoutError:
+        return got
+
+
+def _master(take: Take, pause_s: float = LAZY_S) -> Callable[..., object]:
+    async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+        line = await net.open_bytes(endpoint)
+        while True:
+            await line.write(with_crc(REQUEST))
+            value = take(await _answer(line))
+            if value is not None:
+                publish(str(value))
+            await asyncio.sleep(pause_s)
+
+    return poll
+
+
+@pytest.mark.parametrize(
+    ("take", "case", "says"),
+    [
+        (_believes_all, "MB-002", "published 3333"),
+        (_checks_crc_only, "MB-015a", "published 3333"),
+        (_checks_crc_only, "MB-016", "published 3333"),
+        (_checks_crc_only, "MB-017b", "published 3333"),
+        (_checks_crc_only, "MB-008", "were not taken"),
+        (_zero_for_refusals, "MB-024", "published 0, which no honest answer held"),
+        (_checks_crc_only, "MB-013", "published 3333"),
+    ],
+)
+def test_a_master_that_believes_too_much_or_too_little_fails(take: Take, case: str, says: str) -> None:
+    pause_s = 0.0 if case == "MB-013" else LAZY_S
+    result = judge(_master(take, pause_s), "rtu:/line?baudrate=19200", case)[case]  # type: ignore[arg-type]
+    assert result.verdict is Verdict.FAILED, result.reason
+    assert says in result.reason
+
+
+def test_a_late_reply_is_only_a_failure_where_the_timeout_is_known() -> None:
+    master = _master(_checks_crc_only, 0.0)
+    result = judge(master, "rtu:/line?baudrate=19200", "MB-013", timeout_s=0.0)["MB-013"]  # type: ignore[arg-type]
+    assert result.verdict is Verdict.INCONCLUSIVE
+    assert "say --timeout" in result.reason
+
+
+async def _gives_up(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+    line = await net.open_bytes(endpoint)
+    silences = 0
+    while silences < 2:  # the first one is how its timeout is found out
+        await line.write(with_crc(REQUEST))
+        reply = await _answer(line)
+        if _checks_crc_only(reply) is None:
+            silences += 1
+        else:
+            publish(str(_first_register(reply)))
+        await asyncio.sleep(LAZY_S)
+    await asyncio.Event().wait()
+
+
+def test_a_master_that_never_asks_again_is_wedged_and_what_follows_is_inconclusive() -> None:
+    results = judge(_gives_up, "rtu:/line?baudrate=19200", "MB-003", "MB-014")
+    assert results["MB-003"].verdict is Verdict.FAILED
+    assert "wedged" in results["MB-003"].reason
+    assert results["MB-014"].verdict is Verdict.INCONCLUSIVE
+
+
+async def _floods(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+    line = await net.open_bytes(endpoint)
+    while True:
+        await line.write(with_crc(REQUEST))
+        value = _checks_crc_only(await _answer(line))
+        if value is not None:
+            publish(str(value))
+            await asyncio.sleep(LAZY_S)
+
+
+def test_a_master_that_asks_a_busy_device_at_once_does_not_back_off() -> None:
+    result = judge(_floods, "rtu:/line?baudrate=19200", "MB-024")["MB-024"]
+    assert result.verdict is Verdict.FAILED
+    assert "does not back off" in result.reason
+
+
+async def _naive_sdo(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+    """Any frame with the right number is the answer."""
+    bus = await net.open_can(endpoint, 125_000)
+    while True:
+        await bus.send(CanFrame(0x605, bytes((0x40, 0x00, 0x20, 0, 0, 0, 0, 0))))
+        try:
+            async with asyncio.timeout(TIMEOUT_S):
+                while (frame := await bus.recv()).can_id != 0x585:
+                    pass
+                if len(frame.data) == 8 and frame.data[0] >> 5 == 2:
+                    publish(str(int.from_bytes(frame.data[4:8], "little")))
+        except TimeoutError:
+            pass
+        await asyncio.sleep(LAZY_S)
+
+
+def test_a_naive_sdo_client_fails_what_it_does_not_look_at() -> None:
+    results = judge_canopen(_naive_sdo, "CO-001", "CO-005", "CO-060", "CO-008")
+    assert "published 14" in results["CO-001"].reason, "the indicated length, taken for the value"
+    for case in ("CO-001", "CO-005", "CO-060"):
+        assert results[case].verdict is Verdict.FAILED, case
+    assert results["CO-008"].verdict is Verdict.PASSED

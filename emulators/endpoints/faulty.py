@@ -62,6 +62,9 @@ class FaultyEnd(ByteConnection):
     async def read(self) -> bytes:
         return await self.inner.read()
 
+    async def read_within(self, timeout_s: float) -> bytes:
+        return await self.inner.read_within(timeout_s)
+
     def read_pending(self) -> bytes:
         return self.inner.read_pending()
 

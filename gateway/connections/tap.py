@@ -97,6 +97,9 @@ class _TappedBytes(ByteConnection):
     async def read(self) -> bytes:
         return await self._inner.read()
 
+    async def read_within(self, timeout_s: float) -> bytes:
+        return await self._inner.read_within(timeout_s)
+
     def read_pending(self) -> bytes:
         return self._inner.read_pending()
 

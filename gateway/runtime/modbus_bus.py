@@ -253,11 +253,13 @@ class ModbusBus:
         return True
 
     async def _sleep_or_job(self, until_ns: int) -> None:
+        left_s = max(0.0, (until_ns - self._clock.monotonic_ns()) / NS_PER_S)
+        # Whoever is woken looks at everything: that the next poll is due wakes as a job does.
+        next_poll = asyncio.get_running_loop().call_later(left_s, self._wake.set)
         try:
-            async with asyncio.timeout(max(0.0, (until_ns - self._clock.monotonic_ns()) / NS_PER_S)):
-                await self._wake.wait()
-        except TimeoutError:
-            pass  # the next poll is due
+            await self._wake.wait()
+        finally:
+            next_poll.cancel()
 
     async def _poll(self, client: ModbusClient, device: DeviceState, group: str) -> None:
         """One turn of a device: a transaction of a group, or first contact."""

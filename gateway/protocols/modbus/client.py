@@ -393,11 +393,7 @@ class ModbusClient:
     async def _read_until(self, deadline_ns: int) -> bytes:
         """What arrives next, or nothing at `deadline_ns`."""
         left_s = max(0.0, (deadline_ns - self._clock.monotonic_ns()) / NS_PER_S)
-        try:
-            async with asyncio.timeout(left_s):
-                return await self._connection.read()
-        except TimeoutError:
-            return await self._read_pending()
+        return await self._connection.read_within(left_s)
 
     async def _read_pending(self) -> bytes:
         """What arrived already, possibly nothing; of datagrams only the first, so that none is joined to another."""

@@ -63,6 +63,7 @@ class NodeStatus:
     bring_ups: int = 0
     polls: int = 0
     poll_errors: int = 0
+    start_again: asyncio.TimerHandle | None = None
     wanted: asyncio.Event = field(default_factory=asyncio.Event)
     up: asyncio.Event = field(default_factory=asyncio.Event)
     booted: asyncio.Event = field(default_factory=asyncio.Event)
@@ -391,11 +392,20 @@ class CanopenBus:
 
     def _start_again(self, status: NodeStatus) -> None:
         """A node that we started fell back by itself, as 1029h has it after an error (CiA 301, 7.5.2.32): it is brought up
-        anew, by and by, so that one with a lasting error is not asked without end."""
-        if not self._allow_writes or self._stopping:
-            return
-        self._offline(status, Unreachable("the node left OPERATIONAL"))
-        asyncio.get_running_loop().call_later(START_AGAIN_S, status.wanted.set)
+        anew, by and by, so that one with a lasting error is not asked without end. Unless somebody started it meanwhile."""
+        master, node = self._master, status.driver.node
+
+        def again() -> None:
+            if master is None or master is not self._master or self._stopping or not status.online:
+                return
+            if master.node_state(node) is NmtState.PRE_OPERATIONAL:
+                self._offline(status, Unreachable("the node left OPERATIONAL"))
+                status.wanted.set()
+
+        if self._allow_writes and not self._stopping:
+            if status.start_again is not None:
+                status.start_again.cancel()  # it was started meanwhile, and fell back again
+            status.start_again = asyncio.get_running_loop().call_later(START_AGAIN_S, again)
 
     async def stop_nodes(self, timeout_s: float) -> None:
         """On the way out: nodes that we started go back to PRE-OPERATIONAL, where they send no process data."""

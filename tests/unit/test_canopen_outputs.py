@@ -238,6 +238,12 @@ def test_nothing_goes_to_a_node_that_is_not_operational_and_all_of_it_when_it_is
                 await r.status.driver.master.send(CanFrame(0, bytes([command, NODE])))
                 await asyncio.sleep(0.2)
             assert r.field.rpdos[sent:] == ["207#070005000000"] * 2
+            await r.status.driver.master.send(CanFrame(0, bytes([0x80, NODE])))
+            await asyncio.sleep(1.9)
+            assert r.status.bring_ups == 1
+            await asyncio.sleep(0.5)  # nobody started it: it is brought up again
+            assert r.status.bring_ups == 2
+            assert r.field.rpdos[sent:] == ["207#070005000000"] * 3
 
     run_virtually(main())
 

@@ -299,13 +299,13 @@ def test_the_driver_sets_the_outputs_of_the_io_module(tmp_path: Path) -> None:
     run(main())
 
 
-def test_in_a_prototype_only_a_canopen_node_is_emulated_by_its_profile_alone(tmp_path: Path) -> None:
+def test_in_a_prototype_no_device_that_samples_is_emulated_by_its_profile_alone(tmp_path: Path) -> None:
     system = load_system("observatory")
     text = load_prototype(system).path.read_text(encoding="utf-8")
     path = tmp_path / "mine.prototype.yaml"
     path.write_text(text.replace("recording: incl.jsonl, at_end: loop", "model: profile"), encoding="utf-8")
     assert load_prototype(system, path).devices["inclinometer"].recording is None
     path.write_text(text.replace("recording: cast.jsonl, speed: 1, at_end: hold", "model: profile"), encoding="utf-8")
-    with pytest.raises(FileInvalid, match="for 'ctd'; expected a CANopen node") as error:
+    with pytest.raises(FileInvalid, match="'ctd' does more than its registers say; expected `recording: FILE`") as error:
         load_prototype(system, path)
     assert error.value.line == next(n for n, line in enumerate(path.read_text().splitlines(), 1) if "ctd:" in line)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from random import Random
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -77,7 +77,7 @@ class Aim(BaseModel):
     cob_id: int | None = Field(default=None, ge=0, le=0x7FF)
     index: int | None = Field(default=None, ge=0, le=0xFFFF)
     """An object of CANopen: SDO requests and replies that name it."""
-    direction: str = Field(default="", pattern="^(request|reply|both|)$")
+    direction: Literal["request", "reply", "both", ""] = ""
     nth: int | None = Field(default=None, ge=1)
     every: int | None = Field(default=None, ge=1)
     from_: str | float | int = Field(default=0, alias="from")

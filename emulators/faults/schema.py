@@ -82,14 +82,19 @@ def parse_fault(
         aim = Aim.model_validate({k: v for k, v in said.items() if k in _AIM_KEYS})
         parameters = {k: v for k, v in said.items() if k in own}
         kind.form.model_validate(parameters)
-        from_s = seconds(aim.from_)
-        until_s = None if aim.until is None else seconds(aim.until)
     except ValidationError as e:
         first = e.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else ""
         raise wrong(key, f"{key}: {first['msg']}", got=repr(first["input"])[:60]) from e
-    except UsageError as e:
-        raise wrong("from", e.message, expected=e.expected, got=e.got) from e
+
+    def time(key: str, value: str | float | int) -> float:
+        try:
+            return seconds(value)
+        except UsageError as e:
+            raise wrong(key, e.message, expected=e.expected, got=e.got) from e
+
+    from_s = time("from", aim.from_)
+    until_s = None if aim.until is None else time("until", aim.until)
     if until_s is not None and until_s <= from_s:
         raise wrong("until", "a fault that ends before it begins", expected="until after from")
     return FaultSpec(str(said.get("id") or f"{name}-{number}"), kind, aim, parameters, from_s, until_s)

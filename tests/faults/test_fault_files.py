@@ -1,0 +1,100 @@
+"""Fault files: what is wrong in one is named with its file, line, column and the nearest known word; and `fieldtwin faults`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from emulators.faults.frames import Framing
+from emulators.faults.on_link import wire_faults
+from emulators.faults.registry import FAULTS
+from emulators.faults.schema import load_faults, parse_fault, seconds
+from fieldtwin.cli.faults_command import command
+from gateway.core.errors import FileInvalid, UsageError
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("faults:\n  - {name: silence, device: ctd, untl: 12s}\n", ":2:34: unknown key 'untl' in fault silence"),
+        ("faults:\n  - {name: silence, device: ctd, untl: 12s}\n", "did you mean 'until'?"),
+        ("faults:\n  - name: delay\n    by_ms: -4\n", ":3:5: by_ms: Input should be greater than 0; got -4"),
+        ("faults:\n  - {name: slience}\n", ":2:6: no fault 'slience'"),
+        ("faults:\n  - {name: slience}\n", "did you mean 'silence'?"),
+        ("faults:\n  - {nam: slience}\n", ":2:5: a fault without a name"),
+        ("faults:\n  - silence\n", ":2:5: a fault"),
+        ("faults: []\n", ":1:1: a list of faults"),
+        ("fault: []\n", ":1:1: unknown key 'fault'"),
+        ("faults:\n  - {name: delay, from: 5 s}\n", ":2:19: a time; expected 5s, 250ms, 2min or 24h; got '5 s'"),
+        ("faults:\n  - {name: delay, until: soon}\n", ":2:19: a time"),
+        ("faults:\n  - {name: delay, from: 5s, until: 5s}\n", ":2:29: a fault that ends before it begins"),
+        ("faults:\n  - {name: delay, direction: back}\n", "'request', 'reply', 'both'"),
+        ("faults:\n  - {name: delay, probability: 2}\n", ":2:19: probability"),
+        ("faults:\n  - {name: drop, id: a}\n  - {name: echo, id: a}\n", ":3:18: the id 'a' stands twice"),
+        ("faults:\n  - {name: drop, by_ms: 5}\n", ":2:18: unknown key 'by_ms' in fault drop"),
+    ],
+)
+def test_what_is_wrong_is_said_where_it_is(tmp_path: Path, text: str, told: str) -> None:
+    path = tmp_path / "faults.yaml"
+    path.write_text(text)
+    with pytest.raises(FileInvalid) as raised:
+        load_faults(path)
+    assert told in str(raised.value)
+    assert str(path) in str(raised.value)
+
+
+def test_a_good_file(tmp_path: Path) -> None:
+    path = tmp_path / "faults.yaml"
+    path.write_text(
+        "faults:\n  - {name: drop, device: ctd, from: 250ms, until: 2min}\n  - {id: mine, name: delay, by_ms: 5}\n"
+    )
+    first, second = load_faults(path)
+    spec = parse_fault(first)
+    assert (spec.id, spec.from_s, spec.until_s, spec.aim.device) == ("drop-1", 0.25, 120.0, "ctd")
+    assert second == {"id": "mine", "name": "delay", "by_ms": 5}
+
+
+def test_times() -> None:
+    assert [seconds(t) for t in ("5s", "250ms", "2min", "24h", "7", 1.5)] == [5.0, 0.25, 120.0, 86_400.0, 7.0, 1.5]
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ({"name": "stuck"}, "values of a device"),
+        ({"name": "bus-off"}, "CAN buses"),
+        ({"name": "drop", "device": "ctd"}, "a link knows no names"),
+        ({"name": "drop", "address": "here"}, "an address"),
+    ],
+)
+def test_a_link_knows_neither_names_nor_values(said: dict[str, str], told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        wire_faults([said], Framing.RTU, 1, 0)
+
+
+def test_every_fault_can_be_put_in_with_its_name_alone() -> None:
+    for name, kind in FAULTS.items():
+        fault = parse_fault({"name": name}).make()
+        assert isinstance(fault, kind)
+        assert kind.summary
+        for parameter in kind.form.model_fields.values():
+            assert not parameter.is_required(), name
+
+
+def test_they_are_listed() -> None:
+    told = CliRunner().invoke(command, ["--json"])
+    listed = json.loads(told.stdout)
+    assert [one["name"] for one in listed] == list(FAULTS)
+    (delay,) = json.loads(CliRunner().invoke(command, ["delay", "--json"]).stdout)
+    assert delay["parameters"]["by_ms"] == {
+        "default": 50.0,
+        "type": "number",
+        "exclusiveMinimum": 0,
+        "maximum": 600_000,
+    }
+    refused = CliRunner().invoke(command, ["dely"])
+    assert isinstance(refused.exception, UsageError)
+    assert refused.exception.hint == "did you mean 'delay'?"

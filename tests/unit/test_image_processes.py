@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import mmap
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,8 @@ TAGS = 334
 """Of each of three kinds: 1,002 mixed tags."""
 READS = 10_000_000
 """Tags read, in whole snapshots."""
+FRESH = 100
+"""Of the snapshots of each round at least so many are of publications that had not been seen; with a processor each, 97 % are."""
 ROUNDS = 4
 DEPTH = 512
 
@@ -53,28 +56,27 @@ def test_a_writer_at_full_speed_killed_again_and_again_never_tears_a_value(
     layout = ImageLayout((RegionLayout("r", tags),))
     path = tmp_path / "image"
     path.write_bytes(bytes(layout.size))
-    with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapped:
-        memory = memoryview(mapped)
+    with path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as mapped, memoryview(mapped) as memory:
         layout.format(memory)
-        image = layout.attach(memory)
-        reader = image.reader("r")
-        looks = seen = 0
-        for turn in range(1, rounds + 1):
-            child = _start_writer(path, layout)
-            try:
-                while looks * 3 * TAGS < reads * turn / rounds:
-                    seen, looks = _look(reader, seen), looks + 1
-            finally:
-                child.kill()
-                child.wait()
-                assert child.stdout is not None
-                child.stdout.close()
-            seen = _look(reader, seen)  # whole right after the kill, too
-        assert seen > 100  # publications, however busy the computer is
-        assert looks * 3 * TAGS >= reads
-        assert reader.gave_up == 0
-        image.release()
-        memory.release()
+        with layout.attach(memory) as image:
+            reader = image.reader("r")
+            looks = fresh = seen = 0
+            for turn in range(1, rounds + 1):
+                child = _start_writer(path, layout)
+                try:
+                    while looks * 3 * TAGS < reads * turn / rounds or fresh < FRESH * turn:
+                        before, seen = seen, _look(reader, seen)
+                        looks, fresh = looks + 1, fresh + (seen != before)
+                        if seen == before:
+                            os.sched_yield()  # on a crowded computer the writer gets its turn
+                finally:
+                    child.kill()
+                    child.wait()
+                    assert child.stdout is not None
+                    child.stdout.close()
+                seen = _look(reader, seen)  # whole right after the kill, too
+            assert seen >= fresh >= FRESH * rounds
+            assert reader.gave_up == 0
 
 
 def _start_writer(path: Path, layout: ImageLayout) -> subprocess.Popen[str]:
@@ -100,10 +102,7 @@ def _look(reader: RegionReader, seen: int) -> int:
     assert [m.data for m in messages] == [str(m.seq).encode() for m in messages]
     sequences = [m.seq for m in messages]
     assert sequences == sorted(set(sequences))
-    if messages:
-        assert sequences[0] > seen
-        assert sequences[-1] == n
-        assert len(messages) + reader.missed["m"] - missed_before == n - seen
-        return n
-    assert n == seen
-    return seen
+    assert all(seen < number <= n for number in sequences)
+    # Whatever the writer overwrote while this process had to wait is counted.
+    assert len(messages) + reader.missed["m"] - missed_before == n - seen
+    return n

@@ -99,12 +99,13 @@ class CanopenStage:
 
     def _asked(self, node: int, request: bytes, now_ns: int) -> None:
         server = self._node(node)
-        true = tuple(server.answer(request, now_ns))
         opens = request[0] >> 5 == UPLOAD or (request[0] >> 5 == BLOCK_UPLOAD and request[0] & 3 == 0)
         if opens or request[0] >> 5 == 1:
             self.recorder.add(Asked(now_ns, MASTER, bytes((node,)) + request))
         if opens:
             self._memory = self._begun(request, now_ns)
+            server.objects.word = self._word_for(self._memory is not None)
+        true = tuple(server.answer(request, now_ns))
         case = self._playing
         if case is None or self._memory is None or not true:
             self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
@@ -116,6 +117,12 @@ class CanopenStage:
         )  # fmt: skip
         self.last_ns = now_ns
         self._send(case.play(scene), now_ns)
+
+    def _word_for(self, played: bool) -> int:
+        """While odd frames hold the honest word, other transfers keep the one before: it is to come from the odd ones."""
+        if self._case is not None and self._case.holds_good and not played:
+            return self._words[1] if self._word == self._words[0] else self._words[0]
+        return self._word
 
     def _begun(self, request: bytes, now_ns: int) -> dict[str, int] | None:
         """A transfer begins. What its play keeps in mind, where it is one for the case; it is played to its end."""

@@ -7,7 +7,7 @@ node. One run takes all rows of a wire one after the other, the wires side by si
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -161,12 +161,16 @@ class _Run(VirtualRun):
     def __init__(self, options: VirtualOptions, rows: Sequence[Row]) -> None:
         super().__init__(options)
         self.rows = rows
+        self.before: Callable[[VirtualBench], Awaitable[None]] | None = None
         self.seen = {(row.wire, row.name): Seen() for row in rows}
 
     async def _through(self, bench: VirtualBench, loop: VirtualLoop) -> None:
         values_before: dict[str, int] = {}
         while bench.now_s() < self.options.duration_s:
             await bench.sleep_until_s(bench.now_s() + 0.1)
+            if self.before is not None and bench.now_s() > FIRST_S - 3:
+                before, self.before = self.before, None
+                await before(bench)
             for row in self.rows:
                 at_s = bench.now_s() - row.begins_s
                 if 0 <= at_s < ROW_S - 0.05:
@@ -205,8 +209,10 @@ class _Run(VirtualRun):
                     seen.struck = known["struck"]
 
 
-def through(rows: Sequence[tuple[str, str, dict[str, Any]]]) -> _Run:
-    """Run the rows: wire, fault, what it is told."""
+def through(
+    rows: Sequence[tuple[str, str, dict[str, Any]]], before: Callable[[VirtualBench], Awaitable[None]] | None = None
+) -> _Run:
+    """Run the rows: wire, fault, what it is told. `before` them something else can be done, for 3 s."""
     numbers: dict[str, int] = {}
     made = []
     for wire, name, said in rows:
@@ -224,5 +230,6 @@ def through(rows: Sequence[tuple[str, str, dict[str, Any]]]) -> _Run:
             faults=tuple(row.fault() for row in made),
         )
         run = _Run(options, made)
+        run.before = before
         run.run()
     return run

@@ -11,6 +11,8 @@ import pytest
 from faults_rig import Seen, through
 
 from emulators.faults.registry import FAULTS
+from fieldtwin.running.virtual_bench import VirtualBench
+from gateway.core.errors import UsageError
 
 NOBODY: frozenset[str] = frozenset()
 
@@ -115,13 +117,58 @@ def test_the_table_has_every_fault() -> None:
 
 
 def test_each_fault_is_seen_for_what_it_is_and_is_over_when_it_is_over() -> None:
-    run = through([(row.wire, row.name, row.said) for row in ROWS])
+    run = through([(row.wire, row.name, row.said) for row in ROWS], _by_hand)
     assert run.errors == []
     wrong = [f"{row.wire} {row.name}: {what}" for row in ROWS for what in _wrong(row, run.seen[row.wire, row.name])]
     assert wrong == []
     told = run.oracle.describe()
     assert told["wrong"] == 0, told
     assert told["checked"] > 3000
+
+
+async def _by_hand(bench: VirtualBench) -> None:
+    """What somebody sets stays set until it is taken back; what makes no sense is refused, and says what would."""
+    began_s = bench.now_s()
+    for device, tag, value in (("probe", "temperature", 21.5), ("tilt", "slope_lateral", -30.0)):
+        await bench.set_value(device, tag, value)
+    await bench.sleep_until_s(began_s + 1.3)
+    assert [_value(bench, tag) for tag in ("probe.temperature", "tilt.slope_lateral")] == [21.5, -30.0]
+    for device, tag in (("probe", "temperature"), ("tilt", "slope_lateral")):
+        await bench.set_value(device, tag, None)
+    for said, told in REFUSED:
+        with pytest.raises(UsageError, match=told):
+            await bench.inject(said)
+    with pytest.raises(UsageError, match=r"no tag of probe 'temprature'.*did you mean 'temperature'"):
+        await bench.set_value("probe", "temprature", 1.0)
+    with pytest.raises(UsageError, match="no fault 'nobody' is in"):
+        await bench.clear("nobody")
+    await bench.inject({"id": "mine", "name": "silence", "device": "probe"})
+    with pytest.raises(UsageError, match="the fault 'mine' is in already"):
+        await bench.inject({"id": "mine", "name": "silence", "device": "probe"})
+    await bench.clear("mine")
+    await bench.sleep_until_s(began_s + 2.6)
+    assert _value(bench, "probe.temperature") != 21.5
+    assert _value(bench, "tilt.slope_lateral") != -30.0
+
+
+REFUSED: list[tuple[dict[str, Any], str]] = [
+    ({"name": "drop"}, "fault drop aims at nothing; expected device: NAME, or bus: NAME"),
+    ({"name": "drop", "device": "prob"}, "no device 'prob'.*did you mean 'probe'"),
+    ({"name": "drop", "bus": "lam"}, "no bus 'lam'.*did you mean 'lan'"),
+    ({"name": "drop", "device": "tilt"}, "fault drop is for serial lines and sockets"),
+    ({"name": "bus-off", "bus": "lan"}, "fault bus-off is for CAN buses"),
+    ({"name": "stuck", "bus": "lan"}, "fault stuck is one of a device"),
+    ({"name": "stuck", "device": "probe", "register": "presure"}, "no tag of probe 'presure'.*did you mean 'pressure'"),
+    ({"name": "drop", "bus": "lan", "register": "pressure"}, "a register is one of a device"),
+    ({"name": "drop", "bus": "lan", "address": "x"}, "an address; expected a number, or holding:0x10"),
+    ({"name": "drop", "bus": "lan", "by": 1}, "unknown key 'by' in fault drop"),
+]
+
+
+def _value(bench: VirtualBench, tag: str) -> Any:
+    reading = bench.reading(tag)
+    assert reading is not None
+    return reading.value
 
 
 def _wrong(row: Row, seen: Seen) -> list[str]:

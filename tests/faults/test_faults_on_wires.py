@@ -1,0 +1,176 @@
+"""Faults on this computer's wires: a reset is one, a port dies and comes back, strangers on a link are struck."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import eventually, run
+
+from emulators.endpoints.faulty import FaultyEnd
+from emulators.endpoints.ports import OsPorts
+from emulators.endpoints.pty import PtyEnd
+from emulators.faults.frames import Framing
+from emulators.faults.on_link import wire_faults
+from emulators.link import Link
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import ByteConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost
+
+REQUEST = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
+REPLY = bytes.fromhex("0001 0000 0005 01 03 02 002A")
+
+
+def at_once(*said: dict[str, Any], framing: Framing = Framing.MBAP) -> Any:
+    return wire_faults(said, framing, 1, round(asyncio.get_running_loop().time() * NS_PER_S))
+
+
+async def answers(connection: ByteConnection) -> None:
+    """A device that answers whatever it hears."""
+    with contextlib.suppress(ConnectionLost):
+        while True:
+            await connection.read()
+            await connection.write(REPLY)
+
+
+@contextlib.asynccontextmanager
+async def device(faults: Any) -> Any:
+    """On a socket, behind faults; yields how to connect to it."""
+
+    async def client(connection: ByteConnection) -> None:
+        end = FaultyEnd(connection, faults)
+        try:
+            await answers(end)
+        finally:
+            await end.aclose()
+
+    listening = await OsPorts().listen(Endpoint.parse("tcp://127.0.0.1:0"), client, 4)
+    writers: list[asyncio.StreamWriter] = []
+
+    async def connect() -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        reader, writer = await asyncio.open_connection(*listening.bound.address)
+        writers.append(writer)
+        return reader, writer
+
+    try:
+        yield connect
+    finally:
+        for writer in writers:
+            writer.close()
+            with contextlib.suppress(OSError):
+                await writer.wait_closed()
+        await listening.aclose()
+
+
+def test_a_reset_is_one_inside_the_frame() -> None:
+    async def main() -> None:
+        async with device(at_once({"name": "reset", "at": 4, "nth": 2})) as connect:
+            reader, writer = await connect()
+            writer.write(REQUEST)
+            assert await reader.readexactly(len(REPLY)) == REPLY
+            writer.write(REQUEST)
+            with pytest.raises(ConnectionResetError):
+                await reader.read()  # up to the end, which is none
+            again, writer = await connect()
+            writer.write(REQUEST)
+            assert await again.readexactly(len(REPLY)) == REPLY
+
+    run(main())
+
+
+def test_a_device_that_goes_away_ends_its_connections_in_order() -> None:
+    async def main() -> None:
+        faults = at_once()
+        async with device(faults) as connect:
+            reader, writer = await connect()
+            writer.write(REQUEST)
+            assert await reader.readexactly(len(REPLY)) == REPLY
+            for active in at_once({"name": "disconnect"}).active.values():
+                faults.put_in(active)
+            assert await reader.read(100) == b""
+            assert faults.refuses(active.from_ns)
+            assert faults.take_away("disconnect-1")
+            assert not faults.refuses(active.from_ns)
+
+    run(main())
+
+
+def test_half_open_is_silence_until_a_new_connection() -> None:
+    async def main() -> None:
+        async with device(at_once({"name": "half-open", "nth": 1})) as connect:
+            reader, writer = await connect()
+            writer.write(REQUEST)
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(reader.read(1), 0.1)
+            again, writer = await connect()
+            writer.write(REQUEST)
+            assert await again.readexactly(len(REPLY)) == REPLY
+
+    run(main())
+
+
+def test_what_is_split_arrives_in_pieces() -> None:
+    async def main() -> None:
+        async with device(at_once({"name": "split", "at": 3, "pause_ms": 30})) as connect:
+            reader, writer = await connect()
+            writer.write(REQUEST)
+            assert await reader.read(100) == REPLY[:3]
+            assert await reader.read(100) == REPLY[3:]
+
+    run(main())
+
+
+def test_a_pty_hears_what_the_fault_makes_of_it(tmp_path: Path) -> None:
+    async def main() -> None:
+        plant = Endpoint.parse("rtu:/dev/ttyS0?baudrate=19200&frame=8N1")
+        port, _ = await OsPorts().serial(tmp_path / "line", plant, None)
+        end = FaultyEnd(port, at_once({"name": "truncate", "count": 2}, {"name": "reset"}, framing=Framing.RAW))
+        serving = asyncio.create_task(answers(end))
+        other = (tmp_path / "line").open("r+b", buffering=0)
+        try:
+            other.write(REQUEST)
+            heard = await asyncio.to_thread(other.read, 100)
+            assert heard == REPLY[:4]
+            assert isinstance(end.inner, PtyEnd)
+            assert end.lost is None, "a line cannot be reset"
+        finally:
+            other.close()
+            await end.aclose()
+            await serving
+
+    run(main())
+
+
+def test_a_link_puts_faults_between_strangers() -> None:
+    async def main() -> None:
+        async def stranger(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            while await reader.read(100):
+                writer.write(REPLY)
+            writer.close()
+
+        server = await asyncio.start_server(stranger, "127.0.0.1", 0)
+        far = Endpoint.parse(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+        faults = at_once({"name": "exception", "code": 6, "function": 3, "every": 2})
+        link = Link(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
+        await link.open()
+        serving = asyncio.create_task(link.serve())
+        try:
+            reader, writer = await asyncio.open_connection(*link.ends[0].address)
+            for expected in (REPLY, bytes.fromhex("0001 0000 0003 01 83 06"), REPLY):
+                writer.write(REQUEST)
+                assert await reader.readexactly(len(expected)) == expected
+            assert [active.struck for active in faults.active.values()] == [1]
+            writer.close()
+            await eventually(lambda: not link.connected)
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            await link.aclose()
+            server.close()
+            await server.wait_closed()
+
+    run(main())

@@ -19,7 +19,9 @@ from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
 MAX_CLIENTS = 32
 MAX_PENDING_CHUNKS = 16
-"""A chunk is at most what asyncio reads at once (256 KiB): enough for any pipelining, bounded for a flood."""
+READ_BYTES = 8192
+"""A chunk is at most so much: enough for any pipelining, bounded for a flood. asyncio itself makes room for 256 KiB at each
+read, and getting that from the system takes longer than all else that an answer takes."""
 CLOSE_WITHIN_S = 1.0
 HANDSHAKE_WITHIN_S = 10.0
 """Who says nothing when TLS is to begin is gone by then, and never was a client."""
@@ -29,7 +31,7 @@ OnClient = Callable[["SocketEnd"], Awaitable[None]]
 Answer = Callable[[bytes], tuple[bytes, bool]]
 
 
-class SocketEnd(ByteConnection, asyncio.Protocol):
+class SocketEnd(ByteConnection, asyncio.BufferedProtocol):
     """One accepted client. A client that only stopped sending (half-close) still gets its answers."""
 
     def __init__(self, listener: SocketListener, endpoint: Endpoint) -> None:
@@ -45,6 +47,7 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
         self._room: asyncio.Future[None] | None = None
         self._full = False
         self._secured = False
+        self._read_into = bytearray(READ_BYTES)
         self._closed = self._loop.create_future()
         self._answer: Answer | None = None
 
@@ -125,7 +128,11 @@ class SocketEnd(ByteConnection, asyncio.Protocol):
         _keep_alive(transport.get_extra_info("socket"))
         self._listener.connected(self)
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._read_into
+
+    def buffer_updated(self, nbytes: int) -> None:
+        data = bytes(self._read_into[:nbytes])
         self.last_used_s = self._loop.time()
         if self._answer is not None:
             self._give(data)

@@ -53,6 +53,16 @@ class Program:
         self._rest = ""
 
     async def __aenter__(self) -> Program:
+        await self._start()
+        return self
+
+    async def restart(self) -> None:
+        """End it, if it still runs, and start it anew."""
+        await self._end()
+        await self._start()
+
+    async def _start(self) -> None:
+        self._rest = ""
         try:
             self._process = await asyncio.create_subprocess_exec(
                 *self._argv,
@@ -65,7 +75,6 @@ class Program:
         except OSError as e:
             raise UsageError(f"cannot start {self._argv[0]!r}: {e.strerror or e}") from e
         self._task = asyncio.create_task(self._listen(), name="program under test")
-        return self
 
     async def _listen(self) -> None:
         assert self._process is not None
@@ -81,6 +90,9 @@ class Program:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
     ) -> None:
+        await self._end()
+
+    async def _end(self) -> None:
         assert self._process is not None
         assert self._task is not None
         self._task.cancel()

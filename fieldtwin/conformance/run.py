@@ -7,7 +7,7 @@ the reason, what the master did not take part in is inconclusive.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
@@ -94,6 +94,8 @@ class MasterRun(Generic[C]):
     traits: frozenset[str]
     probe: Probe | None = None
     tell: Callable[[CaseResult], None] = lambda result: None
+    restart: Callable[[], Awaitable[None]] | None = None
+    """Starts the program under test anew: what one case broke for good is no matter of the next one."""
     results: list[CaseResult] = field(default_factory=list)
     habit: Habit = field(default_factory=Habit)
 
@@ -183,14 +185,13 @@ class MasterRun(Generic[C]):
         reason = self._not_here(case)
         if reason:
             self._done(case, skipped(reason), since_ns)
-        elif self._ended is not None:
-            self._done(case, inconclusive(f"the master had ended before, exit code {self._ended.status}"), since_ns)
         elif self.plan.for_s and (since_ns - self._started_ns) / NS_PER_S >= self.plan.for_s:
             self._done(case, inconclusive(f"not within {self.plan.for_s:g} s (--for)"), since_ns)
-        elif not await self._well():
-            self._done(
-                case, inconclusive("all was not well before it began: the master did not take honest answers"), since_ns
-            )
+        elif not await self._well() and not await self._well_anew():
+            why = "the master did not take honest answers"
+            if self._ended is not None:
+                why = f"the master had ended, exit code {self._ended.status}"
+            self._done(case, inconclusive(f"all was not well before it began: {why}"), since_ns)
         else:
             self._done(case, await self._play(case), since_ns)
 
@@ -207,6 +208,17 @@ class MasterRun(Generic[C]):
         """Two honest answers were given, and their word is seen."""
         since_ns = self.stage.now_ns()
         return await self._good_again(since_ns)
+
+    async def _well_anew(self) -> bool:
+        """As `_well`, of a program that was started again."""
+        if self.restart is None:
+            return False
+        self._ended = None
+        await self.restart()
+        await self._until(
+            lambda: self.stage.recorder.count(Asked, self.stage.now_ns() - NS_PER_S) > 0, self.plan.wait_s
+        )
+        return await self._well()
 
     async def _good_again(self, since_ns: int) -> bool:
         return await self._until(

@@ -113,6 +113,7 @@ async def _judged(
     program = Program(options.command, theirs, on_text, run.ended)
     try:
         async with program:
+            run.restart = program.restart
             return await run.run()
     finally:
         if run.exit_code is not None:

@@ -241,18 +241,32 @@ class AttachedConnection(TellsOverrun):
         super().__init__(CANConnection(), endpoint, max_pending)
         self._runner = runner
         self._turn = asyncio.Lock()  # keeps the order of concurrent senders
+        self._held_back = 0
         self._room = asyncio.Event()
         self._node = runner.join(self, name)
 
     async def send(self, frame: CanFrame) -> None:
-        async with self._turn:
-            while True:
-                if self.lost is not None:
-                    raise self._loss()
-                if self._runner.submit(self._node, frame):
-                    return
-                self._room.clear()
-                await self._room.wait()
+        if self._lost is not None:
+            raise self._loss()
+        full = False
+        if not self._held_back:  # as a rule nobody waits
+            if self._runner.submit(self._node, frame):
+                return
+            full = True
+        self._held_back += 1
+        try:
+            async with self._turn:
+                while True:
+                    if full:
+                        self._room.clear()
+                        await self._room.wait()
+                    if self._lost is not None:
+                        raise self._loss()
+                    if self._runner.submit(self._node, frame):
+                        return
+                    full = True
+        finally:
+            self._held_back -= 1
 
     def withdraw(self, can_ids: Collection[int]) -> list[CanFrame]:
         """Take back what was sent under `can_ids` and is not on the wire yet, as a controller aborts its mailboxes."""

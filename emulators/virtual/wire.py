@@ -33,13 +33,14 @@ class MemoryWire:
         kind = RS232Connection if serial else TCPConnection
         self.near = MemoryEnd(self, Direction.SENT, kind(), gateway_end)
         self.far = MemoryEnd(self, Direction.RECEIVED, kind(), field_end)
-        self._pacers = {d: SerialPacer(settings) if settings is not None else None for d in Direction}
+        self._sent = SerialPacer(settings) if settings is not None else None
+        self._received = SerialPacer(settings) if settings is not None else None
 
     def write(self, direction: Direction, data: bytes) -> None:
         """`data` is on the wire now, behind what is on it already."""
         if not data:
             return
-        receiver, pacer = self._receiver(direction), self._pacers[direction]
+        receiver, pacer = self._way(direction)
         if pacer is None:
             receiver.arrived(data)
         else:
@@ -47,7 +48,7 @@ class MemoryWire:
 
     def ended(self, direction: Direction) -> None:
         """The writer of `direction` hung up: behind what is on its way, the other side learns of it."""
-        receiver, pacer = self._receiver(direction), self._pacers[direction]
+        receiver, pacer = self._way(direction)
         lost = ConnectionLost("the other side ended the connection", where=str(receiver.endpoint))
         if pacer is None:
             receiver.feed_lost(lost)
@@ -59,8 +60,9 @@ class MemoryWire:
         self.near.cut(error)
         self.far.cut(error)
 
-    def _receiver(self, direction: Direction) -> MemoryEnd:
-        return self.far if direction is Direction.SENT else self.near
+    def _way(self, direction: Direction) -> tuple[MemoryEnd, SerialPacer | None]:
+        """Who receives what goes there, and what times it."""
+        return (self.far, self._sent) if direction is Direction.SENT else (self.near, self._received)
 
     def sender(self, direction: Direction) -> MemoryEnd:
         return self.near if direction is Direction.SENT else self.far

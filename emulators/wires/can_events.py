@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame
 
 
-@dataclass(frozen=True, slots=True)
-class Delivery:
+class Delivery(NamedTuple):
     """One frame that went over the bus. `frame.t_ns` is its end of frame.
 
     `senders` have more than one node only where identical frames overlapped. `receivers` were on the bus at its start.

@@ -21,11 +21,14 @@ from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from gateway.core.nursery import Nursery
-from gateway.core.values import TagValue
+from gateway.core.values import Quality, Reason, TagValue
 from plc.publishing import Change
 from twin.prototype_file import Prototype
 from twin.system import System
 from twin.virtual import VirtualPrototype
+
+_QUALITIES = {quality: quality.name.lower() for quality in Quality}
+_REASONS = {reason: reason.name.lower() for reason in Reason}
 
 
 class VirtualBench:
@@ -100,9 +103,8 @@ class VirtualBench:
     def _put(self, name: str, value: TagValue) -> None:
         self._updates[name] = self._updates.get(name, 0) + 1
         shown = value.value.hex() if isinstance(value.value, bytes) else value.value
-        self.note(
-            Kind.TAG, name, {"value": shown, "quality": value.quality.name.lower(), "reason": value.reason.name.lower()}
-        )
+        quality, reason = _QUALITIES[value.quality], _REASONS[value.reason]
+        self.note(Kind.TAG, name, {"value": shown, "quality": quality, "reason": reason})
 
     def _changed(self, change: Change) -> None:
         self.note(Kind.STATE, change.tag, {"value": self._named(change.tag, change.after)})
@@ -191,13 +193,16 @@ class _FrameTap:
         self._known: dict[int, tuple[Endpoint, str]] = {}
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
-        self._note(Kind.FRAME, self._name(endpoint), {"dir": direction.value, "bytes": data.hex()})
+        self._note(Kind.FRAME, self._name(endpoint), {"dir": direction._value_, "bytes": data.hex()})
 
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
-        data: dict[str, Any] = {"dir": direction.value, "id": frame.can_id, "bytes": frame.data.hex()}
-        for word, is_set in (("rtr", frame.remote), ("ext", frame.extended), ("err", frame.error)):
-            if is_set:
-                data[word] = True
+        data: dict[str, Any] = {"dir": direction._value_, "id": frame.can_id, "bytes": frame.data.hex()}
+        if frame.remote:
+            data["rtr"] = True
+        if frame.extended:
+            data["ext"] = True
+        if frame.error:
+            data["err"] = True
         self._note(Kind.FRAME, self._name(endpoint), data)
 
     def _name(self, endpoint: Endpoint) -> str:

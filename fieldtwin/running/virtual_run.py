@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from emulators.faults.schema import seconds
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.seal import sealed
 from fieldtwin.running.age_oracle import AgeOracle
@@ -38,6 +39,8 @@ PIECE_S = 10.0
 SETTLE_S = 10.0
 """How long a command that is still under way may take after the run's time is over."""
 LAST_REPLIES_S = 0.5
+CALM_S = 60.0
+"""How long after the last fault all must be well again."""
 ASKED_KEPT = 64
 CAN_WIRE_NS = 10 * NS_PER_MS
 """What a frame may need on a CAN bus: several attempts, behind others."""
@@ -111,6 +114,12 @@ class VirtualRun:
     @property
     def disturbed(self) -> bool:
         return bool(self.faults)
+
+    @property
+    def calm(self) -> bool:
+        """Whether every fault was over for `CALM_S` at the end."""
+        ends = (fault.get("until") for fault in self.faults)
+        return all(end is not None and seconds(end) <= self.elapsed_s - CALM_S for end in ends)
 
     def run(self, progress: Callable[[float], None] | None = None) -> None:
         """Run it. `progress` is told the virtual seconds that are over, from time to time. Errors are kept in `errors`."""
@@ -216,9 +225,12 @@ class VirtualRun:
         return put
 
     def _on_event(self, event: Event) -> None:
-        if event.kind is Kind.FRAME and event.data["dir"] == "sent":
-            self._asked.setdefault(event.where, deque(maxlen=ASKED_KEPT)).append(event.t_ns)
-        if event.kind is Kind.STATE and event.where.endswith(".state") and isinstance(event.data["value"], str):
+        if event.kind is Kind.FRAME:
+            if event.data["dir"] == "sent":
+                if event.where not in self._asked:
+                    self._asked[event.where] = deque(maxlen=ASKED_KEPT)
+                self._asked[event.where].append(event.t_ns)
+        elif event.kind is Kind.STATE and event.where.endswith(".state") and isinstance(event.data["value"], str):
             self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
 
     def _judge(self, side: FieldSide) -> None:

@@ -19,6 +19,7 @@ _FORMATS = {
     "int8": ">b", "uint8": ">B", "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q",
     "uint64": ">Q", "float32": ">f", "float64": ">d",
 }  # fmt: skip
+_STRUCTS = {kind: struct.Struct(form) for kind, form in _FORMATS.items()}
 
 
 def reorder(data: bytes, order: str) -> bytes:
@@ -50,8 +51,12 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
         return TagValue(data, Quality.GOOD, Reason.NONE, t_ns, data)
     if tag.type == "bool":
         return TagValue(bool(int.from_bytes(data)), Quality.GOOD, Reason.NONE, t_ns, data)
-    ordered = reorder(data, tag.order)
-    if int.from_bytes(ordered) in tag.sentinels:
+    return _decode_number(tag, reorder(data, tag.order), data, t_ns)
+
+
+def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue:
+    """The value of the big-endian bytes `ordered`, which were `data` on the wire."""
+    if tag.sentinels and int.from_bytes(ordered) in tag.sentinels:
         return TagValue(None, Quality.BAD, Reason.SENTINEL, t_ns, data)
     number = _number(tag, ordered)
     if number is None or not math.isfinite(number):
@@ -70,7 +75,7 @@ def _number(tag: Tag, ordered: bytes) -> int | float | None:
     if tag.bits is not None:
         low, high = tag.bits
         return int.from_bytes(ordered) >> low & (1 << (high - low + 1)) - 1
-    number: int | float = struct.unpack(_FORMATS[tag.type], ordered)[0]
+    number: int | float = _STRUCTS[tag.type].unpack(ordered)[0]
     return number
 
 
@@ -86,7 +91,7 @@ def apply_scale(tag: Tag, value: TagValue, exponent: TagValue | None) -> TagValu
 def decode_little(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     """The value of `tag` from a CANopen object's bytes, which are little endian (CiA 301, 7.1.4)."""
     if tag.type in _FORMATS:
-        return replace(decode(tag, reorder(data[::-1], tag.order), t_ns), raw=data)
+        return _decode_number(tag, data[::-1], data, t_ns)
     return decode(tag, data, t_ns)
 
 

@@ -85,6 +85,11 @@ class RunSession:
         """Whether faults were put in."""
         return bool(self.options.faults)
 
+    @property
+    def calm(self) -> bool:
+        """Whether there were no faults: how long recovery takes is a scenario's to say."""
+        return not self.disturbed
+
     # -- starting -------------------------------------------------------------------------------------------------------
 
     async def __aenter__(self) -> RunSession:

@@ -79,7 +79,12 @@ class Run(Protocol):
 
     @property
     def disturbed(self) -> bool:
-        """Whether faults were put in: then both sides need not count alike, and devices may be gone in the end."""
+        """Whether faults were put in: then both sides need not count alike."""
+        ...
+
+    @property
+    def calm(self) -> bool:
+        """Whether the last fault was over for so long that all must be well again."""
         ...
 
 
@@ -89,7 +94,7 @@ def summarise(run: Run) -> dict[str, Any]:
     plc = run.plc_status or {}
     exchanges = _exchanges(run)
     checks = [*_plc_checks(plc), *_loss_checks(gateway)]
-    if not run.disturbed:
+    if run.calm:
         checks = [*_device_checks(gateway), *_output_checks(gateway), *checks]
     if run.options.prototype:
         checks += _oracle_checks(run) + ([] if run.disturbed else _exchange_checks(exchanges) + _state_checks(run))

@@ -163,7 +163,7 @@ class FieldSide:
                 serve_rtu(end, line_of(plant, units), self._clock, latency_s, echo=echo), f"emulators on {bus.name}"
             )
         elif listen.scheme == "udp":
-            datagrams = await self._ports.datagrams(listen)
+            datagrams = self.faults.on_datagrams(bus.name, await self._ports.datagrams(listen))
             self._listeners.append(datagrams)
             self.listening[bus.name] = datagrams.bound
             slave = MbapSlave(units)

@@ -13,6 +13,8 @@ from typing import Any
 from emulators.distortion import Distortions
 from emulators.endpoints.faulty import FaultyEnd
 from emulators.endpoints.faulty_can import FaultyCan, bus_rule
+from emulators.endpoints.faulty_udp import FaultyDatagrams
+from emulators.endpoints.ports import Datagrams
 from emulators.faults.can_fault import BusFault
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active, Aim, Fault, Kind, ValueFault
@@ -52,6 +54,10 @@ class FieldFaults:
         """An emulator's end of a line or socket, behind the faults of its bus."""
         return FaultyEnd(connection, self._buses[bus])
 
+    def on_datagrams(self, bus: str, socket: Datagrams) -> FaultyDatagrams:
+        """An emulator's UDP socket, behind the faults of its bus."""
+        return FaultyDatagrams(socket, self._buses[bus])
+
     def on_can(self, bus: str, connection: CanConnection, node: int) -> FaultyCan:
         """A node's end of a bus, behind the faults of that bus."""
         return FaultyCan(connection, self._buses[bus], node)
@@ -84,7 +90,7 @@ class FieldFaults:
         active = Active(
             spec.id,
             fault,
-            spec.aim,
+            self._aim(spec),
             Random(f"{self._seed} {spec.id}"),
             self.start_ns + round(spec.from_s * NS_PER_S),
             until_ns,
@@ -178,9 +184,19 @@ class FieldFaults:
             return (spec.aim.unit,)
         return (self._system.devices[spec.aim.device].address,) if spec.aim.device else ()
 
+    def _aim(self, spec: FaultSpec) -> Aim:
+        """A tag of a CANopen device is its object."""
+        aim = spec.aim
+        if spec.kind.kind is not Kind.CAN or not aim.register_:
+            return aim
+        if not aim.device:
+            raise UsageError("a register is one of a device", expected="device: NAME")
+        at = self._tag(aim.device, aim.register_).object
+        return aim if at is None else aim.model_copy(update={"index": at[0]})
+
     def _addresses(self, spec: FaultSpec) -> range | None:
         aim = spec.aim
-        if issubclass(spec.kind, ValueFault):
+        if spec.kind.kind is not Kind.BYTES:
             return None
         if aim.register_:
             if not aim.device:

@@ -15,12 +15,18 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from emulators.faults.fault import Aim, Fault
+from emulators.faults.fault import Aim, Fault, Kind
 from emulators.faults.registry import fault_class
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.yaml_file import Key, YamlFile, load
 
 _AIM_KEYS = tuple(info.alias or name for name, info in Aim.model_fields.items())
+_NOT_OF = {
+    Kind.BYTES: frozenset({"cob_id", "index"}),
+    Kind.CAN: frozenset({"function", "address"}),
+    Kind.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until"},
+}
+"""What of an aim means nothing to a kind of fault."""
 _DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|min|h)?$")
 _UNIT_S = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "h": 3600.0}
 MOST = 10_000
@@ -72,7 +78,7 @@ def parse_fault(
     except UsageError as e:
         raise wrong("name", e.message, expected=e.expected, hint=e.hint) from e
     own = tuple(kind.form.model_fields)
-    known = ("id", "name", *_AIM_KEYS, *own)
+    known = ("id", "name", *(key for key in _AIM_KEYS if key not in _NOT_OF[kind.kind]), *own)
     for key in said:
         if key not in known:
             near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)

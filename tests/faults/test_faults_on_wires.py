@@ -11,15 +11,21 @@ import pytest
 from support import eventually, run
 
 from emulators.endpoints.faulty import FaultyEnd
+from emulators.endpoints.faulty_udp import FaultyDatagrams
 from emulators.endpoints.ports import OsPorts
 from emulators.endpoints.pty import PtyEnd
 from emulators.faults.frames import Framing
 from emulators.faults.on_link import wire_faults
 from emulators.link import Link
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.serve import serve_udp
+from emulators.modbus.unit import ModbusUnit
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import ByteConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost
+from gateway.wallclock import WallClock
 
 REQUEST = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
 REPLY = bytes.fromhex("0001 0000 0005 01 03 02 002A")
@@ -172,5 +178,40 @@ def test_a_link_puts_faults_between_strangers() -> None:
             await link.aclose()
             server.close()
             await server.wait_closed()
+
+    run(main())
+
+
+def test_datagrams() -> None:
+    async def main() -> None:
+        faults = at_once(
+            {"name": "drop", "direction": "request", "nth": 1},
+            {"name": "delay", "by_ms": 5},
+            {"name": "duplicate", "every": 2},
+        )
+        device = FaultyDatagrams(await OsPorts().datagrams(Endpoint.parse("udp://127.0.0.1:0")), faults)
+        slave = MbapSlave({1: ModbusUnit(MapBank([Span("holding", 0, 1)]))})
+        serving = asyncio.create_task(serve_udp(device, slave, WallClock()))
+        heard: asyncio.Queue[bytes] = asyncio.Queue()
+
+        class Asking(asyncio.DatagramProtocol):
+            def datagram_received(self, data: bytes, addr: Any) -> None:
+                heard.put_nowait(data)
+
+        transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+            Asking, remote_addr=device.bound.address
+        )
+        try:
+            answer = bytes.fromhex("0001 0000 0005 01 03 02 0000")
+            for expected in (0, 1, 2):
+                transport.sendto(REQUEST)
+                for _ in range(expected):
+                    assert await asyncio.wait_for(heard.get(), 5) == answer
+            assert [active.struck for active in faults.active.values()] == [1, 2, 1]
+        finally:
+            transport.close()
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            await device.aclose()
 
     run(main())

@@ -1,0 +1,102 @@
+"""An emulator's UDP socket with faults on it: each datagram is a frame. There is no connection that a fault could end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+
+from emulators.endpoints.ports import Datagrams
+from emulators.faults.engine import WireFaults
+from emulators.faults.fault import Outcome, Piece
+from emulators.faults.frames import Way, understood
+from gateway.core.clock import NS_PER_S
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost
+
+MOST_WAITING = 1_000
+"""Datagrams that were heard and not yet taken; what is more is lost, as a socket loses it."""
+
+Heard = tuple[bytes, tuple[str, int]]
+
+
+class FaultyDatagrams(Datagrams):
+    """`inner` behind `faults`. Close it instead of `inner`."""
+
+    def __init__(self, inner: Datagrams, faults: WireFaults) -> None:
+        self._inner = inner
+        self._faults = faults
+        self._loop = asyncio.get_running_loop()
+        self._heard: asyncio.Queue[Heard | ConnectionLost] = asyncio.Queue(MOST_WAITING)
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._asked: dict[tuple[str, int], int] = {}
+        self._listening = self._loop.create_task(self._listen(), name=f"datagrams at {inner.bound}")
+
+    @property
+    def bound(self) -> Endpoint:
+        return self._inner.bound
+
+    async def receive(self) -> Heard:
+        heard = await self._heard.get()
+        if isinstance(heard, ConnectionLost):
+            raise heard
+        return heard
+
+    async def send(self, data: bytes, peer: tuple[str, int]) -> None:
+        frame = replace(understood(Way.REPLY, self._faults.framing, data), address=self._asked.pop(peer, -1))
+        outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
+        for piece in (outcome or Outcome((Piece(data),))).pieces:
+            if piece.back:
+                self._pass_in(piece.data, peer)
+            elif piece.delay_s > 0:
+                self._later(piece, self._send, peer)
+            else:
+                await self._inner.send(piece.data, peer)
+
+    async def aclose(self) -> None:
+        for task in (self._listening, *self._tasks):
+            task.cancel()
+        await asyncio.gather(self._listening, *self._tasks, return_exceptions=True)
+        await self._inner.aclose()
+
+    def _pass_in(self, data: bytes, peer: tuple[str, int]) -> None:
+        if not self._heard.full():
+            self._heard.put_nowait((data, peer))
+
+    def _send(self, data: bytes, peer: tuple[str, int]) -> None:
+        if len(self._tasks) < MOST_WAITING:
+            task = self._loop.create_task(self._send_quietly(data, peer), name="a fault's datagram")
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+    async def _send_quietly(self, data: bytes, peer: tuple[str, int]) -> None:
+        with contextlib.suppress(ConnectionLost):  # it was too late
+            await self._inner.send(data, peer)
+
+    def _later(self, piece: Piece, then: Callable[[bytes, tuple[str, int]], None], peer: tuple[str, int]) -> None:
+        """`then`, when the piece's time has come, unless it went by itself meanwhile."""
+
+        def due() -> None:
+            if not self._listening.done() and (piece.gone is None or not piece.gone()):
+                then(piece.data, peer)
+
+        self._loop.call_later(piece.delay_s, due)
+
+    async def _listen(self) -> None:
+        try:
+            while True:
+                data, peer = await self._inner.receive()
+                frame = understood(Way.REQUEST, self._faults.framing, data)
+                if len(self._asked) < MOST_WAITING:
+                    self._asked[peer] = frame.address
+                outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
+                for piece in (outcome or Outcome((Piece(data),))).pieces:
+                    if piece.back:
+                        self._send(piece.data, peer)
+                    elif piece.delay_s > 0:
+                        self._later(piece, self._pass_in, peer)
+                    else:
+                        self._pass_in(piece.data, peer)
+        except ConnectionLost as e:
+            await self._heard.put(e)

@@ -83,7 +83,7 @@ def publishes_nothing_bad(seen: Observation) -> Finding | None:
 
 def publishes_good_again(seen: Observation) -> Finding | None:
     """Once the device is well, its value is seen again."""
-    if seen.probed and not any(shown.word is seen.after for shown in seen.of(Shown, seen.over_ns)):
+    if seen.probed and not any(shown.word is seen.last for shown in seen.of(Shown, seen.over_ns)):
         waited = (seen.until_ns - seen.over_ns) / NS_PER_S
         return failed(f"the honest value was not published within {waited:.1f} s after the last odd answer")
     return None
@@ -116,7 +116,7 @@ def took_odd_answer(seen: Observation) -> Finding | None:
     return None
 
 
-accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, took_odd_answer)
+accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, took_odd_answer, publishes_good_again)
 either = all_of(*DUTIES, needs_probe)
 """Taken or discarded, both are right; a wrong value is not."""
 

@@ -119,8 +119,8 @@ class Habit:
 @dataclass(frozen=True)
 class Observation:
     """One case. `begun_ns`: the first request that was misanswered; `over_ns`: the last odd thing that the device did, from
-    then on it was honest; `until_ns`: when the case stopped looking. `before` and `after` are the words that honest answers
-    held before and behind that. `timeout_s`: the master's response timeout as its user says, 0 where nobody said.
+    then on it was honest; `until_ns`: when the case stopped looking. `before` is the word that was held before, `after`
+    the one from `begun_ns` on, in odd frames too where those are to be taken, `last` the one from `over_ns` on. `timeout_s`: the master's response timeout as its user says, 0 where nobody said.
     """
 
     events: tuple[Event, ...]
@@ -130,6 +130,7 @@ class Observation:
     habit: Habit = field(default_factory=Habit)
     before: Word = Word.FIRST
     after: Word = Word.SECOND
+    last: Word = Word.SECOND
     probed: bool = False
     timeout_s: float = 0.0
     patience_s: float = 10.0

@@ -250,7 +250,8 @@ class MasterRun(Generic[C]):
         await self._until(done, self.plan.patience_s)
         stage.end()
         await self._until(lambda: stage.pending == 0, self.plan.patience_s)
-        self._say(after)
+        last = before if case.holds_good else after
+        self._say(last)
         over_ns = stage.now_ns() if case.holds_good else max(stage.last_ns, stage.first_ns)
         await self._good_again(over_ns)
         while stage.last_ns > over_ns:  # a transfer under way went on
@@ -260,7 +261,7 @@ class MasterRun(Generic[C]):
         until_ns = stage.now_ns()
         events = stage.recorder.since(stage.first_ns)
         seen = Observation(
-            events, stage.first_ns, over_ns, until_ns, self.habit, before, after,
+            events, stage.first_ns, over_ns, until_ns, self.habit, before, after, last,
             self.probe is not None, self.plan.timeout_s, self.plan.patience_s,
         )  # fmt: skip
         return case.about.judge(seen)

@@ -120,7 +120,8 @@ class Habit:
 class Observation:
     """One case. `begun_ns`: the first request that was misanswered; `over_ns`: the last odd thing that the device did, from
     then on it was honest; `until_ns`: when the case stopped looking. `before` is the word that was held before, `after`
-    the one from `begun_ns` on, in odd frames too where those are to be taken, `last` the one from `over_ns` on. `timeout_s`: the master's response timeout as its user says, 0 where nobody said.
+    the one from `begun_ns` on, in odd frames too where those are to be taken, `last` the one from `over_ns` on.
+    `timeout_s`: the master's response timeout as its user says, 0 where nobody said.
     """
 
     events: tuple[Event, ...]

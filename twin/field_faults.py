@@ -19,7 +19,7 @@ from emulators.faults.can_fault import BusFault
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active, Aim, Fault, Kind, ValueFault
 from emulators.faults.frames import Framing
-from emulators.faults.schema import FaultSpec, parse_fault
+from emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, parse_fault
 from emulators.faults.set_value import Form, SetValue
 from emulators.wires.can_faults import Rule
 from gateway.core.clock import NS_PER_S, Clock
@@ -86,6 +86,7 @@ class FieldFaults:
             raise UsageError("too many faults at once", expected=f"at most {MOST}")
         fault = spec.make()
         bus = self._bus_of(spec, fault)
+        addresses, functions = self._addresses(spec)
         until_ns = None if spec.until_s is None else self.start_ns + round(spec.until_s * NS_PER_S)
         active = Active(
             spec.id,
@@ -95,7 +96,8 @@ class FieldFaults:
             self.start_ns + round(spec.from_s * NS_PER_S),
             until_ns,
             units=self._units(spec),
-            addresses=self._addresses(spec),
+            addresses=addresses,
+            functions=functions,
         )
         self._put(spec, active, bus)
         self._active[spec.id] = (spec, active, bus)
@@ -194,23 +196,17 @@ class FieldFaults:
         at = self._tag(aim.device, aim.register_).object
         return aim if at is None else aim.model_copy(update={"index": at[0]})
 
-    def _addresses(self, spec: FaultSpec) -> range | None:
+    def _addresses(self, spec: FaultSpec) -> tuple[range | None, frozenset[int]]:
+        """Of Modbus: which addresses are meant, and the functions of their table."""
         aim = spec.aim
         if spec.kind.kind is not Kind.BYTES:
-            return None
+            return None, frozenset()
         if aim.register_:
             if not aim.device:
                 raise UsageError("a register is one of a device", expected="device: NAME")
             at = self._tag(aim.device, aim.register_).registers
-            return range(at.address, at.end)
-        if aim.address is None:
-            return None
-        text = str(aim.address).rpartition(":")[2]
-        try:
-            address = int(text, 0)
-        except ValueError:
-            raise UsageError("an address", expected="a number, or holding:0x10", got=repr(aim.address)) from None
-        return range(address, address + 1)
+            return range(at.address, at.end), FUNCTIONS_OF[at.table]
+        return (None, frozenset()) if aim.address is None else addressed(aim.address)
 
     def _tag(self, device: str, tag: str) -> Tag:
         self._known("device", device, list(self._system.devices))

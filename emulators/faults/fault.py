@@ -160,6 +160,8 @@ class Active:
     units: Sequence[int] = field(default_factory=tuple)
     """Units that `device` and `bus` stand for; none: all."""
     addresses: range | None = None
+    functions: frozenset[int] = frozenset()
+    """Those of the table that the addresses are in; none: all."""
 
     def strikes(self, frame: Frame, now_ns: int) -> bool:
         """Whether it strikes this frame; counts what matches."""
@@ -174,6 +176,8 @@ class Active:
         if self.units and frame.unit not in self.units and not nobody_knows:
             return False
         if aim.function is not None and frame.function != aim.function:
+            return False
+        if self.functions and frame.function not in self.functions:
             return False
         if self.addresses is not None and frame.address not in self.addresses:
             return False

@@ -9,7 +9,7 @@ from typing import Any
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active, Kind
 from emulators.faults.frames import Framing
-from emulators.faults.schema import parse_fault
+from emulators.faults.schema import addressed, parse_fault
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import UsageError
 
@@ -27,13 +27,7 @@ def wire_faults(said: Iterable[Mapping[str, Any]], framing: Framing, seed: int, 
             )
         if aim.device or aim.bus or aim.register_:
             raise UsageError(f"fault {spec.id}: a link knows no names", expected="unit, function, address")
-        addresses = None
-        if aim.address is not None:
-            try:
-                address = int(str(aim.address).rpartition(":")[2], 0)
-            except ValueError:
-                raise UsageError("an address", expected="a number, or holding:0x10", got=repr(aim.address)) from None
-            addresses = range(address, address + 1)
+        addresses, functions = (None, frozenset[int]()) if aim.address is None else addressed(aim.address)
         until_ns = None if spec.until_s is None else start_ns + round(spec.until_s * NS_PER_S)
         faults.put_in(
             Active(
@@ -45,6 +39,7 @@ def wire_faults(said: Iterable[Mapping[str, Any]], framing: Framing, seed: int, 
                 until_ns,
                 units=() if aim.unit is None else (aim.unit,),
                 addresses=addresses,
+                functions=functions,
             )
         )
     return faults

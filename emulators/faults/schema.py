@@ -124,3 +124,24 @@ def load_faults(path: Path) -> tuple[dict[str, Any], ...]:
             raise file.error(("faults", n, "id"), f"the id {spec.id!r} stands twice")
         found[spec.id] = {**one, "id": spec.id}
     return tuple(found.values())
+
+
+FUNCTIONS_OF = {
+    "coil": frozenset({1, 5, 15}),
+    "discrete": frozenset({2}),
+    "input": frozenset({4}),
+    "holding": frozenset({3, 6, 16, 22, 23, 24}),
+}
+"""Table to the function codes that address it."""
+
+
+def addressed(address: str | int) -> tuple[range, frozenset[int]]:
+    """The PDU address that ``0x10`` or ``holding:0x10`` is, and the functions of its table. Raises `UsageError`."""
+    table, _, number = str(address).rpartition(":")
+    try:
+        at = int(number, 0)
+    except ValueError:
+        at = -1
+    if not 0 <= at <= 0xFFFF or (table and table not in FUNCTIONS_OF):
+        raise UsageError("an address", expected="a number, or holding:0x10", got=repr(address))
+    return range(at, at + 1), FUNCTIONS_OF.get(table, frozenset())

@@ -244,11 +244,21 @@ def test_no_number() -> None:
 
 def active(**aim: Any) -> Active:
     addresses = aim.pop("addresses", None)
-    units = aim.pop("units", ())
+    units, functions = aim.pop("units", ()), aim.pop("functions", frozenset())
     until_ns = aim.pop("until_ns", None)
     from_ns = aim.pop("from_ns", 0)
     fault = made("drop")
-    return Active("x", fault, Aim(**aim), Random("seed x"), from_ns, until_ns, units=units, addresses=addresses)
+    return Active(
+        "x",
+        fault,
+        Aim(**aim),
+        Random("seed x"),
+        from_ns,
+        until_ns,
+        units=units,
+        addresses=addresses,
+        functions=functions,
+    )
 
 
 REQUEST = understood(Way.REQUEST, Framing.RTU, line("1103 0010 0002"))
@@ -272,6 +282,8 @@ def hits(fault: Active, times: int = 8, frame: Frame = REQUEST) -> list[int]:
         ({"function": 4}, []),
         ({"addresses": range(0x10, 0x11), "nth": 1}, [1]),
         ({"addresses": range(0x11, 0x20)}, []),
+        ({"addresses": range(0x10, 0x11), "functions": frozenset({3, 6}), "nth": 1}, [1]),
+        ({"addresses": range(0x10, 0x11), "functions": frozenset({4})}, []),
         ({"direction": "reply"}, []),
         ({"direction": "request", "nth": 1}, [1]),
         ({"direction": "both", "nth": 1}, [1]),

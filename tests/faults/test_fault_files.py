@@ -68,6 +68,8 @@ def test_times() -> None:
         ({"name": "bus-off"}, "CAN buses"),
         ({"name": "drop", "device": "ctd"}, "a link knows no names"),
         ({"name": "drop", "address": "here"}, "an address"),
+        ({"name": "drop", "address": "coils:1"}, "an address"),
+        ({"name": "drop", "address": "70000"}, "an address"),
     ],
 )
 def test_a_link_knows_neither_names_nor_values(said: dict[str, str], told: str) -> None:

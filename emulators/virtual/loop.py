@@ -128,17 +128,22 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def call_later(
         self, delay: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        return self.call_at_ns(self.now_ns + round(delay * NS_PER_S), callback, *args, context=context)
+        return self._at(self.now_ns + round(delay * NS_PER_S), callback, args, context)
 
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        return self.call_at_ns(round(when * NS_PER_S), callback, *args, context=context)
+        return self._at(round(when * NS_PER_S), callback, args, context)
 
     def call_at_ns(
         self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
         """As `call_at`, to the nanosecond. What is past is due at this instant, behind what is ready."""
+        return self._at(when_ns, callback, args, context)
+
+    def _at(
+        self, when_ns: int, callback: Callable[..., object], args: tuple[Any, ...], context: Context | None
+    ) -> _Timer:
         timer = _Timer(when_ns, callback, args, self, context)
         self._sequence += 1
         now_ns = self.now_ns
@@ -237,21 +242,22 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def _advance(self) -> None:
         timers = self._timers
-        while timers and timers[0][2].cancelled():
-            self._cancelled -= isinstance(heappop(timers)[2], _Timer)
-        if not timers:
-            raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
-        self.now_ns = now_ns = timers[0][0]
-        while timers and timers[0][0] == now_ns:
-            due = heappop(timers)[2]
+        now_ns = None
+        while timers and (now_ns is None or timers[0][0] == now_ns):
+            when_ns, _, due = heappop(timers)
             if isinstance(due, _Timer):
                 due._scheduled = False
                 if due._cancelled:
                     self._cancelled -= 1
-                else:
-                    self._ready.append(due)
-            elif not due.done():
+                    continue
+                self._ready.append(due)
+            elif due.done():
+                continue
+            else:
                 due.set_result(None)
+            self.now_ns = now_ns = when_ns
+        if now_ns is None:
+            raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
 
     def _who_waits(self) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())

@@ -204,7 +204,13 @@ class CanBus:
                 self._wire.attempt(start)
 
     def _upcoming(self) -> Start | None:
-        if self._next is None and self._wire.waiting:
+        if self._next is None and len(self._wire.waiting) == 1:  # no arbitration, as a rule
+            ((number, node),) = self._wire.waiting.items()
+            winner = node.queue[0]
+            start_ns = max(self._wire.free_ns, winner.ready_ns, node.hold_ns)
+            end_ns = start_ns + self._wire.duration_ns(bits_to_end(winner.frame))
+            self._next = Start(start_ns, end_ns, winner, [number])
+        elif self._next is None and self._wire.waiting:
             heads = [(max(node.queue[0].ready_ns, node.hold_ns), number) for number, node in self._wire.waiting.items()]
             start_ns = max(self._wire.free_ns, min(heads)[0])
             contenders = [number for ready_ns, number in heads if ready_ns <= start_ns]

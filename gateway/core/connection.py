@@ -109,7 +109,8 @@ class _End(Generic[T]):
         self.inbound.write(item)
         if self.on_arrival is not None:
             self.on_arrival(item)
-        self._wake()
+        if self._waiter is not None:
+            self._wake()
         return len(self.inbound.data_stream) < self.max_pending
 
     def feed_lost(self, error: FieldtwinError) -> None:

@@ -5,7 +5,7 @@ Pure: times are monotonic nanoseconds, passed in. It must never know a connectio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 
 from gateway.core.clock import NS_PER_S
@@ -83,16 +83,15 @@ class Turns:
         """
         best: tuple[int, int, int] | None = None
         found: tuple[DeviceState | None, str] = None, ""  # a bus without polls only carries jobs
-        new = any(not device.tried for device in self._devices)
         for order, device in enumerate(self._devices):
             if not device.online:
-                if new and device.tried:
+                if device.tried and any(not d.tried for d in self._devices):
                     continue  # first those that were not asked at all
-                choices = [("", self._try_ns(device))]
+                choices: Iterable[tuple[str, int]] = (("", self._try_ns(device)),)
             elif device.reading is not None:
-                choices = [(device.reading.what, device.reading_due_ns)]
+                choices = ((device.reading.what, device.reading_due_ns),)
             else:
-                choices = list(device.schedule.due_ns.items())
+                choices = device.schedule.due_ns.items()
             ready_ns = max(now_ns, spaced_ns(device.unit))
             for group, due_ns in choices:
                 key = max(due_ns, ready_ns), due_ns, order

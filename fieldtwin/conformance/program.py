@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import termios
 from collections import deque
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -31,6 +32,18 @@ def environment(endpoint: Endpoint) -> dict[str, str]:
     return env
 
 
+def _flush(tty: str) -> None:
+    """A pty keeps what nobody read; a serial port that is closed does not."""
+    try:
+        descriptor = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError:
+        return  # the other end of a real line
+    try:
+        termios.tcflush(descriptor, termios.TCIOFLUSH)
+    finally:
+        os.close(descriptor)
+
+
 class Program:
     """``async with Program(argv, endpoint, on_text, on_end)``. Ends it, with all that it started, on leaving.
 
@@ -46,6 +59,7 @@ class Program:
     ) -> None:
         self.said: deque[str] = deque(maxlen=LAST_LINES)
         self._argv = argv
+        self._endpoint = endpoint
         self._env = {**os.environ, "PYTHONUNBUFFERED": "1", **environment(endpoint)}
         self._on_text, self._on_end = on_text, on_end
         self._process: asyncio.subprocess.Process | None = None
@@ -59,6 +73,8 @@ class Program:
     async def restart(self) -> None:
         """End it, if it still runs, and start it anew."""
         await self._end()
+        if self._endpoint.is_serial:
+            _flush(self._endpoint.path)
         await self._start()
 
     async def _start(self) -> None:

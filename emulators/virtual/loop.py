@@ -49,6 +49,7 @@ class _Call(asyncio.Handle):
     _args: tuple[Any, ...]
     _context: Context
     _cancelled: bool
+    _repr = _source_traceback = None  # of the debug mode
 
     def __init__(
         self, callback: Callable[..., object], args: tuple[Any, ...], loop: VirtualLoop, context: Context | None
@@ -58,7 +59,6 @@ class _Call(asyncio.Handle):
         self._context = copy_context() if context is None else context
         self._cancelled = False
         self._loop = loop
-        self._repr = self._source_traceback = None
 
 
 class _Timer(asyncio.TimerHandle):
@@ -69,6 +69,7 @@ class _Timer(asyncio.TimerHandle):
     _args: tuple[Any, ...]
     _context: Context
     _cancelled: bool
+    _repr = _source_traceback = None  # of the debug mode
 
     def __init__(
         self,
@@ -83,7 +84,6 @@ class _Timer(asyncio.TimerHandle):
         self._context = copy_context() if context is None else context
         self._cancelled = False
         self._loop = loop
-        self._repr = self._source_traceback = None
         self._when = when_ns / NS_PER_S
         self._scheduled = True  # as asyncio's own loops do: cancel() then tells us
 
@@ -145,9 +145,9 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self, when_ns: int, callback: Callable[..., object], args: tuple[Any, ...], context: Context | None
     ) -> _Timer:
         timer = _Timer(when_ns, callback, args, self, context)
-        self._sequence += 1
+        self._sequence = sequence = self._sequence + 1
         now_ns = self.now_ns
-        heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, self._sequence, timer))
+        heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, sequence, timer))
         return timer
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
@@ -221,24 +221,23 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def _run_instant(self) -> None:
         """All that is ready, and what that makes ready, then on to the next timer's instant."""
-        ready, pop, budget = self._ready, self._ready.popleft, STUCK_AFTER
-        while ready:
+        ready, pop, run = self._ready, self._ready.popleft, 0
+        while ready and not self._stopping:
             handle = pop()
-            if not handle._cancelled:
-                try:
-                    handle._context.run(handle._callback, *handle._args)
-                except (SystemExit, KeyboardInterrupt):
-                    raise
-                except BaseException as e:  # as asyncio does: nobody else is there to catch it
-                    self.call_exception_handler({"message": f"in {handle}", "exception": e, "handle": handle})
-                budget -= 1
-            if self._stopping:
-                self.callbacks += STUCK_AFTER - budget
-                return
-            if budget <= 0:
+            if handle._cancelled:
+                continue
+            try:
+                handle._context.run(handle._callback, *handle._args)
+            except (SystemExit, KeyboardInterrupt):
+                raise
+            except BaseException as e:  # as asyncio does: nobody else is there to catch it
+                self.call_exception_handler({"message": f"in {handle}", "exception": e, "handle": handle})
+            run += 1
+            if run == STUCK_AFTER:
                 raise Deadlock("time stands still: callbacks call each other at one instant", got=str(handle))
-        self.callbacks += STUCK_AFTER - budget
-        self._advance()
+        self.callbacks += run
+        if not self._stopping:
+            self._advance()
 
     def _advance(self) -> None:
         timers = self._timers

@@ -141,7 +141,8 @@ def modbus_master(
         waivers_path,
         junit,
         as_json,
-        str(listen),
+        listen,
+        plan.only,
     )
 
 
@@ -227,7 +228,14 @@ def canopen_master(
         size=int(size), nodes=frozenset(nodes), heartbeat_s=heartbeat_s, bitrate=bitrate,
     )  # fmt: skip
     return _judged(
-        lambda listener: judge_canopen_master(options, listener), Listener, cases, waivers_path, junit, as_json, listen
+        lambda listener: judge_canopen_master(options, listener),
+        Listener,
+        cases,
+        waivers_path,
+        junit,
+        as_json,
+        listen,
+        plan.only,
     )
 
 
@@ -249,6 +257,7 @@ def _judged(
     junit: Path | None,
     as_json: bool,
     title: str,
+    only: frozenset[str],
 ) -> int:
     """Run it, show what was found, write the file. The exit code."""
     from fieldtwin.cli.check_view import Progress, print_results
@@ -260,7 +269,7 @@ def _judged(
     known = {case.id for case in cases} | {case.row for case in cases}
     waivers = load_waivers(waivers_path, known) if waivers_path else Waivers()
     started = datetime.now(UTC)
-    with Progress(len(cases)) as progress:
+    with Progress(sum(case.chosen(only) for case in cases)) as progress:
         found: list[CaseResult] = run(judge(listener_type(progress.say, progress.tell)))
     results = [waive(result, waivers, started.date()) for result in found]
     if junit is not None:

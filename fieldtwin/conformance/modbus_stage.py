@@ -92,9 +92,8 @@ class Stage:
         self.recorder.add(event)
         self.on_event()
 
-    def moves(self, wire: ModbusWire, request: bytes, tag: int) -> list[Move]:
-        """What is done about a request: honest, or what the play says."""
-        now_ns = self.now_ns()
+    def moves(self, wire: ModbusWire, request: bytes, tag: int, now_ns: int) -> list[Move]:
+        """What is done about a request that came at `now_ns`: honest, or what the play says."""
         true = self.device.answer(request[1:], now_ns)
         case = self.play
         if request[0] == 0 and isinstance(wire, RtuWire):
@@ -139,7 +138,7 @@ class _Client:
             now_ns = self._stage.now_ns()
             for request, tag in self._wire.cut(data, now_ns):
                 self._stage.note(Asked(now_ns, self._number, request, tag))
-                self._answer(self._stage.moves(self._wire, request, tag), now_ns)
+                self._answer(self._stage.moves(self._wire, request, tag, now_ns), now_ns)
             self._dirty = bool(data)
             if garbage := self._wire.garbage():
                 self._stage.note(Garbled(now_ns, self._number, data[-garbage:]))

@@ -112,6 +112,28 @@ def test_a_reader_that_is_cancelled_loses_nothing() -> None:
     run(main())
 
 
+def test_a_read_within_a_time_gives_what_arrives_or_nothing() -> None:
+    async def main() -> None:
+        end = End()
+        end.feed(b"here")
+        assert await end.read_within(0.0) == b"here", "what is there needs no time"
+        assert await end.read_within(0.001) == b""
+        asyncio.get_running_loop().call_later(0.001, end.feed, b"later")
+        assert await end.read_within(5.0) == b"later"
+        assert end.rooms == 2
+        reading = asyncio.create_task(end.read_within(5.0))
+        await asyncio.sleep(0)
+        with pytest.raises(Bug, match="two readers"):
+            await end.read_within(5.0)
+        end.feed_lost(ConnectionLost("cable pulled"))
+        with pytest.raises(ConnectionLost, match="cable pulled"):
+            await reading
+        with pytest.raises(ConnectionLost, match="cable pulled"):
+            await end.read_within(5.0)
+
+    run(main())
+
+
 def test_what_arrived_is_read_before_the_loss_and_the_first_reason_stays() -> None:
     async def main() -> None:
         end = End()

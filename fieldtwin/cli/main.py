@@ -27,6 +27,7 @@ COMMANDS = {
     "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),
     "check": ("fieldtwin.cli.check_command", "Judge a Modbus or CANopen master: hostile devices, verdicts, waivers."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
+    "test": ("fieldtwin.cli.test_command", "Run scenarios against a prototype, and judge it."),
     "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),
     "trace": ("fieldtwin.cli.trace_command", "What happened in a run: frames in words, JSON, or waveforms."),
     "schema": ("fieldtwin.cli.schema_command", "Print the JSON schema of a kind of file."),

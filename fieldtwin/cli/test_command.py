@@ -1,0 +1,137 @@
+"""`fieldtwin test`: scenarios, judged; a table for people, JSON, JUnit and HTML for others."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+
+import click
+from rich.markup import escape
+from rich.table import Table
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.cli.talk import data
+from gateway.core.errors import UsageError
+
+SUFFIX = ".scenario.yaml"
+_COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
+
+
+@click.command("test")
+@click.argument("files", nargs=-1, type=click.Path(exists=True))
+@click.option("--target", type=click.Choice(["virtual"]), default="virtual", help="Where; default: virtual.")
+@click.option("--seed", type=int, default=None, help="Another seed than the scenario's.")
+@click.option("--junit", type=click.Path(dir_okay=False), help="JUnit XML to this file.")
+@click.option("--html", type=click.Path(dir_okay=False), help="One page with verdicts and diagrams to this file.")
+@click.option(
+    "--trace", type=click.Path(dir_okay=False), help="Every event of a single scenario to this file (JSON lines)."
+)
+@profiles_option
+@json_option
+def command(
+    files: tuple[str, ...],
+    target: str,
+    seed: int | None,
+    junit: str | None,
+    html: str | None,
+    trace: str | None,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Run the scenarios in FILES (*.scenario.yaml; of a folder all that are in it; without FILES those of this folder).
+
+    The exit code is 0 when all passed and 1 otherwise: a scenario that was skipped or stayed inconclusive has not passed.
+    """
+    from fieldtwin.report.model import Report, ScenarioResult, Verdict
+    from fieldtwin.running.virtual_scenario import run_virtual
+    from fieldtwin.scenarios.form import load_scenario
+
+    paths = _found(files)
+    if trace and len(paths) != 1:
+        raise UsageError("--trace belongs to one scenario", got=f"{len(paths)} of them")
+    scenarios = [load_scenario(path, tuple(map(Path, profiles))) for path in paths]
+    results: list[ScenarioResult] = []
+    for scenario in scenarios:
+        results.append(run_virtual(scenario, seed, Path(trace) if trace else None))
+        if not as_json:
+            _show(results[-1])
+    report = Report(
+        "scenarios",
+        results,
+        scenarios[0].system,
+        target,
+        seed,
+        reproduce=shlex.join(["fieldtwin", *sys.argv[1:]]),
+        versions={"fieldtwin": __version__},
+        served=(),
+    )
+    if junit:
+        from fieldtwin.report.junit import write_junit
+
+        write_junit(report, Path(junit))
+    if html:
+        from fieldtwin.report.html import write_html
+
+        write_html(report, Path(html))
+    if as_json:
+        json.dump([_plain(result) for result in results], sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        counts = ", ".join(f"{n} {verdict.value}" for verdict, n in report.counts.items() if n)
+        data.print(f"[bold]{counts}[/bold]")
+    return 0 if report.verdict is Verdict.PASSED else 1
+
+
+def _found(files: tuple[str, ...]) -> list[Path]:
+    paths: list[Path] = []
+    for name in files or (".",):
+        path = Path(name)
+        paths += sorted(path.rglob(f"*{SUFFIX}")) if path.is_dir() else [path]
+    if not paths:
+        raise UsageError("no scenarios", expected=f"files that end in {SUFFIX}")
+    return paths
+
+
+def _show(result: object) -> None:
+    from fieldtwin.report.model import ScenarioResult, Verdict
+
+    assert isinstance(result, ScenarioResult)
+    colour = _COLOUR[result.verdict.value]
+    took = f"[dim]{result.simulated_s:g} s in {result.took_s:.1f} s[/dim]"
+    data.print(f"[{colour}]{result.verdict.value}[/{colour}]  {escape(result.title)}  {took}", soft_wrap=True)
+    if result.verdict is Verdict.PASSED:
+        return
+    if result.reason:
+        data.print(f"  {escape(result.reason)}", soft_wrap=True)
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for check in result.checks:
+        if check.verdict is not Verdict.PASSED:
+            table.add_row("  expected", escape(check.expected))
+            table.add_row("  got", escape(check.got))
+            table.add_row("  at", f"{(check.t_ns or 0) / 1e9:.3f} s, {escape(check.where)}")
+    data.print(table)
+    data.print(f"  {escape(result.reproduce)}", soft_wrap=True)
+
+
+def _plain(result: object) -> dict[str, object]:
+    from fieldtwin.report.model import ScenarioResult
+
+    assert isinstance(result, ScenarioResult)
+    return {
+        "name": result.name,
+        "verdict": result.verdict.value,
+        "seed": result.seed,
+        "target": result.target,
+        "reason": result.reason,
+        "requirements": list(result.requirements),
+        "simulated_s": result.simulated_s,
+        "trace": result.trace_hash,
+        "reproduce": result.reproduce,
+        "checks": [
+            {"number": c.number, "text": c.text, "verdict": c.verdict.value, "expected": c.expected, "got": c.got}
+            for c in result.checks
+        ],
+    }

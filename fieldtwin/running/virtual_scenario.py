@@ -1,0 +1,72 @@
+"""A scenario on the target `virtual`: a prototype in virtual time, in this thread, sealed off while it runs."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.seal import sealed
+from fieldtwin.report.coverage import Collector
+from fieldtwin.report.machines import machines_of
+from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.scenarios.form import Scenario
+from fieldtwin.scenarios.runner import Runner
+from fieldtwin.scenarios.trace import Trace
+from gateway.core.errors import FieldtwinError
+from gateway.wallclock import WallClock
+from twin.prototype_file import load_prototype
+
+
+def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | None = None) -> ScenarioResult:
+    """Run it. `seed` before the scenario's own and the prototype file's."""
+    prototype = load_prototype(scenario.system, _prototype(scenario))
+    chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else prototype.seed
+    collector = Collector(scenario.system, machines_of(scenario.system))
+    began_ns = WallClock().monotonic_ns()
+    loop = VirtualLoop()
+    error = ""
+    result: ScenarioResult | None = None
+    with tempfile.TemporaryDirectory(prefix="ft-scenario-") as folder:
+        sink = trace_file.open("wb") if trace_file is not None else None
+        trace = Trace(sink=sink)
+        trace.listeners.append(collector.feed)
+
+        async def main() -> ScenarioResult:
+            async with VirtualBench(scenario.system, prototype, loop, Path(folder), trace, seed=chosen) as bench:
+                return await Runner(scenario, bench).run()
+
+        try:
+            with sealed():
+                result = loop.run_until_complete(main())
+        except FieldtwinError as e:
+            error = str(e)
+        finally:
+            loop.close()
+            if sink is not None:
+                sink.close()
+    if result is None:
+        result = ScenarioResult(
+            scenario.form.scenario,
+            Verdict.ERROR,
+            requirements=tuple(scenario.form.requirements),
+            file=str(scenario.path),
+            line=1,
+            target="virtual",
+            reason=error,
+            trace=tuple(trace.events),
+        )
+    return replace(
+        result,
+        seed=chosen,
+        reproduce=f"fieldtwin test {scenario.path} --seed {chosen}",
+        took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
+        counts=collector.finish(),
+    )
+
+
+def _prototype(scenario: Scenario) -> Path | None:
+    named = scenario.form.prototype
+    return None if named is None else scenario.path.parent / named

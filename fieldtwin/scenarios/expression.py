@@ -1,0 +1,159 @@
+"""What a scenario asserts: ``quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s``.
+
+A small part of Python's expressions, read with its parser and evaluated here; nothing is ever executed. Names are tags and
+programs' variables; numbers may have a unit of time and are then seconds.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import operator
+import re
+from collections.abc import Callable, Collection
+from typing import Any
+
+from gateway.core.errors import UsageError
+
+FUNCTIONS = ("quality", "age", "value", "updates", "reason")
+"""Of a tag: its quality in words, seconds since its source's time, its value, how often it was published, why it is bad."""
+OWN = ("plc.late", "command pending")
+"""``plc.late``: by how many seconds the last scan was late; ``command pending``: the far end commanded within 5 s."""
+LONGEST = 1000
+DEEPEST = 50
+_UNIT_S = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0}
+_TOKEN = re.compile(r"""('[^']*'|"[^"]*")|(\d+(?:\.\d+)?)\s*(ms|min|s|h)\b|(command pending)""")
+_COMPARE: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
+    ast.Eq: operator.eq,
+    ast.NotEq: operator.ne,
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+_ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
+
+Look = Callable[[str, str], Any]
+"""``look(function, name)``: what is known of a tag or variable now; None where nothing is."""
+
+
+class Expression:
+    """`text`, read once. `names`: the tags and variables that it is about. Raises `UsageError` for what it is not."""
+
+    def __init__(self, text: str, known: Collection[str]) -> None:
+        self.text = text
+        self.names: list[str] = []
+        self._known = known
+        if len(text) > LONGEST:
+            raise UsageError("too long an expression", expected=f"at most {LONGEST} characters")
+        try:
+            self._tree = ast.parse(_TOKEN.sub(_plain, text).strip(), mode="eval").body
+        except (SyntaxError, ValueError, RecursionError) as e:
+            raise UsageError("no expression", got=text, hint="for example: relay.state == 'ACTIVE'") from e
+        self._check(self._tree, 0)
+
+    def evaluate(self, look: Look) -> Any:
+        """Its value now. What compares with something unknown is False, but `!=`, which is True."""
+        return _value(self._tree, look)
+
+    def _check(self, node: ast.expr, depth: int) -> None:
+        if depth > DEEPEST:
+            raise UsageError("an expression nested too deep", got=self.text)
+        if isinstance(node, ast.BoolOp):
+            parts: list[ast.expr] = node.values
+        elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.USub):
+            parts = [node.operand]
+        elif isinstance(node, ast.BinOp) and type(node.op) in _ARITHMETIC:
+            parts = [node.left, node.right]
+        elif isinstance(node, ast.Compare) and all(type(op) in _COMPARE for op in node.ops):
+            parts = [node.left, *node.comparators]
+        elif isinstance(node, ast.Call):
+            self._check_call(node)
+            return
+        elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float | str):
+            return
+        elif isinstance(node, ast.Name | ast.Attribute):
+            self._check_name(_dotted(node))
+            return
+        else:
+            raise UsageError(
+                "not understood", got=ast.unparse(node), expected="names, numbers, texts, comparisons, and, or, not"
+            )
+        for part in parts:
+            self._check(part, depth + 1)
+
+    def _check_call(self, node: ast.Call) -> None:
+        name = _dotted(node.func)
+        if name not in FUNCTIONS or len(node.args) != 1 or node.keywords:
+            near = difflib.get_close_matches(name, FUNCTIONS, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else ""
+            raise UsageError(f"no function {name!r}", expected=", ".join(f"{f}(TAG)" for f in FUNCTIONS), hint=hint)
+        self._check_name(_dotted(node.args[0]))
+
+    def _check_name(self, name: str) -> None:
+        if name in ("true", "false", "plc.late", "command_pending"):
+            return
+        if name not in self._known:
+            near = difflib.get_close_matches(name, self._known, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else ""
+            raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE", hint=hint)
+        self.names.append(name)
+
+
+def _plain(match: re.Match[str]) -> str:
+    text, number, unit, pending = match.groups()
+    if text is not None:
+        return str(text)
+    return "command_pending" if pending else f"({float(number) * _UNIT_S[unit]!r})"
+
+
+def _dotted(node: ast.expr) -> str:
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute):
+        return f"{_dotted(node.value)}.{node.attr}"
+    raise UsageError("not a name", got=ast.unparse(node))
+
+
+def _value(node: ast.expr, look: Look) -> Any:
+    if isinstance(node, ast.Constant):
+        return node.value
+    if isinstance(node, ast.Name | ast.Attribute):
+        name = _dotted(node)
+        return name == "true" if name in ("true", "false") else look("value", name)
+    if isinstance(node, ast.Call):
+        return look(_dotted(node.func), _dotted(node.args[0]))
+    if isinstance(node, ast.BoolOp):
+        values = (bool(_value(part, look)) for part in node.values)
+        return all(values) if isinstance(node.op, ast.And) else any(values)
+    if isinstance(node, ast.UnaryOp):
+        inner = _value(node.operand, look)
+        return not inner if isinstance(node.op, ast.Not) else None if inner is None else -inner
+    if isinstance(node, ast.BinOp):
+        a, b = _value(node.left, look), _value(node.right, look)
+        try:
+            return None if a is None or b is None else _ARITHMETIC[type(node.op)](a, b)
+        except (TypeError, ZeroDivisionError):
+            return None
+    assert isinstance(node, ast.Compare)
+    left = _value(node.left, look)
+    for op, comparator in zip(node.ops, node.comparators, strict=True):
+        right = _value(comparator, look)
+        if not _holds(type(op), left, right):
+            return False
+        left = right
+    return True
+
+
+def _holds(op: type[ast.cmpop], left: Any, right: Any) -> bool:
+    if left is None or right is None:
+        return (op is ast.NotEq) != (left is right and op is ast.Eq)
+    try:
+        return bool(_COMPARE[op](left, right))
+    except TypeError:
+        return op is ast.NotEq

@@ -1,0 +1,235 @@
+"""The scenario file as it is written: strict, every error with file, line, column and the nearest known word."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from emulators.faults.schema import parse_fault, seconds
+from fieldtwin.scenarios.bench import Can
+from fieldtwin.scenarios.expression import Expression
+from gateway.core.errors import UsageError
+from gateway.core.yaml_file import Key, YamlFile, load, validate
+from twin.system import System, load_system
+
+Time = str | float | int
+Number = float | int
+
+
+class _Form(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, populate_by_name=True)
+
+
+class Send(_Form):
+    """The far end commands a period."""
+
+    from_: str = Field(default="shore", alias="from")
+    period_s: int
+
+
+class Set(_Form):
+    """A device holds a value: DEVICE.TAG; null: what it says by itself again."""
+
+    tag: str
+    value: Number | bool | str | None
+
+
+class Wait(_Form):
+    until: str
+    within: Time = 5
+
+
+class Bounds(_Form):
+    min: Number | None = None
+    max: Number | None = None
+
+
+class WireForm(_Form):
+    """What is seen on a device's wire."""
+
+    wire: str
+    access: Annotated[str, Field(pattern="^(read|write)$")] | None = None
+    function: int | None = None
+    register_: str | None = Field(default=None, alias="register")
+    value: Number | None = None
+    unless: str | None = None
+
+
+class Expect(_Form):
+    """One thing that must be so. `tag` and its kin, or `wire` and its kin, or `that`."""
+
+    tag: str | None = None
+    value: Number | bool | str | None = None
+    tolerance: Number = 0
+    quality: str | None = None
+    like: Annotated[str, Field(pattern="^recording$")] | None = None
+    updates_per_s: tuple[Number, Number] | list[Number] | None = None
+    wire: str | None = None
+    access: Annotated[str, Field(pattern="^(read|write)$")] | None = None
+    function: int | None = None
+    register_: str | None = Field(default=None, alias="register")
+    times: int | Bounds | None = None
+    requests_per_s: Bounds | None = None
+    that: str | None = None
+    within: Time | None = None
+    during: Time | None = None
+
+
+class Step(_Form):
+    """One of these."""
+
+    send: Send | None = None
+    set: Set | None = None
+    fault: dict[str, Any] | None = None
+    clear: str | None = None
+    wait: Wait | None = None
+    expect: Expect | None = None
+    pause: Time | None = None
+
+
+class ScenarioForm(_Form):
+    scenario: str = Field(min_length=1, max_length=200)
+    about: str = ""
+    requirements: list[str] = []
+    system: str
+    prototype: str | None = None
+    seed: int | None = None
+    needs: list[str] = []
+    always: list[str] = []
+    never: list[str | WireForm] = []
+    steps: list[Step] = Field(min_length=1, max_length=10_000)
+
+
+WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause")
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A scenario file, checked against its system."""
+
+    path: Path
+    form: ScenarioForm
+    file: YamlFile
+    system: System
+    needs: tuple[Can, ...]
+    always: tuple[Expression, ...]
+    never: tuple[Expression | WireForm, ...]
+
+    def line(self, *loc: Key) -> str:
+        """FILE:LINE of a part of it."""
+        line, _ = self.file.positions.get(loc, (1, 1))
+        return f"{self.path}:{line}"
+
+    def expression(self, text: str, *loc: Key) -> Expression:
+        """`text` as an expression. Raises `FileInvalid` at its spot."""
+        try:
+            return Expression(text, names_of(self.system))
+        except UsageError as e:
+            raise self.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+
+
+def names_of(system: System) -> list[str]:
+    """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE."""
+    from twin.physical import image_layout
+
+    tags = [f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()]
+    variables = [spec.name for region in image_layout(system).regions for spec in region.tags]
+    return list(dict.fromkeys([*tags, *variables]))
+
+
+def word_of(step: Step) -> str:
+    """Which of the words a step is."""
+    return next(word for word in WORDS if getattr(step, word) is not None)
+
+
+def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
+    """Read and check. Raises `FileInvalid`, `UsageError`."""
+    file = load(path)
+    form = validate(file, ScenarioForm)
+    beside = path.parent / form.system
+    system = load_system(str(beside) if beside.exists() else form.system.removesuffix(".yaml"), list(profiles))
+    scenario = Scenario(path, form, file, system, _needs(file, form), (), ())
+    always = tuple(scenario.expression(text, "always", n) for n, text in enumerate(form.always))
+    never: list[Expression | WireForm] = []
+    for n, one in enumerate(form.never):
+        if isinstance(one, str):
+            never.append(scenario.expression(one, "never", n))
+        else:
+            _known(file, ("never", n, "wire"), "device", one.wire, list(system.devices))
+            if one.unless is not None:
+                scenario.expression(one.unless, "never", n, "unless")
+            never.append(one)
+    scenario = Scenario(path, form, file, system, scenario.needs, always, tuple(never))
+    for n, step in enumerate(form.steps):
+        _check_step(scenario, step, n)
+    return scenario
+
+
+def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
+    words = [can.value for can in Can]
+    for n, need in enumerate(form.needs):
+        _known(file, ("needs", n), "need", need, words)
+    asked = [Can(need) for need in form.needs]
+    for step in form.steps:
+        word = word_of(step) if any(getattr(step, w) is not None for w in WORDS) else ""
+        implied = {"send": Can.SEND_COMMAND, "set": Can.SET_VALUE, "fault": Can.INJECT_FAULT, "clear": Can.INJECT_FAULT}
+        if word in implied:
+            asked.append(implied[word])
+        if step.expect is not None and step.expect.wire is not None:
+            asked.append(Can.SEE_WIRE)
+    return tuple(dict.fromkeys(asked))
+
+
+def _check_step(scenario: Scenario, step: Step, n: int) -> None:
+    file, loc = scenario.file, ("steps", n)
+    said = [word for word in WORDS if getattr(step, word) is not None]
+    if len(said) != 1:
+        raise file.error(loc, "a step is one thing", expected=" or ".join(WORDS), got=", ".join(said) or "nothing")
+    try:
+        if step.fault is not None:
+            spec = parse_fault(step.fault, file, (*loc, "fault"), n + 1)
+            for word, name in (("device", spec.aim.device), ("bus", spec.aim.bus)):
+                known = list(scenario.system.devices if word == "device" else scenario.system.buses)
+                if name:
+                    _known(file, (*loc, "fault", word), word, name, known)
+        if step.wait is not None:
+            scenario.expression(step.wait.until, *loc, "wait", "until")
+            seconds(step.wait.within)
+        if step.pause is not None:
+            seconds(step.pause)
+        if step.set is not None:
+            _known(file, (*loc, "set", "tag"), "tag", step.set.tag, names_of(scenario.system))
+        if step.expect is not None:
+            _check_expect(scenario, step.expect, (*loc, "expect"))
+    except UsageError as e:
+        raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+
+
+def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> None:
+    said = [word for word in ("tag", "wire", "that") if getattr(expect, word) is not None]
+    if len(said) != 1:
+        raise scenario.file.error(loc, "an expectation is about one thing", expected="tag, wire or that")
+    if expect.tag is not None:
+        _known(scenario.file, (*loc, "tag"), "tag", expect.tag, names_of(scenario.system))
+    if expect.wire is not None:
+        devices = scenario.system.devices
+        _known(scenario.file, (*loc, "wire"), "device", expect.wire, list(devices))
+        if expect.register_ is not None:
+            _known(scenario.file, (*loc, "register"), "tag", expect.register_, list(devices[expect.wire].profile.tags))
+    if expect.that is not None:
+        scenario.expression(expect.that, *loc, "that")
+    for time in (expect.within, expect.during):
+        if time is not None:
+            seconds(time)
+
+
+def _known(file: YamlFile, loc: tuple[Key, ...], what: str, name: str, known: list[str]) -> None:
+    if name in known:
+        return
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]!r}?" if near else ""
+    raise file.error(loc, f"no {what} {name!r}", expected=", ".join(known) if len(known) < 30 else "", hint=hint)

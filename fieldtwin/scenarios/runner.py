@@ -1,0 +1,284 @@
+"""Runs a scenario on a bench: step after step, while what must always and never hold is looked at.
+
+A step that fails ends the scenario; what comes behind it was not reached. It knows no target: what one cannot do is SKIPPED, what
+its host's lateness makes worthless INCONCLUSIVE, and neither ever passes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from emulators.faults.schema import seconds
+from fieldtwin.decoding.decoder import Decoder
+from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
+from fieldtwin.scenarios.bench import Bench, Can
+from fieldtwin.scenarios.expectation import Watched, judge_tag, judge_wire
+from fieldtwin.scenarios.expression import Expression
+from fieldtwin.scenarios.form import Expect, Scenario, Step, WireForm, word_of
+from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.errors import UsageError
+
+TICK_S = 0.02
+"""How often is looked while something is waited for."""
+PENDING_S = 5.0
+KEPT = 20_000
+_NS = 1_000_000_000
+
+
+@dataclass
+class _Broken(Exception):
+    """A check that says no: the verdict, what was expected, what came."""
+
+    verdict: Verdict
+    expected: str
+    got: str
+
+
+class Runner:
+    """One scenario on one bench. ``await run()`` once."""
+
+    def __init__(self, scenario: Scenario, bench: Bench) -> None:
+        self.scenario = scenario
+        self.bench = bench
+        self.results: list[CheckResult] = []
+        self.exchanges: deque[Exchange] = deque(maxlen=KEPT)
+        self._decoder = Decoder(scenario.system)
+        self._always = [
+            (f"always {n}", text, e, True) for n, (text, e) in _numbered(scenario.form.always, scenario.always)
+        ]
+        self._never = list(enumerate(scenario.never, 1))
+        self._stimulus_s = 0.0
+        self._sent_s = -PENDING_S
+        self._watched: deque[Exchange] = deque()
+        self._excused: list[bool] = []
+        bench.trace.listeners.append(self._on_event)
+
+    def missing(self) -> list[Can]:
+        """What the scenario needs and the bench cannot do."""
+        return [need for need in self.scenario.needs if need not in self.bench.can]
+
+    async def run(self) -> ScenarioResult:
+        """All steps. Never raises for what the system does; raises what a bench raises that is gone."""
+        scenario, form = self.scenario, self.scenario.form
+        lacking = self.missing()
+        verdict, reason = Verdict.PASSED, ""
+        if lacking:
+            verdict = Verdict.SKIPPED
+            reason = f"the target {self.bench.target} cannot {', '.join(need.value for need in lacking)}"
+        else:
+            for n, step in enumerate(form.steps):
+                result = await self._step(n, step)
+                self.results.append(result)
+                if result.verdict is not Verdict.PASSED:
+                    verdict, reason = result.verdict, f"step {result.number}: {result.text}"
+                    break
+            if verdict is Verdict.PASSED:
+                self._hold_to_the_end()
+        return ScenarioResult(
+            form.scenario,
+            verdict,
+            tuple(self.results),
+            tuple(form.requirements),
+            str(scenario.path),
+            1,
+            self.bench.target,
+            reason=reason,
+            simulated_s=self.bench.now_s(),
+            trace=tuple(self.bench.trace.events),
+            trace_hash=self.bench.trace.hexdigest(),
+            dropped=self.bench.trace.dropped,
+        )
+
+    # -- steps ----------------------------------------------------------------------------------------------------------
+
+    async def _step(self, n: int, step: Step) -> CheckResult:
+        word, since_s = word_of(step), self.bench.now_s()
+        text = f"{word}: {_said(getattr(step, word))}"
+        self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text})
+        expected = got = ""
+        verdict = Verdict.PASSED
+        names: list[str] = []
+        try:
+            names = await self._do(n, word, step) or []
+        except _Broken as broken:
+            verdict, expected, got = broken.verdict, broken.expected, broken.got
+        except UsageError as e:
+            verdict, got = Verdict.ERROR, str(e)
+        result = CheckResult(
+            str(n + 1),
+            text,
+            verdict,
+            self._now_ns(),
+            round(since_s * _NS),
+            expected,
+            got,
+            where=self.scenario.line("steps", n),
+            names=tuple(names),
+        )
+        self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text, "verdict": verdict.value})
+        return result
+
+    async def _do(self, n: int, word: str, step: Step) -> list[str] | None:
+        bench = self.bench
+        if word in ("send", "set", "fault", "clear"):
+            self._stimulus_s = bench.now_s()
+        if step.send is not None:
+            self._sent_s = bench.now_s()
+            await bench.send(step.send.period_s)
+        elif step.set is not None:
+            device, _, tag = step.set.tag.partition(".")
+            await bench.set_value(device, tag, step.set.value)
+        elif step.fault is not None:
+            await bench.inject({"id": f"step {n + 1}", **step.fault})
+        elif step.clear is not None:
+            await bench.clear(step.clear)
+        elif step.pause is not None:
+            await self._until(bench.now_s() + seconds(step.pause))
+        elif step.wait is not None:
+            expression = self.scenario.expression(step.wait.until, "steps", n, "wait", "until")
+            await self._wait(expression, seconds(step.wait.within))
+            return expression.names
+        elif step.expect is not None:
+            return await self._expect(n, step.expect)
+        return None
+
+    async def _wait(self, expression: Expression, within_s: float) -> None:
+        deadline_s = self.bench.now_s() + within_s
+        while not expression.evaluate(self._look):
+            if self.bench.now_s() >= deadline_s:
+                raise _Broken(Verdict.FAILED, f"{expression.text} within {within_s:g} s", self._seen(expression.names))
+            await self._tick(deadline_s)
+
+    async def _expect(self, n: int, expect: Expect) -> list[str]:
+        within_s = seconds(expect.within) if expect.within is not None else 0.0
+        during_s = seconds(expect.during) if expect.during is not None else 0.0
+        if expect.that is not None:
+            expression = self.scenario.expression(expect.that, "steps", n, "expect", "that")
+            await self._wait(expression, within_s)
+            await self._throughout(expression, during_s)
+            return expression.names
+        watched = Watched(self.bench, self.scenario.system, self.bench.now_s(), self._stimulus_s, self.exchanges)
+        if expect.wire is not None:
+            await self._until(self.bench.now_s() + max(within_s, during_s))
+            said = judge_wire(expect, watched)
+            if said is not None:
+                raise _Broken(Verdict.FAILED, *said)
+            return [expect.wire]
+        assert expect.tag is not None
+        if expect.updates_per_s is not None:
+            await self._until(self.bench.now_s() + max(during_s, 1.0))
+        deadline_s = self.bench.now_s() + within_s
+        while (said := await judge_tag(expect, watched)) is not None:
+            if self.bench.now_s() >= deadline_s or expect.updates_per_s is not None:
+                raise _Broken(Verdict.FAILED, *said)
+            await self._tick(deadline_s)
+        return [expect.tag]
+
+    async def _throughout(self, expression: Expression, during_s: float) -> None:
+        end_s = self.bench.now_s() + during_s
+        while self.bench.now_s() < end_s:
+            await self._tick(end_s)
+            if not expression.evaluate(self._look):
+                raise _Broken(Verdict.FAILED, f"{expression.text} for {during_s:g} s", self._seen(expression.names))
+
+    # -- time, and what holds all the time --------------------------------------------------------------------------------
+
+    async def _until(self, t_s: float) -> None:
+        while self.bench.now_s() < t_s:
+            await self._tick(t_s)
+
+    async def _tick(self, at_most_s: float) -> None:
+        await self.bench.sleep_until_s(min(self.bench.now_s() + TICK_S, max(at_most_s, self.bench.now_s() + 0.001)))
+        for number, text, expression, _ in self._always:
+            if not expression.evaluate(self._look):
+                late = "plc.late" in text and Can.EXACT_TIME not in self.bench.can
+                raise _Broken(
+                    Verdict.INCONCLUSIVE if late else Verdict.FAILED, f"{number}: {text}", self._seen(expression.names)
+                )
+        for n, one in self._never:
+            if isinstance(one, Expression) and one.evaluate(self._look):
+                raise _Broken(Verdict.FAILED, f"never {n}: {one.text}", self._seen(one.names))
+        excused = [self._is_excused(one) for _, one in self._never]
+        while self._watched:
+            exchange = self._watched.popleft()
+            for (n, one), now, before in zip(self._never, excused, self._excused or excused, strict=True):
+                if isinstance(one, WireForm) and not (now or before) and self._forbidden(one, exchange):
+                    raise _Broken(Verdict.FAILED, f"never {n}: {_said(one)}", exchange.text)
+        self._excused = excused
+
+    def _is_excused(self, one: Expression | WireForm) -> bool:
+        """Whether `unless` holds: what was seen since the last look may be older than this moment."""
+        if not isinstance(one, WireForm) or one.unless is None:
+            return False
+        return bool(self.scenario.expression(one.unless, "never").evaluate(self._look))
+
+    def _forbidden(self, form: WireForm, exchange: Exchange) -> bool:
+        if exchange.device != form.wire or (form.function is not None and exchange.function != form.function):
+            return False
+        if form.access is not None and form.access not in exchange.access:
+            return False
+        if form.register_ is not None and form.register_ not in exchange.tags:
+            return False
+        return form.value is None or exchange.tags.get(form.register_ or "") == form.value
+
+    def _hold_to_the_end(self) -> None:
+        """What held all the time is said so, once."""
+        now_ns = self._now_ns()
+        for number, text, expression, _ in self._always:
+            self.results.append(CheckResult(number, text, Verdict.PASSED, now_ns, 0, names=tuple(expression.names)))
+        for n, one in self._never:
+            text = one.text if isinstance(one, Expression) else _said(one)
+            self.results.append(CheckResult(f"never {n}", text, Verdict.PASSED, now_ns, 0))
+
+    def _on_event(self, event: Event) -> None:
+        if event.kind is Kind.FRAME:
+            for exchange in self._decoder.feed(event):
+                self.exchanges.append(exchange)
+                if any(isinstance(one, WireForm) for _, one in self._never):
+                    self._watched.append(exchange)
+
+    # -- what is known ----------------------------------------------------------------------------------------------------
+
+    def _now_ns(self) -> int:
+        return round(self.bench.now_s() * _NS)
+
+    def _look(self, function: str, name: str) -> Any:
+        if name == "plc.late":
+            return self.bench.late_ms() / 1000
+        if name == "command_pending":
+            return self.bench.now_s() - self._sent_s <= PENDING_S
+        reading = self.bench.reading(name)
+        if reading is None:
+            return {"quality": "bad", "reason": "never read", "updates": 0}.get(function)
+        if function == "age":
+            return reading.age_s
+        return getattr(reading, function)
+
+    def _seen(self, names: Iterable[str]) -> str:
+        told = []
+        for name in dict.fromkeys(names):
+            reading = self.bench.reading(name)
+            shown = (
+                "never published"
+                if reading is None
+                else f"{reading.value!r} {reading.quality}, {reading.age_s:.3f} s old"
+            )
+            told.append(f"{name}: {shown}")
+        return "; ".join(told)
+
+
+def _numbered(texts: list[str], expressions: tuple[Expression, ...]) -> Iterable[tuple[int, tuple[str, Expression]]]:
+    return enumerate(zip(texts, expressions, strict=True), 1)
+
+
+def _said(part: Any) -> str:
+    """A step's own words."""
+    if hasattr(part, "model_dump"):
+        part = part.model_dump(exclude_none=True, exclude_defaults=True, by_alias=True)
+    if isinstance(part, dict):
+        return ", ".join(f"{key} {_said(value)}" for key, value in part.items())
+    return str(part)

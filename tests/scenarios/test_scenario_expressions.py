@@ -1,0 +1,91 @@
+"""What scenarios assert: read strictly, evaluated without executing anything, false where nothing is known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fieldtwin.scenarios.expression import Expression
+from gateway.core.errors import UsageError
+
+KNOWN = ["ctd.pressure", "ctd.status", "relay.state"]
+NOW: dict[tuple[str, str], Any] = {
+    ("value", "ctd.pressure"): 5.5,
+    ("quality", "ctd.pressure"): "good",
+    ("age", "ctd.pressure"): 1.2,
+    ("updates", "ctd.pressure"): 7,
+    ("value", "relay.state"): "ACTIVE",
+    ("value", "plc.late"): 0.002,
+    ("value", "command_pending"): True,
+}
+
+
+def look(function: str, name: str) -> Any:
+    return NOW.get((function, name))
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("relay.state == 'ACTIVE'", True),
+        ("relay.state != 'ACTIVE'", False),
+        ("quality(ctd.pressure) != 'good' or age(ctd.pressure) <= 1.5 s", True),
+        ("age(ctd.pressure) <= 1100 ms", False),
+        ("age(ctd.pressure) < 0.1 min and ctd.pressure > 5", True),
+        ("5 < ctd.pressure < 6", True),
+        ("not (ctd.pressure + 1 == 6.5)", False),
+        ("-ctd.pressure * 2 == -11", True),
+        ("plc.late < 5 ms", True),
+        ("command pending and updates(ctd.pressure) == 7", True),
+        ("ctd.status > 0", False),  # nothing is known of it
+        ("ctd.status == 0", False),
+        ("ctd.status != 0", True),
+        ("ctd.pressure / 0 == 1", False),
+        ("relay.state > 5", False),
+        ("'5 s' == '5 s'", True),
+        ("true and not false", True),
+    ],
+)
+def test_values(text: str, value: bool) -> None:
+    assert Expression(text, KNOWN).evaluate(look) is value
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("ctd.presure > 1", "did you mean 'ctd.pressure'"),
+        ("qualty(ctd.pressure) == 'good'", "did you mean 'quality'"),
+        ("ctd.pressure >", "no expression"),
+        ("__import__('os').system('true')", "not a name"),
+        ("[x for x in ctd.pressure]", "not understood"),
+        ("ctd.pressure if true else 1", "not understood"),
+        ("ctd.pressure ** 9", "not understood"),
+        ("quality(ctd.pressure, 1)", "no function"),
+        ("(" * 300 + "1" + ")" * 300, "expression"),
+        ("-" * 200 + "1", "nested too deep"),
+        ("1" * 2000, "too long"),
+    ],
+)
+def test_what_is_refused(text: str, told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        Expression(text, KNOWN)
+
+
+@given(st.text(max_size=60))
+@settings(max_examples=300, deadline=None)
+def test_any_text_is_an_expression_or_refused(text: str) -> None:
+    try:
+        expression = Expression(text, KNOWN)
+    except UsageError:
+        return
+    expression.evaluate(look)
+
+
+def test_it_says_what_it_is_about() -> None:
+    assert Expression("quality(ctd.pressure) == 'good' and relay.state == 'OFF'", KNOWN).names == [
+        "ctd.pressure",
+        "relay.state",
+    ]

@@ -1,0 +1,128 @@
+"""Scenarios against the observatory in virtual time: what passes, what fails and says why, what is refused before it starts."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from fieldtwin.cli.test_command import command
+from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.running.virtual_scenario import run_virtual
+from fieldtwin.scenarios.form import load_scenario
+from gateway.core.errors import FileInvalid
+
+SHIPPED = sorted((Path(__file__).resolve().parents[2] / "profiles" / "systems").glob("*.scenario.yaml"))
+
+
+def written(folder: Path, steps: str, head: str = "") -> Path:
+    path = folder / "x.scenario.yaml"
+    path.write_text(f"scenario: a test\nsystem: observatory\n{head}steps:\n{steps}")
+    return path
+
+
+def run(folder: Path, steps: str, head: str = "") -> ScenarioResult:
+    return run_virtual(load_scenario(written(folder, steps, head)))
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.name)
+def test_shipped_scenarios_pass_and_give_the_same_trace_again(path: Path) -> None:
+    first, second = (run_virtual(load_scenario(path)) for _ in range(2))
+    assert first.verdict is Verdict.PASSED, first.checks
+    assert first.trace_hash == second.trace_hash
+
+
+ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"relay.state == 'ACTIVE'\", within: 10s}\n"
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected", "got"),
+    [
+        ("  - wait: {until: \"relay.state == 'ACTIVE'\", within: 1s}\n", "within 1 s", "STANDBY"),
+        ("  - expect: {tag: relay.state, value: ACTIVE, within: 1s}\n", "ACTIVE", "STANDBY"),
+        ("  - pause: 2s\n  - expect: {tag: inclinometer.slope_long, quality: bad}\n", "bad", "good"),
+        ("  - expect: {tag: inclinometer.slope_long, updates_per_s: [1, 2], during: 5s}\n", "1 to 2", "9"),
+        ("  - expect: {wire: ctd, requests_per_s: {max: 1}, during: 5s}\n", "at most 1", "3"),
+        ("  - expect: {wire: ctd, function: 16, times: 3, within: 2s}\n", "3 times", "1"),
+        (ACTIVE + "  - expect: {wire: ctd, register: sample_period_s, value: 2, within: 1s}\n", "at least 1", "none"),
+        (
+            "  - pause: 2s\n  - set: {tag: ctd.pressure, value: 1}\n  - expect: {that: 'ctd.pressure == 1', within: 1s}\n",
+            "",
+            "",
+        ),
+    ],
+)
+def test_what_does_not_hold_fails_with_what_was_seen(tmp_path: Path, steps: str, expected: str, got: str) -> None:
+    result = run(tmp_path, steps)
+    assert result.verdict is Verdict.FAILED
+    failed = result.checks[-1]
+    assert failed.verdict is Verdict.FAILED
+    assert expected in failed.expected
+    assert got in failed.got
+    assert failed.where == f"{tmp_path / 'x.scenario.yaml'}:{3 + len(result.checks)}"
+    assert result.reproduce.startswith("fieldtwin test ")
+
+
+def test_a_value_that_is_set_arrives_and_leaves_again(tmp_path: Path) -> None:
+    steps = ACTIVE + (
+        "  - set: {tag: ctd.temperature, value: 99.5}\n"
+        "  - expect: {tag: ctd.temperature, value: 99.5, tolerance: 0.01, quality: good, within: 4s}\n"
+        "  - set: {tag: ctd.temperature, value: null}\n"
+        "  - expect: {tag: ctd.temperature, like: recording, tolerance: 0.01, within: 4s}\n"
+        "  - expect: {that: 'ctd.temperature < 90', within: 4s, during: 2s}\n"
+    )
+    result = run(tmp_path, steps)
+    assert result.verdict is Verdict.PASSED, result.checks[-1]
+
+
+def test_always_and_never_are_looked_at_all_the_time(tmp_path: Path) -> None:
+    always = run(tmp_path, ACTIVE, "always: [\"relay.state == 'STANDBY'\"]\n")
+    assert (always.verdict, always.checks[-1].number) == (Verdict.FAILED, "2")
+    assert "ACTIVE" in always.checks[-1].got
+    never = run(
+        tmp_path, ACTIVE + "  - pause: 2s\n", "never: [{wire: ctd, access: write, register: sample_period_s}]\n"
+    )
+    assert never.verdict is Verdict.FAILED
+    assert "sample_period_s" in never.checks[-1].got
+
+
+def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -> None:
+    result = run(tmp_path, "  - pause: 1s\n", "needs: [probe]\n")
+    assert result.verdict is Verdict.SKIPPED
+    assert "probe" in result.reason
+    ended = CliRunner().invoke(command, [str(tmp_path / "x.scenario.yaml"), "--json"], standalone_mode=False)
+    assert ended.return_value == 1
+    assert json.loads(ended.output)[0]["verdict"] == "skipped"
+
+
+@pytest.mark.parametrize(
+    ("steps", "told", "line"),
+    [
+        ("  - snd: {period_s: 1}\n", "did you mean 'send'", 4),
+        ("  - send: {period_s: 1}\n    pause: 1s\n", "one thing", 4),
+        ("  - fault: {name: silense, device: ctd}\n", "did you mean 'silence'", 4),
+        ("  - fault: {name: silence, device: ctb}\n", "did you mean 'ctd'", 4),
+        ("  - expect: {tag: ctd.presure, quality: good}\n", "did you mean 'ctd.pressure'", 4),
+        ("  - expect: {wire: ctd, register: pressur, times: 1}\n", "did you mean 'pressure'", 4),
+        ("  - pause: 1s\n  - wait: {until: 'relay.stat == 1'}\n", "did you mean 'relay.state'", 5),
+        ("  - pause: soon\n", "a time", 4),
+        ("  - expect: {quality: good}\n", "about one thing", 4),
+    ],
+)
+def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: str, line: int) -> None:
+    with pytest.raises(FileInvalid) as e:
+        load_scenario(written(tmp_path, steps))
+    assert told in str(e.value)
+    assert e.value.line == line
+
+
+def test_reports_are_written(tmp_path: Path) -> None:
+    path = written(tmp_path, ACTIVE, "requirements: [REQ-1]\n")
+    words = [str(path), "--html", str(tmp_path / "r.html"), "--junit", str(tmp_path / "r.xml")]
+    ended = CliRunner().invoke(command, words, standalone_mode=False)
+    assert ended.return_value == 0, ended.output
+    assert "1 passed" in ended.output
+    assert "REQ-1" in (tmp_path / "r.html").read_text()
+    assert "a test" in (tmp_path / "r.xml").read_text()

@@ -22,7 +22,7 @@ def test_senders_that_wait_for_room_keep_their_order() -> None:
         sender, listener = runner.attach(ENDPOINT, "sender"), runner.attach(ENDPOINT, "listener")
         senders = [asyncio.ensure_future(sender.send(CanFrame(0x100 + n))) for n in range(FRAMES)]
         heard = [(await listener.recv()).can_id]
-        senders.append(asyncio.ensure_future(sender.send(CanFrame(0x001))))  # there is room now, and others wait for it
+        await sender.send(CanFrame(0x001))  # there is room now, and others wait for it
         heard += [(await listener.recv()).can_id for _ in range(FRAMES)]
         await asyncio.gather(*senders)
         assert heard == [*range(0x100, 0x100 + FRAMES), 0x001]

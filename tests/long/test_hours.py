@@ -20,12 +20,24 @@ RUN_HOURS = 2
 SHIPPED = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 
 
+SLOWER = (
+    ("cycle_ms: 10\n", "cycle_ms: 100\n"),
+    ("{values: {every_ms: 500}, status: {every_ms: 1000}}", "{values: {every_ms: 1000}, status: {every_ms: 5000}}"),
+    ("stale_after_ms: 1500", "stale_after_ms: 3500"),
+    ("event_ms: 100}", "event_ms: 1000}"),
+    ("stale_after_ms: 500\n", "stale_after_ms: 3500\n"),
+    ("{inbox: {every_ms: 200}, status: {every_ms: 2000}}", "{inbox: {every_ms: 500}, status: {every_ms: 5000}}"),
+)
+
+
 def slow_scan(folder: Path) -> Path:
-    """The shipped system with a scan of 100 ms."""
+    """The shipped system with a scan of 100 ms, its sensors asked each second."""
     text = (SHIPPED / "observatory.yaml").read_text()
-    assert text.count("cycle_ms: 10\n") == 1
+    for old, new in SLOWER:
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
     path = folder / "observatory.yaml"
-    path.write_text(text.replace("cycle_ms: 10\n", "cycle_ms: 100\n"))
+    path.write_text(text)
     (folder / "observatory.prototype.yaml").write_text((SHIPPED / "observatory.prototype.yaml").read_text())
     return path
 
@@ -36,7 +48,7 @@ def run_hours(path: Path, hours: int, *, random_faults: bool) -> None:
     failed = {r.seed: r.errors for r in results if not r.ok}
     assert not failed
     assert sum(r.wrong for r in results) == 0
-    assert sum(r.checked for r in results) > len(results) * RUN_HOURS * 3600
+    assert sum(r.checked for r in results) > len(results) * RUN_HOURS * 3600 / 2
 
 
 def test_hours_in_peace(tmp_path: Path) -> None:

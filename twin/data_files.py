@@ -48,7 +48,7 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
                 for candidate in (sub / f"{name}.yaml", sub / name):
                     if candidate.is_file():
                         return candidate
-    known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if ".prototype" not in p.name})
+    known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if "." not in p.stem})
     near = difflib.get_close_matches(direct.name, known, n=1)
     raise UsageError(
         f"no {kind[:-1]} {name!r}",

@@ -14,6 +14,8 @@ from twin.system import System
 
 _NS = 1_000_000_000
 Said = tuple[str, str] | None
+LIKE_S = 0.5
+"""How long before a value's own time its device may have held it: a reply takes its time on the wire."""
 
 
 @dataclass
@@ -53,18 +55,20 @@ async def judge_tag(expect: Expect, watched: Watched) -> Said:
         within = f" ± {expect.tolerance:g}" if expect.tolerance else ""
         return f"{expect.tag} {expect.value}{within}", str(reading.value)
     if expect.like is not None:
-        return await _like_held(expect, watched, reading.value)
+        return await _like_held(expect, watched, reading.value, reading.age_s)
     return None
 
 
-async def _like_held(expect: Expect, watched: Watched, value: object) -> Said:
-    """The tag against what its device holds."""
+async def _like_held(expect: Expect, watched: Watched, value: object, reading_age_s: float) -> Said:
+    """The tag against what its device holds, or held when the tag was read."""
     assert expect.tag is not None
     device, _, name = expect.tag.partition(".")
     tag = watched.system.devices[device].profile.tags[name]
     held = await watched.bench.held(expect.tag)
     can = watched.system.buses[watched.system.devices[device].bus].endpoint.is_can
-    recent = [raw for _, raw in held[-20:]]
+    since_s = watched.bench.now_s() - reading_age_s - LIKE_S
+    newest = [raw for t_s, raw in held if t_s >= since_s]
+    recent = newest or [raw for _, raw in held[-1:]]
     truths = [(decode_little if can else decode)(tag, raw, 0).value for raw in recent]
     if any(_near(value, truth, expect.tolerance) for truth in truths if truth is not None):
         return None

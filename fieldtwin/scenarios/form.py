@@ -104,6 +104,15 @@ class ScenarioForm(_Form):
     steps: list[Step] = Field(min_length=1, max_length=10_000)
 
 
+_QUALITIES = ["good", "uncertain", "bad", "substituted", "simulated"]
+_TOGETHER = {
+    "tag": ("tag", "value", "tolerance", "quality", "like", "within", "during"),
+    "updates": ("tag", "quality", "updates_per_s", "during"),
+    "wire": ("wire", "access", "function", "register", "value", "times", "within"),
+    "rate": ("wire", "access", "function", "register", "value", "requests_per_s", "during"),
+    "that": ("that", "within", "during"),
+}
+"""The keys of an expectation, by what it is about."""
 WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause")
 
 
@@ -160,6 +169,9 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
             never.append(scenario.expression(one, "never", n))
         else:
             _known(file, ("never", n, "wire"), "device", one.wire, list(system.devices))
+            if one.register_ is not None:
+                tags = list(system.devices[one.wire].profile.tags)
+                _known(file, ("never", n, "register"), f"tag of {one.wire}", one.register_, tags)
             if one.unless is not None:
                 scenario.expression(one.unless, "never", n, "unless")
             never.append(one)
@@ -213,6 +225,19 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
     said = [word for word in ("tag", "wire", "that") if getattr(expect, word) is not None]
     if len(said) != 1:
         raise scenario.file.error(loc, "an expectation is about one thing", expected="tag, wire or that")
+    kind = "rate" if expect.requests_per_s is not None else "updates" if expect.updates_per_s is not None else said[0]
+    for name in sorted(expect.model_fields_set):
+        key = type(expect).model_fields[name].alias or name
+        if key not in _TOGETHER[kind]:
+            raise scenario.file.error(
+                (*loc, key), f"{key!r} says nothing about this", expected=", ".join(_TOGETHER[kind])
+            )
+    if kind in ("rate", "updates") and expect.during is None:
+        raise scenario.file.error(loc, "a rate is one of some time", expected="during: 10s")
+    if expect.quality is not None:
+        _known(scenario.file, (*loc, "quality"), "quality", expect.quality, _QUALITIES)
+    if expect.like is not None and (expect.tag or "").partition(".")[0] not in scenario.system.devices:
+        raise scenario.file.error((*loc, "like"), "only what a device holds can be like it", expected="tag: DEVICE.TAG")
     if expect.tag is not None:
         _known(scenario.file, (*loc, "tag"), "tag", expect.tag, names_of(scenario.system))
     if expect.wire is not None:

@@ -51,6 +51,9 @@ class Runner:
             (f"always {n}", text, e, True) for n, (text, e) in _numbered(scenario.form.always, scenario.always)
         ]
         self._never = list(enumerate(scenario.never, 1))
+        self._dropped = 0
+        self._judged: set[str] = set()
+        """What must always hold and of which everything was known at least once."""
         self._stimulus_s = 0.0
         self._sent_s = -PENDING_S
         self._watched: deque[Exchange] = deque()
@@ -77,7 +80,7 @@ class Runner:
                     verdict, reason = result.verdict, f"step {result.number}: {result.text}"
                     break
             if verdict is Verdict.PASSED:
-                self._hold_to_the_end()
+                verdict, reason = self._hold_to_the_end()
         return ScenarioResult(
             form.scenario,
             verdict,
@@ -103,7 +106,9 @@ class Runner:
         verdict = Verdict.PASSED
         names: list[str] = []
         try:
+            self._look_at_all()
             names = await self._do(n, word, step) or []
+            self._look_at_all()
         except _Broken as broken:
             verdict, expected, got = broken.verdict, broken.expected, broken.got
         except UsageError as e:
@@ -163,7 +168,12 @@ class Runner:
             return expression.names
         watched = Watched(self.bench, self.scenario.system, self.bench.now_s(), self._stimulus_s, self.exchanges)
         if expect.wire is not None:
+            dropped = self._dropped
             await self._until(self.bench.now_s() + max(within_s, during_s))
+            if self._dropped != dropped:
+                raise _Broken(
+                    Verdict.INCONCLUSIVE, f"at most {KEPT} exchanges in that time", "more; some were forgotten"
+                )
             said = judge_wire(expect, watched)
             if said is not None:
                 raise _Broken(Verdict.FAILED, *said)
@@ -176,6 +186,12 @@ class Runner:
             if self.bench.now_s() >= deadline_s or expect.updates_per_s is not None:
                 raise _Broken(Verdict.FAILED, *said)
             await self._tick(deadline_s)
+        if expect.updates_per_s is None:
+            end_s = self.bench.now_s() + during_s
+            while self.bench.now_s() < end_s:  # and it stays so
+                await self._tick(end_s)
+                if (said := await judge_tag(expect, watched)) is not None:
+                    raise _Broken(Verdict.FAILED, *said)
         return [expect.tag]
 
     async def _throughout(self, expression: Expression, during_s: float) -> None:
@@ -193,7 +209,14 @@ class Runner:
 
     async def _tick(self, at_most_s: float) -> None:
         await self.bench.sleep_until_s(min(self.bench.now_s() + TICK_S, max(at_most_s, self.bench.now_s() + 0.001)))
+        self._look_at_all()
+
+    def _look_at_all(self) -> None:
+        """What must always and never hold, now. Raises `_Broken`."""
         for number, text, expression, _ in self._always:
+            if number not in self._judged and any(self.bench.reading(name) is None for name in expression.names):
+                continue  # nothing is known of it yet
+            self._judged.add(number)
             if not expression.evaluate(self._look):
                 late = "plc.late" in text and Can.EXACT_TIME not in self.bench.can
                 raise _Broken(
@@ -225,18 +248,23 @@ class Runner:
             return False
         return form.value is None or exchange.tags.get(form.register_ or "") == form.value
 
-    def _hold_to_the_end(self) -> None:
-        """What held all the time is said so, once."""
-        now_ns = self._now_ns()
+    def _hold_to_the_end(self) -> tuple[Verdict, str]:
+        """What held all the time is said so, once; what could never be judged makes the scenario inconclusive."""
+        now_ns, verdict, reason = self._now_ns(), Verdict.PASSED, ""
         for number, text, expression, _ in self._always:
-            self.results.append(CheckResult(number, text, Verdict.PASSED, now_ns, 0, names=tuple(expression.names)))
+            found = Verdict.PASSED if number in self._judged else Verdict.INCONCLUSIVE
+            if found is not Verdict.PASSED:
+                verdict, reason = found, f"{number}: nothing was ever known of {', '.join(expression.names)}"
+            self.results.append(CheckResult(number, text, found, now_ns, 0, names=tuple(expression.names)))
         for n, one in self._never:
             text = one.text if isinstance(one, Expression) else _said(one)
             self.results.append(CheckResult(f"never {n}", text, Verdict.PASSED, now_ns, 0))
+        return verdict, reason
 
     def _on_event(self, event: Event) -> None:
         if event.kind is Kind.FRAME:
             for exchange in self._decoder.feed(event):
+                self._dropped += len(self.exchanges) == KEPT
                 self.exchanges.append(exchange)
                 if any(isinstance(one, WireForm) for _, one in self._never):
                     self._watched.append(exchange)

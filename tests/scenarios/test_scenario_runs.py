@@ -88,6 +88,20 @@ def test_always_and_never_are_looked_at_all_the_time(tmp_path: Path) -> None:
     assert "sample_period_s" in never.checks[-1].got
 
 
+def test_what_lasts_must_last_and_what_always_holds_holds_at_once(tmp_path: Path) -> None:
+    good = "  - wait: {until: \"quality(inclinometer.slope_long) == 'good'\"}\n"
+    dead = good + "  - fault: {name: lost-frame, device: inclinometer}\n"
+    lasting = run(tmp_path, dead + "  - expect: {tag: inclinometer.slope_long, quality: good, during: 10s}\n")
+    assert lasting.verdict is Verdict.FAILED
+    assert "bad" in lasting.checks[-1].got
+    at_once = run(tmp_path, "  - pause: 100ms\n  - send: {period_s: 1}\n", "always: [\"relay.state == 'OFF'\"]\n")
+    assert at_once.verdict is Verdict.FAILED
+    never_known = run(tmp_path, "  - pause: 2s\n", "always: ['ctd.pressure > 0']\n")  # it is in standby
+    assert never_known.verdict is Verdict.INCONCLUSIVE
+    with pytest.raises(FileInvalid, match="no tag of ctd 'nothere'"):
+        run(tmp_path, "  - pause: 1s\n", "never: [{wire: ctd, register: nothere}]\n")
+
+
 def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -> None:
     result = run(tmp_path, "  - pause: 1s\n", "needs: [probe]\n")
     assert result.verdict is Verdict.SKIPPED
@@ -109,6 +123,11 @@ def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -
         ("  - pause: 1s\n  - wait: {until: 'relay.stat == 1'}\n", "did you mean 'relay.state'", 5),
         ("  - pause: soon\n", "a time", 4),
         ("  - expect: {quality: good}\n", "about one thing", 4),
+        ("  - expect: {tag: ctd.pressure, times: 1}\n", "'times' says nothing about this", 4),
+        ("  - expect: {wire: ctd, quality: good}\n", "'quality' says nothing about this", 4),
+        ("  - expect: {wire: ctd, requests_per_s: {max: 1}}\n", "during: 10s", 4),
+        ("  - expect: {tag: ctd.pressure, quality: goood}\n", "did you mean 'good'", 4),
+        ("  - expect: {tag: relay.state, like: recording}\n", "DEVICE.TAG", 4),
     ],
 )
 def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: str, line: int) -> None:

@@ -7,7 +7,7 @@ back is forgotten.
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,8 +29,8 @@ class _Held:
         self.raws.append(raw)
 
     def was(self, raw: bytes, from_ns: int, to_ns: int) -> bool:
-        """Whether it was `raw` at any time between, both ends included."""
-        first = max(0, bisect_right(self.times_ns, from_ns) - 1)
+        """Whether it was `raw` at any time between, both ends included: what ended at `from_ns` was so at that instant."""
+        first = max(0, bisect_left(self.times_ns, from_ns) - 1)
         last = bisect_right(self.times_ns, to_ns)
         return raw in self.raws[first:last]
 

@@ -1,0 +1,123 @@
+"""A live wire for the commissioning verbs: opened by its URL, observed by taps, closed on leaving.
+
+What a verb sends goes through the gateway's own master: the same framing, silences and refusals that run the plant. It
+must never know what a verb is for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from typing import Any
+
+from gateway.connections.os_connector import OsConnector
+from gateway.connections.tap import TappedConnector
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import ByteConnection, CanConnection, Connector, Tap
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.nursery import Nursery
+from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.modbus.client import ModbusClient
+from gateway.protocols.modbus.framings import framing_of, make_framer
+from gateway.protocols.modbus.request import Request
+from gateway.wallclock import WallClock
+
+
+@asynccontextmanager
+async def modbus_at(
+    url: str,
+    *,
+    timeout_s: float = 1.0,
+    spacing_s: float = 0.0,
+    echo: bool = False,
+    taps: Sequence[Tap] = (),
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> AsyncIterator[ModbusClient]:
+    """A Modbus client at `url` (``rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1``, ``tcp://HOST:502``...).
+
+    `timeout_s` is for each reply, `spacing_s` the pause behind every exchange (the rate limit of sweeps); `taps` see all
+    that is sent and received. Raises `UsageError` for a url that is no Modbus wire, `Unreachable` where nobody is.
+    """
+    endpoint = Endpoint.parse(url)
+    framing_of(endpoint)
+    clock = clock or WallClock()
+    connection = await _observed(connector, taps, clock).open_bytes(endpoint)
+    client = ModbusClient.at(endpoint, connection, clock, timeout_s=timeout_s, spacing_s=spacing_s, echo=echo)
+    try:
+        yield client
+    finally:
+        await client.aclose()
+
+
+@asynccontextmanager
+async def canopen_at(
+    url: str,
+    bitrate: int = 0,
+    *,
+    sdo_timeout_s: float = 0.5,
+    taps: Sequence[Tap] = (),
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> AsyncIterator[CanopenMaster]:
+    """A CANopen master on the bus at `url`, already listening; it sends nothing by itself.
+
+    `bitrate` in bit/s, 0: whatever the bus runs at, where the medium knows. Raises `UsageError` for a url that is no CAN
+    bus, `Unreachable` or `ConnectionLost` where there is none.
+    """
+    clock = clock or WallClock()
+    async with frames_at(url, bitrate, taps=taps, connector=connector, clock=clock) as connection:
+        master = CanopenMaster(connection, clock, sdo_timeout_s=sdo_timeout_s)
+        async with Nursery() as nursery:
+            nursery.start(master.run(), f"master at {url}")
+            yield master
+
+
+@asynccontextmanager
+async def bytes_at(
+    url: str, *, taps: Sequence[Tap] = (), connector: Connector | None = None, clock: Clock | None = None
+) -> AsyncIterator[ByteConnection]:
+    """The bytes of a wire, for whoever only listens. Raises as `modbus_at`."""
+    connection = await _observed(connector, taps, clock or WallClock()).open_bytes(Endpoint.parse(url))
+    try:
+        yield connection
+    finally:
+        await connection.aclose()
+
+
+@asynccontextmanager
+async def frames_at(
+    url: str,
+    bitrate: int = 0,
+    *,
+    taps: Sequence[Tap] = (),
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> AsyncIterator[CanConnection]:
+    """The frames of a CAN bus, for whoever only listens. Raises as `canopen_at`."""
+    endpoint = Endpoint.parse(url)
+    if not endpoint.is_can:
+        raise UsageError(
+            "CANopen is spoken on a CAN bus", expected="can:socketcan/can0 or can:fieldtwin/HOST:PORT", got=url
+        )
+    connection = await _observed(connector, taps, clock or WallClock()).open_can(endpoint, bitrate)
+    try:
+        yield connection
+    finally:
+        await connection.aclose()
+
+
+def frame_of(url: str, unit: int, request: Request[Any]) -> bytes:
+    """What `request` to `unit` would look like on the wire at `url`, with transaction id 1: for `--dry-run`."""
+    endpoint = Endpoint.parse(url)
+    char_time_ns = round(endpoint.serial.char_time_s * NS_PER_S) if endpoint.is_serial else 0
+    framer = make_framer(
+        framing_of(endpoint), char_time_ns=char_time_ns, echo=False, strict=False, accepts_zero_id=False
+    )
+    return framer.begin(unit, request)
+
+
+def _observed(connector: Connector | None, taps: Sequence[Tap], clock: Clock) -> Connector:
+    connector = connector or OsConnector()
+    return TappedConnector(connector, taps, clock) if taps else connector

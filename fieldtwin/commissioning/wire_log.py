@@ -1,0 +1,69 @@
+"""The log of all that a verb put on a wire, and of what came back: kept beside every dump, and wherever `--log` says.
+
+JSON lines as a run's capture has them (``t_ns``, ``endpoint``, ``direction``, ``hex``, ``frame``), so `fieldtwin export` and
+Wireshark's readers take both. A line with ``"started"`` stands before each session: who, when, with what words.
+"""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TextIO
+
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import Direction, Tap
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FileInvalid
+from gateway.wallclock import WallClock
+
+
+class WireLog(Tap):
+    """Appends to `path`, a session at a time; a line is the operating system's when the call returns.
+
+    At most `max_bytes` a session: then `full` is True and nothing more is written. A verb that may only send what is
+    logged asks `full` before it sends. Raises `FileInvalid` when the file cannot be written.
+    """
+
+    def __init__(self, path: Path, words: str, clock: Clock | None = None, max_bytes: int = 1 << 30) -> None:
+        self.path = path
+        self.full = False
+        self.sent = 0
+        self._room_bytes = max_bytes
+        clock = clock or WallClock()
+        try:
+            self._file: TextIO = path.open("a", encoding="ascii", buffering=1, newline="\n")
+        except OSError as e:
+            raise FileInvalid(f"cannot write the log of what is sent: {e.strerror or e}", path=str(path)) from e
+        started = datetime.fromtimestamp(clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+        self._write({"started": started, "t_ns": clock.monotonic_ns(), "command": words})
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+    def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
+        self.sent += direction is Direction.SENT
+        self._write({"t_ns": t_ns, "endpoint": str(endpoint), "direction": direction.value, "hex": data.hex()})
+
+    def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
+        self.sent += direction is Direction.SENT
+        line = {"t_ns": t_ns, "endpoint": str(endpoint), "direction": direction.value}
+        self._write(line | {"hex": frame.data.hex(), "frame": str(frame)})
+
+    def _write(self, line: dict[str, object]) -> None:
+        text = json.dumps(line, separators=(",", ":")) + "\n"
+        if self.full or len(text) > self._room_bytes:
+            self.full = True
+            return
+        try:
+            self._file.write(text)
+            self._room_bytes -= len(text)
+        except OSError:
+            self.full = True

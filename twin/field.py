@@ -14,6 +14,7 @@ from typing import Any
 from emulators.canopen.node import CanopenNode
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
+from emulators.distorted_registers import DistortedRegisters
 from emulators.emulator import EmulatedUnit
 from emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
 from emulators.journal import HeldJournal, share_of
@@ -247,7 +248,9 @@ class FieldSide:
                 seed=self.prototype.seed,
             )
             self._pairs[config.name] = pair
-            unit = self._emulated_unit(config, pair.near, ())
+            seen = DistortedRegisters(pair.near, pair.near.peek, emulated.profile, pair.near.journal)
+            unit = self._emulated_unit(config, seen, ())
+            self.faults.on_values(config.name, seen.distortions)
             modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
             modem.journal = pair.near.journal
             return unit
@@ -272,7 +275,9 @@ class FieldSide:
             raise FileInvalid(
                 f"{config.name!r}: {e.message}", path=str(self.prototype.path), expected=e.expected, got=e.got
             ) from e
-        unit = self._emulated_unit(config, bank, ())
+        seen = DistortedRegisters(bank, bank.peek, emulated.profile, bank.journal)
+        unit = self._emulated_unit(config, seen, ())
+        self.faults.on_values(config.name, seen.distortions)
         add_own_functions(unit, bank, emulated.profile)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = bank.journal

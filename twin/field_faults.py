@@ -62,10 +62,9 @@ class FieldFaults:
         """A node's end of a bus, behind the faults of that bus."""
         return FaultyCan(connection, self._buses[bus], node)
 
-    def on_values(self, device: str, distortions: Distortions | None) -> None:
-        """What `device` holds can be distorted; None: it cannot."""
-        if distortions is not None:
-            self._distortions[device] = distortions
+    def on_values(self, device: str, distortions: Distortions) -> None:
+        """What `device` holds can be distorted."""
+        self._distortions[device] = distortions
 
     def on_wire(self, bus: str, disturb: Callable[[Rule], None], undisturb: Callable[[Rule], None]) -> None:
         """A modelled CAN bus, on which errors can happen."""
@@ -108,7 +107,7 @@ class FieldFaults:
             found = self._distortions.get(spec.aim.device)
             if found is None:
                 raise UsageError(
-                    f"what {spec.aim.device} holds cannot be changed", expected="a device with a recording"
+                    f"what {spec.aim.device} holds cannot be changed", expected="a device that is emulated here"
                 )
             found.put_in(active, spec.aim.register_)
         elif isinstance(active.fault, BusFault):
@@ -140,7 +139,7 @@ class FieldFaults:
         found = self._tag(device, tag)
         distortions = self._distortions.get(device)
         if distortions is None or found.is_text:
-            raise UsageError(f"{device}.{tag} cannot be set", expected="a number of a device with a recording")
+            raise UsageError(f"{device}.{tag} cannot be set", expected="a number of a device that is emulated here")
         id = f"set {device}.{tag}"
         distortions.take_away(id)
         if value is None:

@@ -96,10 +96,17 @@ class DeviceModel(ABC):
         """Bring the device to the moment. Asked when it wished, after writes, and before each reading; time never goes back."""
 
 
+Distort = Callable[[Mapping[Key, bytes], int], dict[Key, bytes]]
+"""Given all that a device would hold now, and now_ns: what it holds instead. For faults."""
+
+
 class Behaviour(Service):
     """Runs a model inside a node. It is the node's source of values as well (see `service.Source`)."""
 
-    def __init__(self, model: DeviceModel, source: Source | None, data: NodeData) -> None:
+    def __init__(
+        self, model: DeviceModel, source: Source | None, data: NodeData, distort: Distort | None = None
+    ) -> None:
+        self._distort = distort
         self._model = model
         self._source = source
         self._data = data
@@ -164,12 +171,15 @@ class Behaviour(Service):
         values = dict(played)
         quiet = self._encoded(outcome.readings)
         told = self._encoded(outcome.states)
+        if self._distort is not None:
+            values = self._distort(values | quiet | told, now_ns)
+            told = {key: values[key] for key in told}
         events = [key for key, raw in told.items() if self._data.put(*key, raw)]
         for key in events:
             self._core.note(now_ns, "set", *key, told[key])
         if events:
             self._changed(events, now_ns)
-        return values | quiet | told
+        return values if self._distort is not None else values | quiet | told
 
     def _situation(self, now_ns: int, written: Collection[Key], played: Mapping[Key, bytes]) -> Situation:
         types = self._data.types

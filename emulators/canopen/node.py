@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 
 from emulators.canopen.aborts import Abort
 from emulators.canopen.acceptance import Acceptance
-from emulators.canopen.behaviour import Behaviour, DeviceModel
+from emulators.canopen.behaviour import Behaviour, DeviceModel, Distort
 from emulators.canopen.bus_faults import BusFaults
 from emulators.canopen.client_view import ClientView
 from emulators.canopen.dictionary import Dictionary, Key
@@ -58,7 +58,8 @@ class NodeContext:
     """What the node is given besides its data sheet.
 
     `source` plays values, by time and where it `AnswersReads` by upload; `model` makes of them, and of what clients write, what
-    the device does; `held` is told of every value that the objects then have. `factory` replaces defaults (a serial number).
+    the device does; `distort` changes what the model says, for faults; `held` is told of every value that the objects then have.
+    `factory` replaces defaults (a serial number).
     `refusals` are objects that SDO clients get an abort for, whatever the data sheet says.
 
     `tolerate_short_sdo` takes SDO requests of fewer than 8 bytes as padded with zeros, as for old PLCs; by default they are
@@ -70,6 +71,7 @@ class NodeContext:
     source: Source | None = None
     model: DeviceModel | None = None
     held: Held | None = None
+    distort: Distort | None = None
     factory: Mapping[Key, bytes] = field(default_factory=dict)
     refusals: Mapping[Key, Abort] = field(default_factory=dict)
     tolerate_short_sdo: bool = False
@@ -95,7 +97,7 @@ class CanopenNode:
             raise UsageError("not a CANopen node id", expected="1 to 127, or 255 with LSS", got=str(node_id))
         data = NodeData(dictionary, 0 if node_id == UNCONFIGURED else node_id, context.factory)
         source, model = context.source, context.model
-        self._behaviour = None if model is None else Behaviour(model, source, data)
+        self._behaviour = None if model is None else Behaviour(model, source, data, context.distort)
         self._core = core = Core(data, node_id, self._behaviour or source, context.journal_size)
         core.held = context.held
         core.answers = source if isinstance(source, AnswersReads) else None

@@ -14,6 +14,7 @@ from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.models.by_profile import model_for
+from emulators.models.distorted_objects import DistortedObjects
 from emulators.models.played_objects import HeldObjects, PlayedObjects
 from emulators.replay.can_log import CanLog
 from emulators.replay.objects import recorded_objects
@@ -24,11 +25,11 @@ from gateway.core.profile import DeviceProfile
 
 @dataclass(frozen=True, slots=True)
 class EmulatedNode:
-    """The node and what it held, by tag. `distortions` of what a recording plays; None: it plays none."""
+    """The node and what it held, by tag. `distortions`: what its objects hold instead."""
 
     node: CanopenNode
     journal: HeldJournal
-    distortions: Distortions | None
+    distortions: Distortions
 
 
 def emulated_node(
@@ -51,19 +52,25 @@ def emulated_node(
     tags = profile.tags.values()
     held = HeldObjects(tags)
     own = _factory(profile, dictionary, identity or {})
-    context = NodeContext(model=model_for(dictionary), held=held, factory=own)
-    played: PlayedObjects | None = None
-    if isinstance(recording, CanLog):
-        objects = recorded_objects(recording, dictionary, node_id)
-        context = replace(context, source=objects, factory={**objects.initial, **own}, refusals=objects.refusals)
-    elif recording is not None:
+    model = model_for(dictionary)
+    context = NodeContext(model=model, held=held, factory=own)
+    if isinstance(recording, SignalPlayer):
         played = PlayedObjects(tags, dictionary, recording)
-        context = replace(context, source=played)
-    node = CanopenNode(dictionary, node_id, context)
+        distortions = played.distortions
+        node = CanopenNode(dictionary, node_id, replace(context, source=played))
+    else:
+        objects = None if recording is None else recorded_objects(recording, dictionary, node_id)
+        if objects is not None:
+            context = replace(context, factory={**objects.initial, **own}, refusals=objects.refusals)
+        distorted = DistortedObjects(tags, dictionary, objects, has_model=model is not None)
+        distortions = distorted.distortions
+        context = replace(context, source=distorted, distort=distorted.over if model is not None else None)
+        node = CanopenNode(dictionary, node_id, context)
+        distorted.data = node.data
     for tag in tags:  # what nobody plays is held as well: by the data sheet
         if tag.object is not None and node.data.has(*tag.object):
             held({tag.object: node.data.get(*tag.object)}, now_ns)
-    return EmulatedNode(node, held.journal, played.distortions if played is not None else None)
+    return EmulatedNode(node, held.journal, distortions)
 
 
 def _factory(profile: DeviceProfile, dictionary: Dictionary, identity: Mapping[str, str]) -> dict[Key, bytes]:

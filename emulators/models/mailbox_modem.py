@@ -48,6 +48,10 @@ class MailboxModem(RegisterBank):
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
         self._cells.check_read(table, address, count, now_ns)
 
+    def peek(self, table: Table, address: int) -> int:
+        """What a cell holds, without anything that happens at a read."""
+        return self._cells.peek(table, address)
+
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
         self.advance(now_ns)
         self._cells.write(table, address, values, now_ns)

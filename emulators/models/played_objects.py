@@ -53,11 +53,11 @@ class PlayedObjects:
             number = (value - tag.offset) / tag.scale
             if math.isnan(number) and not tag.type.startswith("float"):
                 continue  # no integer says "no value": the object keeps what it has
-            out[key] = encode(data_type, number if tag.type.startswith("float") else _whole(number, data_type))
+            out[key] = encode(data_type, number if tag.type.startswith("float") else whole(number, data_type))
         return out
 
 
-def _whole(number: float, data_type: int) -> int:
+def whole(number: float, data_type: int) -> int:
     """The nearest number that the type holds: a device's converters saturate."""
     bounds = integer_range(data_type)
     if bounds is None:

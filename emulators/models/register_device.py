@@ -56,6 +56,10 @@ class StatedRegisters(RegisterBank):
             at = tag.registers
             self._note_all(at.table, range(at.address, at.end), now_ns)
 
+    def peek(self, table: Table, address: int) -> int:
+        """What a cell holds, without the effects of a read."""
+        return self._cells.peek(table, address)
+
     def _put(self, tag: Tag, value: float | str) -> None:
         at = tag.registers
         if isinstance(value, str) != (tag.type == "string"):

@@ -59,11 +59,11 @@ Judge = Callable[[Observation], Finding]
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """The part of a case that people see, and its judge.
+class About:
+    """The part of a case that people see.
 
     `id` is the catalogue's, with a letter behind it where a row is several cases. `clause` names the source as
-    the catalogue does.
+    the catalogue does. `does` is what the checker does, `must` what is expected of whom it judges, who has the `role`.
     """
 
     id: str
@@ -72,15 +72,24 @@ class Case:
     danger: Danger
     does: str
     must: str
-    judge: Judge
 
     @property
     def row(self) -> str:
         """The row of the catalogue."""
         return self.id.rstrip("abcdefgh")
 
-    role = "master"
+    @property
+    def role(self) -> str:
+        """Whom the case judges."""
+        return "master"
 
     def chosen(self, only: frozenset[str]) -> bool:
         """Whether `only` names it, or its row; all are chosen by none."""
         return not only or self.id in only or self.row in only
+
+
+@dataclass(frozen=True, slots=True)
+class Case(About):
+    """A case for masters, with its judge."""
+
+    judge: Judge

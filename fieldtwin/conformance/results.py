@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any
 
-from fieldtwin.conformance.case import Case, Finding, failed
+from fieldtwin.conformance.case import About, Finding, failed
 from fieldtwin.conformance.waivers import Waivers
 from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
 
@@ -17,7 +17,7 @@ from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
 class CaseResult:
     """A case and what was found. `waived`: the waiver's reason, where a failure is one that somebody answers for."""
 
-    case: Case
+    case: About
     finding: Finding
     took_s: float = 0.0
     waived: str = ""

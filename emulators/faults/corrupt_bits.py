@@ -8,19 +8,31 @@ from pydantic import Field
 
 from emulators.faults.fault import Outcome, Parameters, WireFault, passed
 from emulators.faults.frames import Frame
+from emulators.faults.remake import remade
 
 
 class Form(Parameters):
     bits: int = Field(default=1, ge=1, le=64)
+    fits: bool = False
 
 
 class CorruptBits(WireFault):
     name = "corrupt-bits"
-    summary = "`bits` bits of the frame, anywhere, are turned over"
+    summary = (
+        "`bits` bits of the frame, anywhere, are turned over; with `fits` they are behind the function code, and its check "
+        "sum fits"
+    )
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
-        data = bytearray(frame.data)
-        for place in random.sample(range(8 * len(data)), min(self.parameters.bits, 8 * len(data))):
-            data[place // 8] ^= 1 << place % 8
-        return passed(bytes(data))
+        bits = self.parameters.bits
+        if self.parameters.fits and frame.pdu:
+            return passed(remade(frame, pdu=frame.pdu[:1] + _turned(frame.pdu[1:], bits, random)))
+        return passed(_turned(frame.data, bits, random))
+
+
+def _turned(raw: bytes, bits: int, random: Random) -> bytes:
+    data = bytearray(raw)
+    for place in random.sample(range(8 * len(data)), min(bits, 8 * len(data))):
+        data[place // 8] ^= 1 << place % 8
+    return bytes(data)

@@ -12,7 +12,7 @@ from emulators.faults.remake import remade
 
 
 class Form(Parameters):
-    by: int = Field(default=2, ge=-250, le=250)
+    by: int = Field(default=2, ge=-255, le=255)
 
 
 class CorruptLength(WireFault):

@@ -91,6 +91,10 @@ class Parameters(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+HEX = r"^([0-9A-Fa-f]{2} ?)*$"
+"""Bytes that a parameter spells out."""
+
+
 class Nothing(Parameters):
     """None."""
 

@@ -6,18 +6,19 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.fault import HEX, Outcome, Parameters, WireFault, passed
 from emulators.faults.frames import Frame
 
 
 class Form(Parameters):
     count: int = Field(default=4, ge=1, le=1024)
+    data: str = Field(default="", pattern=HEX, max_length=3072)
 
 
 class Garbage(WireFault):
     name = "garbage"
-    summary = "`count` bytes that mean nothing follow the frame at once"
+    summary = "`count` bytes that mean nothing, or those of `data` (hex), follow the frame at once"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
-        return passed(frame.data + random.randbytes(self.parameters.count))
+        return passed(frame.data + (bytes.fromhex(self.parameters.data) or random.randbytes(self.parameters.count)))

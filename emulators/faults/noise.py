@@ -6,21 +6,24 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from emulators.faults.fault import HEX, Outcome, Parameters, Piece, WireFault, passed
 from emulators.faults.frames import Frame
 
 
 class Form(Parameters):
     count: int = Field(default=3, ge=1, le=1024)
     lead_ms: float = Field(default=0.0, ge=0, le=60_000)
+    data: str = Field(default="", pattern=HEX, max_length=3072)
 
 
 class Noise(WireFault):
     name = "noise"
-    summary = "`count` bytes that mean nothing precede the frame, `lead_ms` before it"
+    summary = "`count` bytes that mean nothing, or those of `data` (hex), precede the frame, `lead_ms` before it"
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
-        return Outcome(
-            (Piece(random.randbytes(self.parameters.count)), Piece(frame.data, self.parameters.lead_ms / 1000))
-        )
+        p = self.parameters
+        before = bytes.fromhex(p.data) or random.randbytes(p.count)
+        if not p.lead_ms:
+            return passed(before + frame.data)
+        return Outcome((Piece(before), Piece(frame.data, p.lead_ms / 1000)))

@@ -13,13 +13,19 @@ from emulators.faults.frames import Frame
 class Form(Parameters):
     at: int = Field(default=3, ge=1, le=1024)
     pause_ms: float = Field(default=1.0, ge=0, le=60_000)
+    times: int = Field(default=1, ge=1, le=1024)
 
 
 class Split(WireFault):
     name = "split"
-    summary = "the frame arrives cut behind `at` bytes, the rest `pause_ms` later"
+    summary = (
+        "the frame arrives cut behind `at` bytes, up to `times` times, each piece `pause_ms` behind the one before"
+    )
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
-        at = self.parameters.at
-        return Outcome((Piece(frame.data[:at]), Piece(frame.data[at:], self.parameters.pause_ms / 1000)))
+        p, left, cut = self.parameters, frame.data, list[bytes]()
+        while len(left) > p.at and len(cut) < p.times:
+            cut.append(left[: p.at])
+            left = left[p.at :]
+        return Outcome(tuple(Piece(data, n * p.pause_ms / 1000) for n, data in enumerate([*cut, left])))

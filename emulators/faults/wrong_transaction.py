@@ -11,16 +11,22 @@ from emulators.faults.frames import Frame, Framing
 
 
 class Form(Parameters):
-    by: int = Field(default=1, ge=1, le=65535)
+    by: int = Field(default=1, ge=0, le=65535)
+    to: int = Field(default=-1, ge=-1, le=65535)
+    protocol: int = Field(default=0, ge=0, le=65535)
 
 
 class WrongTransaction(WireFault):
     name = "wrong-transaction"
-    summary = "the transaction id is `by` more; on a line, which has none, nothing happens"
+    summary = (
+        "the transaction id is `by` more, or `to` (-1: not), and the protocol id `protocol`; on a line, which has none, "
+        "nothing happens"
+    )
     form = Form
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
-        if frame.framing is not Framing.MBAP or len(frame.data) < 2:
+        if frame.framing is not Framing.MBAP or len(frame.data) < 4:
             return passed(frame.data)
-        transaction = (int.from_bytes(frame.data[:2]) + self.parameters.by) & 0xFFFF
-        return passed(transaction.to_bytes(2) + frame.data[2:])
+        p = self.parameters
+        transaction = p.to if p.to >= 0 else (int.from_bytes(frame.data[:2]) + p.by) & 0xFFFF
+        return passed(transaction.to_bytes(2) + int(p.protocol).to_bytes(2) + frame.data[4:])

@@ -64,6 +64,8 @@ def _told(described: dict[str, Any]) -> str:
     return f"{described['summary']}" + (f" [dim]({own})[/dim]" if own else "")
 
 
-def _number(value: float) -> str:
+def _number(value: float | str) -> str:
     """Codes, which are large, as everybody writes them."""
+    if isinstance(value, str | bool):
+        return json.dumps(value)
     return f"0x{value:X}" if isinstance(value, int) and value >= 0x1000 else f"{value:g}"

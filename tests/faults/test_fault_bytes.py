@@ -48,7 +48,7 @@ def made(name: str, **said: Any) -> Any:
     return parse_fault({"name": name, **said}).make()
 
 
-def struck(name: str, data: bytes, framing: Framing = Framing.RTU, **said: Any) -> Outcome:
+def struck(name: str, data: bytes, framing: Framing = Framing.RTU, /, **said: Any) -> Outcome:
     fault = made(name, **said)
     assert isinstance(fault, WireFault)
     frame = understood(Way.REPLY, framing, data)
@@ -79,6 +79,13 @@ def pieces(outcome: Outcome) -> list[tuple[bytes, float]]:
         ("wrong-function", {"code": 4}, [(line("1104 04 000A 0102"), 0.0)]),
         ("wrong-transaction", {}, [(ON_LINE, 0.0)]),
         ("truncate", {"count": 2}, [(ON_LINE[:-2], 0.0)]),
+        (
+            "split",
+            {"at": 4, "times": 9, "pause_ms": 2},
+            [(ON_LINE[:4], 0.0), (ON_LINE[4:8], 0.002), (ON_LINE[8:], 0.004)],
+        ),
+        ("noise", {"data": "00 FF"}, [(b"\0\xff" + ON_LINE, 0.0)]),
+        ("garbage", {"data": "0000"}, [(ON_LINE + b"\0\0", 0.0)]),
         ("exception", {"code": 4}, [(line("1183 04"), 0.0)]),
         ("busy", {}, [(line("1183 06"), 0.0)]),
         ("wrong-parity", {}, [(bytes(b for b in ON_LINE if b.bit_count() % 2 == 0), 0.0)]),
@@ -93,6 +100,10 @@ def test_on_a_line(name: str, said: dict[str, Any], expected: list[tuple[bytes, 
     [
         ("corrupt-length", {"by": -1}, "0007 0000 0006" + REPLY),
         ("wrong-transaction", {"by": 3}, "000A 0000 0007" + REPLY),
+        ("wrong-transaction", {"to": 0}, "0000 0000 0007" + REPLY),
+        ("wrong-transaction", {"by": 0, "protocol": 1}, "0007 0001 0007" + REPLY),
+        ("corrupt-length", {"by": -7}, "0007 0000 0000" + REPLY),
+        ("corrupt-length", {"by": -8}, "0007 0000 FFFF" + REPLY),
         ("wrong-unit", {"unit_id": 9}, "0007 0000 0007 0903 04 000A 0102"),
         ("wrong-function", {"code": 4}, "0007 0000 0007 1104 04 000A 0102"),
         ("exception", {"code": 2}, "0007 0000 0003 1183 02"),
@@ -124,6 +135,8 @@ def test_the_check_sum_of_ascii() -> None:
 def test_what_is_left_to_chance() -> None:
     ((spoilt, _),) = pieces(struck("corrupt-bits", ON_LINE, bits=3))
     assert sum((a ^ b).bit_count() for a, b in zip(spoilt, ON_LINE, strict=True)) == 3
+    ((fits, _),) = pieces(struck("corrupt-bits", ON_LINE, fits=True))
+    assert (fits[:2], crc(fits), fits != ON_LINE) == (ON_LINE[:2], b"\0\0", True)
     ((behind, _),) = pieces(struck("garbage", ON_LINE, count=5))
     assert behind[:-5] == ON_LINE
     before, frame = pieces(struck("noise", ON_LINE, count=5, lead_ms=2))
@@ -178,6 +191,23 @@ NODE = 5
         ("lost-segment", {}, (0x585, "00616263"), []),
         ("lost-segment", {}, (0x585, "4117600020000000"), None),
         ("emcy-burst", {}, (0x185, "01"), None),
+        ("late-frame", {"by_ms": 50}, (0x185, "0102"), [(0x185, "0102", 0.05)]),
+        ("short-frame", {"length": 1}, (0x185, "0102"), [(0x185, "01", 0.0)]),
+        ("odd-heartbeat", {"state": 0x55}, (0x705, "05"), [(0x705, "55", 0.0)]),
+        ("odd-heartbeat", {}, (0x585, "05"), None),
+        ("odd-sdo", {"command": 0xE0}, (0x585, "4b106000ff000000"), [(0x585, "e0106000ff000000", 0.0)]),
+        ("odd-sdo", {"index_by": 1}, (0x585, "4b106000ff000000"), [(0x585, "4b116000ff000000", 0.0)]),
+        ("odd-sdo", {"index_by": 1}, (0x585, "0061626300000000"), [(0x585, "0061626300000000", 0.0)]),
+        ("odd-sdo", {"size_by": 5}, (0x585, "4108100009000000"), [(0x585, "410810000e000000", 0.0)]),
+        ("odd-sdo", {"no_size": True}, (0x585, "4b106000ff000000"), [(0x585, "42106000ff000000", 0.0)]),
+        ("odd-sdo", {"no_size": True}, (0x585, "4108100009000000"), [(0x585, "4008100000000000", 0.0)]),
+        (
+            "odd-sdo",
+            {"before": 1},
+            (0x585, "4b106000ff000000"),
+            [(0x585, "e000000000000000", 0.0), (0x585, "4b106000ff000000", 0.0)],
+        ),
+        ("odd-sdo", {}, (0x605, "4010600000000000"), None),
         ("boot-storm", {}, (0x705, "05"), None),
     ],
 )
@@ -199,6 +229,10 @@ def test_what_a_node_says_unasked() -> None:
     assert [(p.frame.can_id, p.frame.data[:2], p.delay_s) for p in emcy] == [
         (0x85, b"\x10\x81", n * 0.002) for n in range(3)
     ]
+    (short,) = made("emcy-burst", count=1, length=3).appears(NODE, Random(1))
+    assert short.frame.data == b"\x00\x10\x01"
+    (far,) = made("odd-sdo", extended=True).strike(CanFrame(0x585, bytes(8)), NODE, Random(1))
+    assert far.frame.extended
     boots = made("boot-storm", count=3, every_ms=50).appears(NODE, Random(1))
     assert [(p.frame, p.delay_s) for p in boots] == [(CanFrame(0x705, b"\0"), n * 0.05) for n in range(3)]
 

@@ -89,6 +89,10 @@ ROWS = [
     Row("can", "emcy-burst", "", 0.1),
     Row("can", "sync-jitter", "", 0.1),
     Row("can", "boot-storm", "not_operational", 1.0),
+    Row("can", "late-frame", "timeout heartbeat_lost", 1.5, {"by_ms": 700.0}),
+    Row("can", "short-frame", "wire_error stale heartbeat_lost", 1.5),
+    Row("can", "odd-heartbeat", "not_operational heartbeat_lost", 1.5),
+    Row("sdo", "odd-sdo", "stale timeout", 1.5, {"command": 0xE0}),
     Row("line", "stuck", "", 0.1),
     Row("can", "stuck", "", 0.1),
     Row("line", "drift", "", 0.1, {"per_s": 1000.0}),
@@ -103,6 +107,8 @@ ROWS = [
     Row("can", "set", "", 0.1, {"value": -12.5, "register": "slope_long"}),
 ]
 
+BRIEF = {"boot-storm"}
+"""What a program does not see: it is over before the next scan."""
 ASKED_FOR = {
     ("line", "set"): 12.5,
     ("can", "set"): -12.5,
@@ -184,6 +190,8 @@ def _wrong(row: Row, seen: Seen) -> list[str]:
         found.append(f"not good because {sorted(seen.reasons)} instead of {row.why or 'never'}")
     if not expected and seen.program_saw:
         found.append("the program saw it")
+    if expected and seen.reasons and not seen.program_saw and row.wire != "text" and row.name not in BRIEF:
+        found.append("the program did not see it")
     if seen.well_s is None or seen.well_s > row.well_s + 0.05:
         found.append(f"well after {seen.well_s} s instead of {row.well_s}")
     key = (row.wire, row.name)

@@ -1,0 +1,29 @@
+"""A node that says that it is in a state which is none, or in another than it is in."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.can_fault import HEARTBEAT, CanFault, CanPiece
+from emulators.faults.fault import Parameters
+from gateway.core.canframe import CanFrame
+
+
+class Form(Parameters):
+    state: int = Field(default=0x55, ge=0, le=0xFF)
+
+
+class OddHeartbeat(CanFault):
+    name = "odd-heartbeat"
+    summary = (
+        "the node's heartbeat tells `state`: 4 stopped, 5 operational, 127 pre-operational, 0 boot-up, others none"
+    )
+    form = Form
+
+    def aims_at(self, frame: CanFrame, node: int) -> bool:
+        return frame.can_id == HEARTBEAT + node
+
+    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+        return (CanPiece(CanFrame(frame.can_id, bytes((self.parameters.state,)))),)

@@ -1,0 +1,26 @@
+"""Frames of fewer bytes than were agreed."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.can_fault import CanFault, CanPiece
+from emulators.faults.fault import Parameters
+from gateway.core.canframe import CanFrame
+
+
+class Form(Parameters):
+    length: int = Field(default=1, ge=0, le=7)
+
+
+class ShortFrame(CanFault):
+    name = "short-frame"
+    summary = "a frame of the node ends behind `length` bytes (narrow it with `cob_id`)"
+    form = Form
+
+    def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
+        if frame.remote:
+            return (CanPiece(frame),)
+        return (CanPiece(CanFrame(frame.can_id, frame.data[: self.parameters.length], extended=frame.extended)),)

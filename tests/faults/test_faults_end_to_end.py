@@ -89,7 +89,7 @@ ROWS = [
     Row("can", "emcy-burst", "", 0.1),
     Row("can", "sync-jitter", "", 0.1),
     Row("can", "boot-storm", "not_operational", 1.0),
-    Row("can", "late-frame", "timeout heartbeat_lost", 1.5, {"by_ms": 700.0}),
+    Row("sdo", "late-frame", "timeout stale", 1.5, {"by_ms": 350.0, "cob_id": 0x585}),
     Row("can", "short-frame", "wire_error stale heartbeat_lost", 1.5),
     Row("can", "odd-heartbeat", "not_operational heartbeat_lost", 1.5),
     Row("sdo", "odd-sdo", "stale timeout", 1.5, {"command": 0xE0}),

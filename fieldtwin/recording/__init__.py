@@ -1,0 +1,1 @@
+"""Recording what others say on a wire, and asking whether two recordings say the same."""

@@ -19,6 +19,7 @@ from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 from fieldtwin.scenarios.trace import Event, Kind
 from gateway.core.clock import NS_PER_S
 from gateway.core.image import TagKind
+from gateway.runtime.canopen_bus import CanopenBus
 from plc.program import Program, ScanInfo, var_input, var_local, var_output
 
 LASTS_S, AFTER_S, FIRST_S = 2.0, 2.6, 5.0
@@ -118,6 +119,8 @@ class Seen:
 
     reasons: set[str] = field(default_factory=set)
     """Why the tag was not good."""
+    driver_says: set[str] = field(default_factory=set)
+    """What the driver says is wrong with its device: the errors that it shows, and `offline`."""
     program_saw: bool = False
     """That its input was not good."""
     published: int = 0
@@ -196,6 +199,8 @@ class _Run(VirtualRun):
             seen.published += updates - before.get(row.wire, updates)
             seen.values.append(reading.value if reading is not None else None)
         before[row.wire] = updates
+        if at_s < LASTS_S:
+            seen.driver_says |= _said_by_driver(bench, DEVICES[row.wire])
         if not good:
             seen.not_good(reading.reason if reading is not None else "never")
         seen.program_saw |= program is not None and not program.value
@@ -207,6 +212,16 @@ class _Run(VirtualRun):
             for known in bench.run.field.faults.describe():
                 if known["id"] == f"{row.wire} {row.name}":
                     seen.struck = known["struck"]
+
+
+def _said_by_driver(bench: VirtualBench, device: str) -> set[str]:
+    """The kind of error that the gateway's status shows for a device now."""
+    bus: Any = bench.run.gateway.buses[bench.system.devices[device].bus]
+    if isinstance(bus, CanopenBus):
+        state: Any = next(s for s in bus.nodes.values() if s.driver.config.name == device)
+    else:
+        state = next(s for s in bus.devices if s.driver.config.name == device)
+    return {text for text in (state.error, "" if state.online else "offline") if text}
 
 
 def through(

@@ -5,6 +5,7 @@ No value that a device did not hold is ever published as good. A row without rea
 
 from __future__ import annotations
 
+import re
 from typing import Any, NamedTuple
 
 import pytest
@@ -107,6 +108,18 @@ ROWS = [
     Row("can", "set", "", 0.1, {"value": -12.5, "register": "slope_long"}),
 ]
 
+DRIVER_SAYS = {
+    "timeout": "no reply within|does not answer|heartbeat lost",
+    "wire_error": "check sum|answers another request|another function|wrong size",
+    "unreachable": "ended the connection|no reply within",
+    "refused": "refused with exception 04h",
+    "busy": "refused with exception 06h",
+    "heartbeat_lost": "heartbeat lost",
+    "duplicate-node": "two nodes answer",
+}
+"""What the driver's status shows, by why the tag is not good, or by the fault."""
+NOT_A_DRIVERS = {"nan", "short-frame", "boot-storm"}
+"""The driver itself is well with these: values that are none, one TPDO of a node that answers, what is over at once."""
 BRIEF = {"boot-storm"}
 """What a program does not see: it is over before the next scan."""
 ASKED_FOR = {
@@ -181,6 +194,19 @@ def _value(bench: VirtualBench, tag: str) -> Any:
     return reading.value
 
 
+def _wrong_with_driver(row: Row, seen: Seen) -> list[str]:
+    """One object that is not read well leaves a node online, and its driver without an error."""
+    told = [text for text in seen.driver_says if "two nodes" not in text or row.name == "duplicate-node"]
+    if row.wire in ("sdo", "text") or row.name in NOT_A_DRIVERS:
+        return []
+    if not row.why:
+        return [f"the driver says {told}"] if told else []
+    expected = DRIVER_SAYS.get(row.name) or "|".join(DRIVER_SAYS[why] for why in row.why.split() if why in DRIVER_SAYS)
+    if not any(re.search(expected, text) for text in told):
+        return [f"the driver says {told}, and nothing of {expected}"]
+    return []
+
+
 def _wrong(row: Row, seen: Seen) -> list[str]:
     found = []
     if not seen.struck:
@@ -192,6 +218,7 @@ def _wrong(row: Row, seen: Seen) -> list[str]:
         found.append("the program saw it")
     if expected and seen.reasons and not seen.program_saw and row.wire != "text" and row.name not in BRIEF:
         found.append("the program did not see it")
+    found += _wrong_with_driver(row, seen)
     if seen.well_s is None or seen.well_s > row.well_s + 0.05:
         found.append(f"well after {seen.well_s} s instead of {row.well_s}")
     key = (row.wire, row.name)

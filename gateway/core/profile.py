@@ -76,6 +76,7 @@ class Tag:
     scale_by: str | None = None
     bits: tuple[int, int] | None = None
     sentinels: tuple[int, ...] = ()
+    nonvolatile: bool = False
 
     @property
     def registers(self) -> RegisterRange:
@@ -376,6 +377,7 @@ def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterab
             scale_by=t.scale_by,
             bits=t.bits,
             sentinels=tuple(t.sentinels),
+            nonvolatile=t.nonvolatile,
         )
 
 

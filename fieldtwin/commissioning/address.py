@@ -1,0 +1,195 @@
+"""What a person names on a command line, as tags: ``holding:100``, ``40101``, ``6040h:00``, or a tag of a profile.
+
+Pure text handling. A raw address becomes a tag of its own, named as it was asked for, so that everything after this knows tags
+only and decodes them with the gateway's codec.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from gateway.core.errors import UsageError
+from gateway.core.profile import INTEGER_RANGES, REGISTERS_OF, DeviceProfile, RegisterRange, Tag, resolve_address
+from gateway.protocols.canopen.datatypes import DataType
+from gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
+
+AUTO = "auto"
+"""The type of a CANopen object of which nothing is known: what its length says."""
+
+ORDERS = ("ABCD", "CDAB", "BADC", "DCBA")
+TYPES = (*REGISTERS_OF, "int8", "uint8", "string", "bytes")
+
+_OBJECT = re.compile(r"^(?:0x)?([0-9A-Fa-f]{4})h?(?:[:.]([0-9A-Fa-f]{1,2})h?)?$")
+_REGISTER = re.compile(r"^(?:(?:coil|discrete|input|holding):.*|[0-9]{5,6})$")
+_STORING = {0x1010: "stores parameters", 0x1011: "restores factory values"}
+_OF_TYPE_CODE = {
+    DataType.BOOLEAN: "bool", DataType.INTEGER8: "int8", DataType.INTEGER16: "int16", DataType.INTEGER32: "int32",
+    DataType.INTEGER64: "int64", DataType.UNSIGNED8: "uint8", DataType.UNSIGNED16: "uint16", DataType.UNSIGNED32: "uint32",
+    DataType.UNSIGNED64: "uint64", DataType.REAL32: "float32", DataType.REAL64: "float64",
+    DataType.VISIBLE_STRING: "string",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class RawForm:
+    """How raw addresses are read: `type` None is uint16, bool for bits, and what its length says for an object; `registers`
+    is the length of text; `count` values stand one behind the other."""
+
+    type: str | None = None
+    order: str = "ABCD"
+    count: int = 1
+    registers: int = 1
+
+    def __post_init__(self) -> None:
+        if self.type is not None and self.type not in TYPES:
+            raise UsageError("no such type", expected=", ".join(TYPES), got=self.type)
+        if self.order not in ORDERS:
+            raise UsageError("no such byte order", expected=", ".join(ORDERS), got=self.order)
+        if not 1 <= self.count <= 2000 or not 1 <= self.registers <= 125:
+            raise UsageError("count or length out of range", expected="1 to 2000 values, 1 to 125 registers")
+
+
+def tags_of(
+    items: Sequence[str],
+    protocol: str,
+    form: RawForm | None = None,
+    profile: DeviceProfile | None = None,
+    dictionary: ObjectDictionary | None = None,
+) -> list[Tag]:
+    """The tags that `items` name, in their order and each once. Without items: every readable tag of the profile.
+
+    A name is looked for in the profile first (a shell pattern takes all that it fits: ``voltage_*``), then in the EDS; the rest
+    are raw addresses. Raises `UsageError` that names what was meant.
+    """
+    form = form or RawForm()
+    if not items:
+        if profile is None:
+            example = "holding:100" if protocol == "modbus" else "6041h:00"
+            raise UsageError("nothing to read", expected=f"an address such as {example}, or --profile NAME")
+        return [t for t in profile.tags.values() if t.readable]
+    found: dict[str, Tag] = {}
+    for item in items:
+        found |= {tag.name: tag for tag in _tags(item, protocol, form, profile, dictionary)}
+    return list(found.values())
+
+
+def _tags(
+    item: str, protocol: str, form: RawForm, profile: DeviceProfile | None, dictionary: ObjectDictionary | None
+) -> list[Tag]:
+    if profile is not None:
+        named = _by_name(item, profile.tags)
+        if named:
+            return named
+    if protocol == "modbus" and _REGISTER.match(item):
+        return _registers(item, form)
+    if protocol == "canopen" and (match := _OBJECT.match(item)):
+        index, sub = int(match[1], 16), int(match[2] or "0", 16)
+        return _objects(index, sub, form, dictionary)
+    if dictionary is not None:
+        entry = dictionary.find(item)
+        return [tag_of_entry(entry)]
+    known = list(profile.tags) if profile is not None else []
+    near = difflib.get_close_matches(item, known, n=1)
+    raw = "holding:100 or 40101" if protocol == "modbus" else "6041h:00"
+    raise UsageError(
+        f"nothing is called {item!r}",
+        expected=f"{'a tag of the profile, or ' if known else ''}an address such as {raw}",
+        hint=f"did you mean {near[0]!r}?" if near else "",
+    )
+
+
+def _by_name(item: str, tags: Mapping[str, Tag]) -> list[Tag]:
+    if item in tags:
+        return [tags[item]]
+    if not set(item) & set("*?["):
+        return []
+    pattern = re.compile("".join({"*": ".*", "?": "."}.get(c, re.escape(c)) for c in item))
+    return [tag for name, tag in tags.items() if pattern.fullmatch(name)]
+
+
+def _registers(item: str, form: RawForm) -> list[Tag]:
+    try:
+        first = resolve_address(item, "printed")
+        bits = first.table in ("coil", "discrete")
+        kind = form.type or ("bool" if bits else "uint16")
+        if kind in ("int8", "uint8") or (bits and kind != "bool"):
+            raise ValueError(f"a {kind} does not stand in the table {first.table}")
+        step = REGISTERS_OF.get(kind, form.registers)
+        whole = resolve_address(item, "printed", step * form.count)
+    except ValueError as e:
+        raise UsageError(str(e)) from e
+    return [
+        raw_tag(
+            f"{whole.table}:{whole.address + i * step}",
+            kind,
+            at=RegisterRange(whole.table, whole.address + i * step, step),
+            order=form.order,
+        )
+        for i in range(form.count)
+    ]
+
+
+def _objects(index: int, sub: int, form: RawForm, dictionary: ObjectDictionary | None) -> list[Tag]:
+    if sub + form.count > 256:
+        raise UsageError("the subindices end at FFh", got=f"{sub:02X}h with {form.count} values")
+    tags = []
+    for i in range(sub, sub + form.count):
+        entry = dictionary.get(index, i) if dictionary is not None else None
+        if entry is not None and form.type is None:
+            tags.append(replace(tag_of_entry(entry), name=object_name(index, i)))
+        else:
+            tags.append(raw_tag(object_name(index, i), form.type or AUTO, object_=(index, i)))
+    return tags
+
+
+def object_name(index: int, subindex: int) -> str:
+    """``6041h:00``."""
+    return f"{index:04X}h:{subindex:02X}"
+
+
+def tag_of_entry(entry: DictionaryEntry) -> Tag:
+    """An entry of an EDS as a tag: its type, its access and its limits are what the file says."""
+    kind = _OF_TYPE_CODE.get(
+        DataType(entry.type_code) if entry.type_code in set(DataType) else DataType.DOMAIN, "bytes"
+    )
+    limits = None
+    if kind in INTEGER_RANGES and (entry.low is not None or entry.high is not None):
+        low, high = INTEGER_RANGES[kind]
+        limits = (float(low if entry.low is None else entry.low), float(high if entry.high is None else entry.high))
+    access = "wo" if entry.access == "wo" else "rw" if entry.writable else "ro"
+    tag = raw_tag(entry.name, kind, object_=(entry.index, entry.subindex))
+    return replace(tag, access=access, range=limits)
+
+
+def raw_tag(
+    name: str,
+    kind: str,
+    *,
+    at: RegisterRange | None = None,
+    object_: tuple[int, int] | None = None,
+    order: str = "ABCD",
+) -> Tag:
+    """A tag of which nothing is known but where it stands and how it is read; whether it may be written the device tells."""
+    fixed = at is not None and at.table in ("discrete", "input")
+    stores = object_ is not None and object_[0] in _STORING
+    return Tag(
+        name=name,
+        type=kind,
+        at=at,
+        object=object_,
+        order=order,
+        poll="asked",
+        access="ro" if fixed else "rw",
+        unit="",
+        scale=1.0,
+        offset=0.0,
+        values=(),
+        range=None,
+        counter=False,
+        secret=False,
+        danger=_STORING[object_[0]] if stores and object_ is not None else "",
+        nonvolatile=stores,
+    )

@@ -1,0 +1,292 @@
+"""One device at the end of a wire, as the commissioning verbs use it: read tags, write one, show the frames without sending.
+
+It must never decide what may be written (`writing` does), nor know a file or a screen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+from fieldtwin.commissioning.address import AUTO
+from fieldtwin.commissioning.live import frame_of
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import CrcError, Desync, DeviceRefused, ModbusExceptionReply, ReplyTimeout, SdoAborted
+from gateway.core.profile import DeviceProfile, RegisterRange, Tag
+from gateway.core.profile_schema import Limits, ProfileForm
+from gateway.core.values import Quality, Reason, Scalar, TagValue
+from gateway.devices.codec import apply_scale, decode, decode_little, encode, reorder
+from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, plan_reads
+from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.canopen.sdo import SdoDownload, SdoUpload
+from gateway.protocols.modbus.client import ModbusClient
+from gateway.protocols.modbus.framings import framing_of
+from gateway.protocols.modbus.request import Request
+from gateway.protocols.modbus.requests import (
+    ReadBits,
+    ReadRegisters,
+    WriteCoil,
+    WriteCoils,
+    WriteRegister,
+    WriteRegisters,
+)
+
+WIRE_TROUBLE = (ReplyTimeout, CrcError, Desync)
+OBJECT_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int32": 4, "uint32": 4, "float32": 4}
+"""Bytes of an object of that type; 8 for the others that are numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A tag's value, or why there is none: then the value is bad and `problem` says what the device or the wire said."""
+
+    value: TagValue
+    problem: str = ""
+
+
+class Point(Protocol):
+    """A device that can be asked. Frames are as on the wire, one line of hex or candump's text each."""
+
+    protocol: str
+    where: str
+    requests: int
+    """How many requests, or transfers, were sent for it."""
+
+    async def read(self, tags: Sequence[Tag]) -> dict[str, Answer]:
+        """Each tag's value by name, in as few requests as possible. What the device refuses or the wire loses is an answer
+        too; raises only what ends the connection."""
+        ...
+
+    async def write(self, tag: Tag, data: bytes) -> None:
+        """Write the bytes of `encoded` in one request, once. Raises the errors of wire and device."""
+        ...
+
+    def read_frames(self, tags: Sequence[Tag]) -> list[str]:
+        """What `read` would send first."""
+        ...
+
+    def write_frames(self, tag: Tag, data: bytes) -> list[str]:
+        """What `write` would send."""
+        ...
+
+
+def encoded(tag: Tag, value: Scalar) -> bytes:
+    """The bytes of an engineering value as they stand on the wire: registers, or an object's little-endian bytes.
+
+    Raises `NotAllowed` for what the tag cannot hold. Bytes are taken as they are.
+    """
+    if isinstance(value, bytes):
+        return value
+    data = encode(tag, value)
+    if tag.at is not None:
+        return data
+    big = reorder(data, tag.order)
+    return big[::-1][: OBJECT_BYTES.get(tag.type, 8)]
+
+
+def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:
+    """The value in `data`. An object of unknown type is an unsigned number where it has the length of one, else text or bytes."""
+    if tag.at is not None:
+        return decode(tag, data, t_ns)
+    if tag.type == AUTO:
+        text = len(data) > 4 and data.rstrip(b"\0").isascii() and data.rstrip(b"\0").decode("ascii").isprintable()
+        kind = f"uint{8 * len(data)}" if len(data) in (1, 2, 4) else "string" if text else "bytes"
+        tag = replace(tag, type=kind)
+    size = OBJECT_BYTES.get(tag.type, None if tag.is_text else 8)
+    if size is not None and len(data) != size:  # another type than was said: shown, and never decoded as something else
+        return TagValue(data, Quality.UNCERTAIN, Reason.NOT_A_NUMBER, t_ns, data)
+    return decode_little(tag, data, t_ns)
+
+
+class ModbusPoint:
+    """`unit` at `url`, asked through `client`. `profile` gives its limits and gaps; what it teaches is kept in `learnt`."""
+
+    protocol = "modbus"
+
+    def __init__(self, client: ModbusClient | None, url: str, unit: int, profile: DeviceProfile | None = None) -> None:
+        self.where = f"{url} unit {unit}"
+        self.unit = unit
+        self.learnt = Learnt()
+        self.requests = 0
+        self._client = client
+        self._url = url
+        self._profile = profile
+        self._plans: dict[tuple[str, ...], GroupPlan] = {}
+
+    @property
+    def is_broadcast(self) -> bool:
+        """Whether all units of the line are meant."""
+        return self.unit == 0 and framing_of(Endpoint.parse(self._url)) in ("rtu", "ascii")
+
+    @property
+    def client(self) -> ModbusClient:
+        assert self._client is not None, "a dry run sends nothing"
+        return self._client
+
+    async def read(self, tags: Sequence[Tag]) -> dict[str, Answer]:
+        """As `Point.read`. A tag that is scaled by another one brings that along."""
+        asked = self._with_scales(tags)
+        plan = self._plan(asked)
+        answers: dict[str, Answer] = {}
+        todo = list(plan.reads)
+        while todo:
+            read = todo.pop(0)
+            try:
+                raw, t_ns = await self._transaction(read.range)
+            except ModbusExceptionReply as e:
+                parts = plan.refused(read, e.code) if e.code in (ILLEGAL_ADDRESS, TOO_LONG) else ()
+                todo[:0] = parts
+                if not parts:
+                    answers |= _bad(read.tags, Reason.REFUSED, e)
+            except WIRE_TROUBLE as e:
+                reason = Reason.TIMEOUT if isinstance(e, ReplyTimeout) else Reason.WIRE_ERROR
+                answers |= _bad(read.tags, reason, e)
+            else:
+                plan.taken(read)
+                answers |= {t.name: Answer(decode(t, part(read.range, t.registers, raw), t_ns)) for t in read.tags}
+        plan.pass_ended()
+        return {t.name: self._scaled(t, answers) for t in tags if t.name in answers}
+
+    async def write(self, tag: Tag, data: bytes) -> None:
+        """As `Point.write`; the function is the one that the profile's limits leave."""
+        self.requests += 1
+        await self.client.execute(self.unit, write_request(tag, data, self._functions))
+
+    def read_frames(self, tags: Sequence[Tag]) -> list[str]:
+        return [self._frame(_read_request(r.range)) for r in self._plan(self._with_scales(tags)).reads]
+
+    def write_frames(self, tag: Tag, data: bytes) -> list[str]:
+        return [self._frame(write_request(tag, data, self._functions))]
+
+    @property
+    def _functions(self) -> list[int] | None:
+        return self._profile.form.limits.functions if self._profile is not None else None
+
+    def _frame(self, request: Request[Any]) -> str:
+        return frame_of(self._url, self.unit, request).hex(" ")
+
+    async def _transaction(self, at: RegisterRange) -> tuple[bytes, int]:
+        self.requests += 1
+        if at.table == "coil" or at.table == "discrete":
+            bits = await self.client.read_bits(self.unit, at.table, at.address, at.count)
+            return bytes(bits.bits), bits.t_ns
+        reply = await self.client.read_registers(self.unit, at.table, at.address, at.count)
+        return reply.raw, reply.t_ns
+
+    def _with_scales(self, tags: Sequence[Tag]) -> list[Tag]:
+        known = {t.name: t for t in tags}
+        if self._profile is not None:
+            for tag in tags:
+                if tag.scale_by is not None:
+                    known.setdefault(tag.scale_by, self._profile.tags[tag.scale_by])
+        return list(known.values())
+
+    def _scaled(self, tag: Tag, answers: dict[str, Answer]) -> Answer:
+        answer = answers[tag.name]
+        if tag.scale_by is None or answer.problem:
+            return answer
+        by = answers.get(tag.scale_by)
+        return Answer(apply_scale(tag, answer.value, by.value if by is not None else None))
+
+    def _plan(self, tags: Sequence[Tag]) -> GroupPlan:
+        """The gateway's own planner over just these tags; asked for again, it knows what was learnt."""
+        key = tuple(t.name for t in tags)
+        if key not in self._plans:
+            self._plans[key] = GroupPlan(asked_profile(tags, self._profile), "asked", self.learnt)
+        return self._plans[key]
+
+
+class CanopenPoint:
+    """`node` on the bus at `url`, asked over SDO through `master`; it is never commanded to another state."""
+
+    protocol = "canopen"
+
+    def __init__(self, master: CanopenMaster | None, url: str, node: int) -> None:
+        self.where = f"{url} node {node}"
+        self.node = node
+        self.requests = 0
+        self._master = master
+
+    @property
+    def master(self) -> CanopenMaster:
+        assert self._master is not None, "a dry run sends nothing"
+        return self._master
+
+    async def read(self, tags: Sequence[Tag]) -> dict[str, Answer]:
+        """As `Point.read`: one transfer a tag."""
+        answers: dict[str, Answer] = {}
+        for tag in tags:
+            assert tag.object is not None
+            self.requests += 1
+            try:
+                data = await self.master.sdo_upload(self.node, *tag.object)
+            except SdoAborted as e:
+                answers |= _bad([tag], Reason.REFUSED, e)
+            except WIRE_TROUBLE as e:
+                answers |= _bad([tag], Reason.TIMEOUT if isinstance(e, ReplyTimeout) else Reason.WIRE_ERROR, e)
+            else:
+                answers[tag.name] = Answer(decoded(tag, data, 1))
+        return answers
+
+    async def write(self, tag: Tag, data: bytes) -> None:
+        assert tag.object is not None
+        self.requests += 1
+        await self.master.sdo_download(self.node, *tag.object, data)
+
+    def read_frames(self, tags: Sequence[Tag]) -> list[str]:
+        return [str(SdoUpload(self.node, *t.object, 0).start(0)) for t in tags if t.object is not None]
+
+    def write_frames(self, tag: Tag, data: bytes) -> list[str]:
+        assert tag.object is not None
+        return [str(SdoDownload(self.node, *tag.object, 0, data).start(0))]
+
+
+def asked_profile(tags: Sequence[Tag], profile: DeviceProfile | None) -> DeviceProfile:
+    """A profile of `tags` alone, in one group ``asked``, with the limits and gaps of `profile`. Without one nothing is known:
+    reads go as far as the standard lets them, and never over a register that was not asked for."""
+    form = profile.form if profile is not None else ProfileForm(
+        device="raw/raw", source="", protocol="modbus", limits=Limits(max_gap=0)
+    )  # fmt: skip
+    named = {t.name: replace(t, poll="asked", access="rw") for t in tags}
+    gaps = profile.gaps if profile is not None else ()
+    return DeviceProfile("", "", form, named, {}, None, None, None, gaps)
+
+
+def planned(tags: Sequence[Tag], profile: DeviceProfile | None) -> tuple[Read, ...]:
+    """The fewest reads for `tags` (`plan_reads`)."""
+    return plan_reads(asked_profile(tags, profile), "asked")
+
+
+def part(read: RegisterRange, at: RegisterRange, raw: bytes) -> bytes:
+    """The bytes of `at` out of what `read` brought (bits one a byte)."""
+    width = 1 if read.table in ("coil", "discrete") else 2
+    start = (at.address - read.address) * width
+    return raw[start : start + at.count * width]
+
+
+def write_request(tag: Tag, data: bytes, functions: Sequence[int] | None) -> Request[Any]:
+    """The one request that writes `tag`: 05 or 0Fh for a coil, 06 for one register where the device has it or is unknown,
+    else 10h."""
+    at = tag.registers
+    if at.table == "coil":
+        value = bool(int.from_bytes(data))
+        if functions is not None and 5 not in functions:
+            return WriteCoils(at.address, (value,))
+        return WriteCoil(at.address, value)
+    words = tuple(int.from_bytes(data[i : i + 2]) for i in range(0, len(data), 2))
+    if len(words) == 1 and (functions is None or 6 in functions):
+        return WriteRegister(at.address, words[0])
+    return WriteRegisters(at.address, words)
+
+
+def _read_request(at: RegisterRange) -> Request[Any]:
+    if at.table == "coil" or at.table == "discrete":
+        return ReadBits(at.table, at.address, at.count)
+    return ReadRegisters(at.table, at.address, at.count)
+
+
+def _bad(
+    tags: Sequence[Tag], reason: Reason, error: DeviceRefused | ReplyTimeout | CrcError | Desync
+) -> dict[str, Answer]:
+    return {t.name: Answer(TagValue(None, Quality.BAD, reason), error.message) for t in tags}

@@ -1,0 +1,124 @@
+"""Modbus frames for checks: requests made by hand, the damaged ones included, and replies found in whatever came back.
+
+Pure. A driver's framer refuses what is odd; here odd is what is looked for, so that nothing is thrown away: what is no
+frame is kept as `rest`. Sources: MODBUS over Serial Line V1.02 (SL), Messaging on TCP/IP V1.0b (TG).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from gateway.protocols.modbus.ascii import lrc
+from gateway.protocols.modbus.crc import crc16, with_crc
+from gateway.protocols.modbus.frame_shapes import MAX_FRAME, frame_lengths
+
+NO_TRANSACTION = -1
+_ASCII_FRAME = re.compile(rb":([0-9A-F]{6,512})\r\n")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A whole reply of somebody. `transaction` is `NO_TRANSACTION` on a line."""
+
+    unit: int
+    pdu: bytes
+    transaction: int = NO_TRANSACTION
+
+    @property
+    def refusal(self) -> int:
+        """The exception code, 0 where it is none (AP 7)."""
+        return self.pdu[1] if self.pdu[0] & 0x80 and len(self.pdu) == 2 else 0
+
+    def __str__(self) -> str:
+        if self.refusal:
+            return f"exception {self.refusal:02X}"
+        return short(self.pdu)
+
+
+def short(data: bytes, most: int = 16) -> str:
+    """Bytes as people read them: ``03 02 00 AA``."""
+    more = f" and {len(data) - most} more" if len(data) > most else ""
+    return data[:most].hex(" ").upper() + more
+
+
+def framed(framing: str, unit: int, pdu: bytes, transaction: int = 1) -> bytes:
+    """`pdu` to `unit` as it goes on a wire of `framing`: rtu, ascii, mbap or udp."""
+    body = bytes((unit,)) + pdu
+    if framing == "rtu":
+        return with_crc(body)
+    if framing == "ascii":
+        return ascii_frame(body)
+    return mbap(body, transaction)
+
+
+def ascii_frame(body: bytes, check: int | None = None) -> bytes:
+    """``:`` hex, LRC, CR LF (SL 2.5.2.1); another check sum if `check` says so."""
+    return b":" + (body + bytes((lrc(body) if check is None else check,))).hex().upper().encode() + b"\r\n"
+
+
+def mbap(body: bytes, transaction: int, protocol: int = 0, length: int | None = None) -> bytes:
+    """An ADU of unit and PDU (TG 3.1.3), with fields that are wrong if so wanted."""
+    said = len(body) if length is None else length
+    return transaction.to_bytes(2) + protocol.to_bytes(2) + said.to_bytes(2) + body
+
+
+def replies(framing: str, data: bytes) -> tuple[list[Answer], bytes]:
+    """All whole replies in `data`, in order, and what is none of them or not whole yet."""
+    if framing == "rtu":
+        return _rtu_replies(data)
+    if framing == "ascii":
+        return _ascii_replies(data)
+    return _mbap_replies(data)
+
+
+def _rtu_replies(data: bytes) -> tuple[list[Answer], bytes]:
+    answers: list[Answer] = []
+    rest = bytearray()
+    at = 0
+    while at < len(data):
+        length = _rtu_length(data[at : at + MAX_FRAME])
+        if length:
+            answers.append(Answer(data[at], data[at + 1 : at + length - 2]))
+            at += length
+        else:
+            rest.append(data[at])
+            at += 1
+    return answers, bytes(rest)
+
+
+def _rtu_length(data: bytes) -> int:
+    """Of the frame that `data` begins with, 0 if it is none: the lengths that its function can have first, then any."""
+    if len(data) < 4:
+        return 0
+    likely, _ = frame_lengths(data)
+    for length in [*likely, *range(4, len(data) + 1)]:
+        if length <= len(data) and crc16(data[: length - 2]) == int.from_bytes(data[length - 2 : length], "little"):
+            return length
+    return 0
+
+
+def _ascii_replies(data: bytes) -> tuple[list[Answer], bytes]:
+    answers: list[Answer] = []
+    rest, at = bytearray(), 0
+    for match in _ASCII_FRAME.finditer(data):
+        text = match[1]
+        body = bytes.fromhex(text.decode()) if len(text) % 2 == 0 else b""
+        if len(body) < 3 or lrc(body[:-1]) != body[-1]:
+            continue
+        rest += data[at : match.start()]
+        answers.append(Answer(body[0], body[1:-1]))
+        at = match.end()
+    return answers, bytes(rest + data[at:])
+
+
+def _mbap_replies(data: bytes) -> tuple[list[Answer], bytes]:
+    answers: list[Answer] = []
+    at = 0
+    while len(data) - at >= 8:
+        protocol, length = int.from_bytes(data[at + 2 : at + 4]), int.from_bytes(data[at + 4 : at + 6])
+        if protocol or not 2 <= length <= 254 or len(data) - at < 6 + length:
+            break
+        answers.append(Answer(data[at + 6], data[at + 7 : at + 6 + length], int.from_bytes(data[at : at + 2])))
+        at += 6 + length
+    return answers, data[at:]

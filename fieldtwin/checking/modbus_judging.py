@@ -1,0 +1,68 @@
+"""What many Modbus cases ask: was it refused as it must be, was it met with silence, is all well again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fieldtwin.checking.device_case import NotHere
+from fieldtwin.checking.modbus_frames import Answer
+from fieldtwin.checking.modbus_wire import Heard, ModbusWire
+from fieldtwin.conformance.case import Finding, failed, passed
+
+NAMES = {1: "illegal function", 2: "illegal data address", 3: "illegal data value", 4: "device failure", 6: "busy"}
+
+
+def named(code: int) -> str:
+    """``exception 03``, with its name where it has one."""
+    return f"exception {code:02X}" + (f" ({NAMES[code]})" if code in NAMES else "")
+
+
+def refused(pdu: bytes, answer: Answer, *codes: int) -> str:
+    """Empty if `answer` refuses the request `pdu` with one of `codes`, else what is wrong."""
+    wanted = " or ".join(f"{code:02X}" for code in codes)
+    if answer.refusal and answer.pdu[0] != pdu[0] | 0x80:
+        return f"refuses function {answer.pdu[0] & 0x7F:02X} instead of {pdu[0]:02X}: {answer.pdu.hex(' ').upper()}"
+    if answer.refusal in codes:
+        return ""
+    if answer.refusal:
+        return f"{named(answer.refusal)} instead of {wanted}"
+    return f"answers {answer} instead of exception {wanted}"
+
+
+async def must_refuse(wire: ModbusWire, pdu: bytes, *codes: int, may_lack: bool = True) -> Finding:
+    """Send it; the device has to refuse it with one of `codes`, and go on. `may_lack`: exception 01 means that it has no such
+    function, and the case is skipped."""
+    heard = await wire.ask(pdu)
+    answer = heard.first
+    if answer is None or answer.unit != wire.unit:
+        after = await wire.still_good()
+        return failed(f"{heard} instead of {named(codes[0])}" + (f"; the next request: {after}" if after else ""))
+    if may_lack and answer.refusal == 0x01 and 0x01 not in codes:
+        raise NotHere(f"it has no function {pdu[0]:02X}")
+    wrong = refused(pdu, answer, *codes)
+    return failed(wrong) if wrong else passed(named(answer.refusal))
+
+
+async def silent_then_good(wire: ModbusWire, heard: Heard) -> Finding:
+    """`heard` has to be nothing, and a request afterwards is answered."""
+    if not heard.nothing:
+        return failed(f"{heard} instead of silence")
+    after = await wire.still_good()
+    return (
+        failed(f"the request afterwards: {after}") if after else passed("silence; the request afterwards is answered")
+    )
+
+
+def answers_good(wire: ModbusWire, heard: Heard, times: int) -> bool:
+    """Whether `heard` is the usual answer, so many times, and nothing else."""
+    return len(heard.answers) == times and all(wire.is_good(a) for a in heard.answers) and not heard.rest
+
+
+def first_table(wire: ModbusWire, functions: Sequence[int]) -> tuple[int, int, int]:
+    """(function, address, count) of a read that is answered. Raises `NotHere` where none of `functions` has one."""
+    for function in functions:
+        if function in wire.readable:
+            return function, *wire.readable[function]
+    raise NotHere(
+        "nothing was found that can be read" if len(functions) > 2 else "it has no such table, as far as seen"
+    )

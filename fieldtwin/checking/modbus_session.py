@@ -1,0 +1,114 @@
+"""A check of a Modbus device from beginning to end: open, learn, ask who it is, play the cases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AsyncExitStack
+from dataclasses import dataclass, field
+
+from fieldtwin.checking.device_case import DeviceResult
+from fieldtwin.checking.modbus_cases import CASES
+from fieldtwin.checking.modbus_learn import learn
+from fieldtwin.checking.modbus_wire import ModbusWire
+from fieldtwin.checking.run import Plan, Transcript, play
+from fieldtwin.commissioning.live import bytes_at
+from gateway.core.clock import Clock
+from gateway.core.connection import ByteConnection, Connector, Tap
+from gateway.core.endpoint import Endpoint
+from gateway.protocols.modbus.framings import framing_of
+from gateway.wallclock import WallClock
+
+OBJECT_NAMES = {
+    0: "vendor",
+    1: "product code",
+    2: "revision",
+    3: "vendor URL",
+    4: "product",
+    5: "model",
+    6: "application",
+}
+"""AP 6.21, table of object ids."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModbusOptions:
+    """How to check: `given` table -> address that can be read; `may_write` table -> (address, count) of cells that are
+    lent for writing; `go_on` says why nothing more may be sent, or nothing."""
+
+    endpoint: str
+    unit: int
+    plan: Plan
+    timeout_s: float = 1.0
+    spacing_s: float = 0.05
+    echo: bool = False
+    given: dict[str, int] = field(default_factory=dict)
+    may_write: dict[str, tuple[int, int]] = field(default_factory=dict)
+    taps: Sequence[Tap] = ()
+    connector: Connector | None = None
+    clock: Clock | None = None
+    go_on: Callable[[], str] = lambda: ""
+
+
+def traits_of(endpoint: Endpoint) -> frozenset[str]:
+    """What cases call the wire: ``rtu-line``, ``ascii-line``, ``rtu-stream``, ``mbap-stream``, ``udp``."""
+    framing = framing_of(endpoint)
+    if framing == "udp":
+        return frozenset({"udp"})
+    kind = "line" if endpoint.is_serial else "stream"
+    return frozenset({f"{framing}-{kind}"} | ({"serial"} if endpoint.is_serial else set()))
+
+
+async def check_modbus(
+    options: ModbusOptions,
+    say: Callable[[str], None] = lambda text: None,
+    tell: Callable[[DeviceResult], None] = lambda result: None,
+) -> tuple[dict[str, str], list[DeviceResult]]:
+    """What the device says of itself, and the results. Raises `Unreachable` where nobody answers."""
+    endpoint = Endpoint.parse(options.endpoint)
+    clock = options.clock or WallClock()
+    transcript = Transcript(clock)
+    async with AsyncExitStack() as opened:
+
+        async def open_wire() -> ByteConnection:
+            taps = (transcript, *options.taps)
+            return await opened.enter_async_context(
+                bytes_at(options.endpoint, taps=taps, connector=options.connector, clock=clock)
+            )
+
+        wire = ModbusWire(
+            open_wire, clock, framing_of(endpoint), options.unit, traits=traits_of(endpoint), timeout_s=options.timeout_s,
+            spacing_s=options.spacing_s, char_s=endpoint.serial.char_time_s if endpoint.is_serial else 0.0, echo=options.echo,
+        )  # fmt: skip
+        wire.may_write = dict(options.may_write)
+        await learn(wire, options.given)
+        say(f"the usual request is {wire.good.hex(' ').upper()}, its answer {wire.good_reply.hex(' ').upper()}")
+        identity = await read_identity(wire)
+        results = await play(wire, CASES, options.plan, transcript, clock, tell, options.go_on)
+        await wire.aclose()
+    return identity, results
+
+
+async def read_identity(wire: ModbusWire) -> dict[str, str]:
+    """What the device says of itself by FC 43/14 and FC 17; empty where it says nothing."""
+    identity: dict[str, str] = {}
+    for code in (0x01, 0x02):
+        answer = (await wire.ask(bytes((0x2B, 0x0E, code, 0)))).first
+        if answer is None or answer.refusal or len(answer.pdu) < 7:
+            break
+        place = 7
+        while place + 2 <= len(answer.pdu):
+            raw = answer.pdu[place + 2 : place + 2 + answer.pdu[place + 1]]
+            name = OBJECT_NAMES.get(answer.pdu[place], f"object {answer.pdu[place]:02X}")
+            if text := shown(raw):
+                identity[name] = text
+            place += 2 + answer.pdu[place + 1]
+    answer = (await wire.ask(b"\x11")).first
+    if answer is not None and not answer.refusal and len(answer.pdu) > 2:
+        identity["server id"] = shown(answer.pdu[2:]) or answer.pdu[2:].hex(" ").upper()
+    await wire.settle()
+    return identity
+
+
+def shown(raw: bytes) -> str:
+    """A device's text as it can be shown, at most 80 characters; empty where nothing can."""
+    return "".join(chr(b) for b in raw if 32 <= b < 127).strip()[:80]

@@ -1,0 +1,241 @@
+"""A Modbus wire as a checker holds it: any bytes out, every byte in, and the device's way of answering when all is well.
+
+It must never know what a case is about. It keeps what may be sent to what the case's danger allows, by a list of functions:
+a case that would send more is our bug.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+
+from fieldtwin.checking.modbus_frames import Answer, framed, replies, short
+from fieldtwin.conformance.case import Danger
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import ByteConnection
+from gateway.core.errors import Bug, ConnectionLost, Unreachable
+
+READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x11, 0x18, 0x2B})
+"""Functions that change nothing in any device that keeps to the standard, with whatever parameters."""
+WRITES = frozenset({0x05, 0x06, 0x0F, 0x10, 0x16, 0x17})
+IDENTIFICATION = b"\x2b\x0e"
+"""What may be asked by function 2B; it carries CANopen's services as well, which may write."""
+MOST_HEARD = 65_536
+"""Bytes that a device may say at once; one that says more babbles."""
+GATEWAY_SAYS_NO = (0x0A, 0x0B)
+"""Exceptions of a gateway that has no such device: nobody is there."""
+
+Open = Callable[[], Awaitable[ByteConnection]]
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What came: whole replies, what is none, and whether the device hung up."""
+
+    answers: tuple[Answer, ...]
+    rest: bytes = b""
+    closed: bool = False
+
+    @property
+    def first(self) -> Answer | None:
+        return self.answers[0] if self.answers else None
+
+    @property
+    def nothing(self) -> bool:
+        return not self.answers and not self.rest
+
+    def __str__(self) -> str:
+        said = [str(answer) for answer in self.answers]
+        said += [f"{short(self.rest)}, which is no frame"] if self.rest else []
+        said += ["hangs up"] if self.closed else []
+        return ", ".join(said) or "silence"
+
+
+class ModbusWire:
+    """One wire to one unit.
+
+    `framing` is rtu, ascii, mbap or udp; `traits` name the wire for cases (the framing, ``serial`` or ``stream``).
+    `timeout_s` is how long a reply may take, and how long silence is waited for; `spacing_s` rests between two requests;
+    `char_s` is the time of a character on a serial line.
+    """
+
+    def __init__(
+        self,
+        open_wire: Open,
+        clock: Clock,
+        framing: str,
+        unit: int,
+        *,
+        traits: frozenset[str] = frozenset(),
+        timeout_s: float = 1.0,
+        spacing_s: float = 0.05,
+        char_s: float = 0.0,
+        echo: bool = False,
+    ) -> None:
+        self.framing, self.unit, self.traits = framing, unit, traits
+        self.timeout_s, self.char_s = timeout_s, char_s
+        self.pause_s = max(4 * char_s, 0.005)
+        """A silence that ends any frame (SL 2.5.1.1: 3.5 characters, 1.75 ms at least), with something to spare."""
+        self.danger = Danger.READ
+        self.good = b""
+        """The request by which it is seen that all is well: a read."""
+        self.good_reply = b""
+        self.readable: dict[int, tuple[int, int]] = {}
+        """Function -> (address, count) of a read that is answered with values."""
+        self.refused: dict[int, int] = {}
+        """Function -> the exception that it always gave instead."""
+        self.may_write: dict[str, tuple[int, int]] = {}
+        """``holding`` and ``coil`` -> (address, count) of cells that the user gave for writing."""
+        self._open, self.clock = open_wire, clock
+        self._spacing_s = max(spacing_s, self.pause_s) if char_s else spacing_s
+        self._echo = echo
+        self._echo_left = b""
+        self._connection: ByteConnection | None = None
+        self._closed = False
+        self._transaction = 0
+        self._quiet_since_ns = clock.monotonic_ns() - round(self._spacing_s * NS_PER_S)
+
+    # -- the connection ------------------------------------------------------------------------------------------
+
+    async def reopen(self) -> None:
+        """A new connection; the old one is closed first. Raises `Unreachable`."""
+        await self.aclose()
+        self._connection = await self._open()
+        self._closed = False
+
+    async def open_another(self) -> ByteConnection:
+        """One more, beside ours; whoever asks for it closes it."""
+        return await self._open()
+
+    async def aclose(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            await connection.aclose()
+
+    @property
+    def serial(self) -> bool:
+        return "serial" in self.traits
+
+    # -- saying and hearing ----------------------------------------------------------------------------------------
+
+    def next_transaction(self) -> int:
+        self._transaction = self._transaction % 0xFFFE + 1
+        return self._transaction
+
+    def frame(self, pdu: bytes, unit: int | None = None, transaction: int | None = None) -> bytes:
+        """`pdu` as it goes on this wire."""
+        number = self.next_transaction() if transaction is None else transaction
+        return framed(self.framing, self.unit if unit is None else unit, pdu, number)
+
+    async def say(self, data: bytes, *carries: bytes, at_once: bool = False) -> None:
+        """Send `data`, in which the PDUs `carries` are; the rest between two requests is kept unless `at_once`."""
+        for pdu in carries:
+            self._must_be_allowed(pdu)
+        if self._connection is None or self._closed:
+            await self.reopen()
+        if not at_once:
+            await self._rest()
+        assert self._connection is not None
+        try:
+            await self._connection.write(data)
+        except ConnectionLost:
+            self._closed = True
+        if self._echo:
+            self._echo_left += data
+        self._quiet_since_ns = self.clock.monotonic_ns() + round(len(data) * self.char_s * NS_PER_S)
+
+    def _must_be_allowed(self, pdu: bytes) -> None:
+        if self.danger is Danger.DISRUPT or (pdu[0] in READS and (pdu[0] != 0x2B or pdu[:2] == IDENTIFICATION)):
+            return
+        if self.danger is Danger.WRITE and pdu[0] in WRITES:
+            return
+        raise Bug(f"a check of danger {self.danger.value} would send function {pdu[0]:02X}h")
+
+    async def _rest(self) -> None:
+        await self.clock.sleep_until_ns(self._quiet_since_ns + round(self._spacing_s * NS_PER_S))
+
+    async def hear(self, count: int = 1, within_s: float | None = None) -> Heard:
+        """What comes, until there are `count` whole replies, or nothing came for the timeout; ``count=0`` hears all."""
+        data, closed = await self._bytes(count, self.timeout_s if within_s is None else within_s)
+        answers, rest = replies(self.framing, data)
+        return Heard(tuple(answers), rest, closed)
+
+    async def _bytes(self, count: int, within_s: float) -> tuple[bytes, bool]:
+        data = b""
+        end_ns = max(self.clock.monotonic_ns(), self._quiet_since_ns) + round(within_s * NS_PER_S)
+        while not self._closed and self._connection is not None and len(data) < MOST_HEARD:
+            left_s = (end_ns - self.clock.monotonic_ns()) / NS_PER_S
+            if left_s <= 0 or (count and len(replies(self.framing, data)[0]) >= count):
+                break
+            try:
+                chunk = await self._connection.read_within(left_s)
+            except ConnectionLost:
+                self._closed = True
+                break
+            if chunk:
+                data += self._without_echo(chunk)
+                self._quiet_since_ns = self.clock.monotonic_ns()
+                if count:  # something is coming: its rest has the time of a frame
+                    end_ns = max(end_ns, self._quiet_since_ns + round((self.pause_s + 0.05) * NS_PER_S))
+        return data, self._closed
+
+    def _without_echo(self, chunk: bytes) -> bytes:
+        same = 0
+        while same < min(len(chunk), len(self._echo_left)) and chunk[same] == self._echo_left[same]:
+            same += 1
+        self._echo_left = self._echo_left[same:] if same else b""
+        return chunk[same:]
+
+    async def ask(self, pdu: bytes, unit: int | None = None, *, count: int = 1) -> Heard:
+        """A request in a good frame, and what comes back. On a wire with transaction ids only replies to it count."""
+        number = self.next_transaction()
+        await self.say(self.frame(pdu, unit, number), pdu)
+        heard = await self.hear(count)
+        if self.framing in ("mbap", "udp"):
+            late = [a for a in heard.answers if a.transaction != number]
+            if late and len(late) == len(heard.answers):  # of something earlier: ours may follow
+                more = await self.hear(count)
+                ours = tuple(a for a in more.answers if a.transaction == number)
+                return Heard(ours or heard.answers, heard.rest + more.rest, more.closed)
+        return heard
+
+    async def pause(self, s: float) -> None:
+        await asyncio.sleep(s)
+
+    async def drain(self) -> Heard:
+        """What came unasked until now."""
+        return await self.hear(0, self.pause_s)
+
+    # -- when all is well -----------------------------------------------------------------------------------------
+
+    def is_good(self, answer: Answer | None) -> bool:
+        """Whether it is an answer of the unit to `good`, of the usual shape; the values may have changed."""
+        if answer is None or answer.unit != self.unit:
+            return False
+        usual = self.good_reply
+        if usual[0] & 0x80:
+            return answer.pdu == usual
+        return answer.pdu[:2] == usual[:2] and len(answer.pdu) == len(usual)
+
+    async def still_good(self) -> str:
+        """Empty when `good` is answered as usual, else what came instead."""
+        heard = await self.ask(self.good)
+        return "" if len(heard.answers) == 1 and self.is_good(heard.first) and not heard.rest else str(heard)
+
+    async def settle(self) -> bool:
+        """Bring wire and device back to where all is well: silence, at worst a new connection. False: it is not."""
+        for attempt in range(3):
+            try:
+                if attempt or self._connection is None or self._closed:
+                    if self.serial and self._connection is not None:
+                        await self.pause(self.timeout_s)
+                    else:
+                        await self.reopen()
+                await self.drain()
+                self._echo_left = b""
+                if not await self.still_good():
+                    return True
+            except Unreachable:
+                await self.pause(self.timeout_s)
+        return False

@@ -1,0 +1,49 @@
+"""What a check is about: the device, as far as it names itself, who looked at it, when, and by which words."""
+
+from __future__ import annotations
+
+import getpass
+import platform
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from fieldtwin.__about__ import __version__
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """`identity` is what the device says of itself, in its words, name to text: vendor, product, serial number...
+
+    `started` is ISO 8601 in UTC, `took_s` the whole check. `at_most` is the highest danger that was allowed, `wrote` what was
+    given for writing.
+    """
+
+    protocol: str
+    endpoint: str
+    address: int
+    identity: dict[str, str] = field(default_factory=dict)
+    started: str = ""
+    took_s: float = 0.0
+    by: str = ""
+    command: str = ""
+    at_most: str = "read"
+    wrote: tuple[str, ...] = ()
+    timeout_s: float = 0.0
+    host: str = field(default_factory=platform.node)
+    fieldtwin: str = __version__
+
+    @property
+    def name(self) -> str:
+        """``unit 1 on tcp://127.0.0.1:502``."""
+        return f"{'node' if self.protocol == 'canopen' else 'unit'} {self.address} on {self.endpoint}"
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self) | {"wrote": list(self.wrote)}
+
+
+def who() -> str:
+    """The name under which somebody is logged in here, empty where there is none."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):
+        return ""

@@ -1,0 +1,72 @@
+"""Emulated Modbus devices and CANopen nodes in memory and in virtual time, for the checks of devices."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TypeVar
+
+from emulators.modbus.ascii import AsciiSlave
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.fifo import FifoQueues
+from emulators.modbus.identification import Identification
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.rtu import RtuSlave
+from emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
+from emulators.modbus.unit import ModbusUnit
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.ports import MemoryNet
+from gateway.core.connection import ByteConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.nursery import Nursery
+
+T = TypeVar("T")
+
+
+def make_unit() -> ModbusUnit:
+    """Registers 0 to 199, coils 0 to 36, eight input registers, a queue, a name."""
+    bank = MapBank([Span("coil", 0, 37), Span("holding", 0, 200), Span("input", 0, 8)])
+    bank.poke("holding", 0, 0xAA, 0xBB)
+    bank.poke("coil", 3, 1)
+    fifos = FifoQueues([0x04DE], capacity=40)
+    fifos.push(0x04DE, 0x01B8, 0x1284)
+    names = {0: b"fieldtwin", 1: b"FT-1", 2: b"V2.11", 3: b"u" * 200, 4: b"n" * 60}
+    return ModbusUnit(bank, fifos=fifos, identification=Identification(names))
+
+
+def on_modbus(
+    url: str, use: Callable[[MemoryNet, str, VirtualClock], Awaitable[T]], unit: ModbusUnit | None = None, at: int = 1
+) -> T:
+    """What `use` comes to with a device served at `url` in memory. `use` gets the net, the url and the clock."""
+    loop = VirtualLoop()
+
+    async def main() -> T:
+        net, endpoint, clock = MemoryNet(loop), Endpoint.parse(url), VirtualClock(loop)
+        units = {at: unit or make_unit()}
+
+        async def stream(end: ByteConnection) -> None:
+            if endpoint.scheme == "rtu+tcp":
+                await serve_rtu(end, RtuSlave(units), clock)
+            else:
+                await serve_mbap(end, MbapSlave(units), clock)
+
+        async with Nursery() as nursery:
+            if endpoint.is_serial:
+                end, _ = await net.serial(Path(endpoint.path), endpoint, endpoint.serial)
+                slave = AsciiSlave(units) if endpoint.scheme == "ascii" else RtuSlave(units)
+                nursery.start(serve_rtu(end, slave, clock), "device")
+                return await use(net, url, clock)
+            if endpoint.scheme == "udp":
+                datagrams = await net.datagrams(endpoint)
+                nursery.start(serve_udp(datagrams, MbapSlave(units), clock), "device")
+                return await use(net, str(datagrams.bound), clock)
+            listener = await net.listen(endpoint, stream, 8)
+            try:
+                return await use(net, str(listener.bound), clock)
+            finally:
+                await listener.aclose()
+
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        return runner.run(main())

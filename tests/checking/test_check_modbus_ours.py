@@ -1,0 +1,44 @@
+"""Our own emulated devices pass every Modbus case that can be played on their wire, on each kind of wire."""
+
+from __future__ import annotations
+
+import pytest
+from devices_in_memory import on_modbus
+
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.ports import MemoryNet
+from fieldtwin.checking.device_case import DeviceResult
+from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
+from fieldtwin.checking.run import Plan
+from fieldtwin.conformance.case import Danger
+from fieldtwin.report.model import Verdict
+
+ALL = Plan(at_most=Danger.DISRUPT, has=frozenset({"holding", "coil", "i-know"}))
+WIRES = (
+    "rtu:/virtual/line?baudrate=19200&frame=8E1",
+    "ascii:/virtual/line?baudrate=9600&frame=7E1",
+    "tcp://127.0.0.1:0",
+    "rtu+tcp://127.0.0.1:0",
+    "udp://127.0.0.1:0",
+)
+
+
+def check(url: str, plan: Plan = ALL, at: int = 1) -> list[DeviceResult]:
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
+        options = ModbusOptions(
+            url, at, plan, may_write={"holding": (190, 10), "coil": (3, 1)}, connector=net, clock=clock
+        )  # fmt: skip
+        _, results = await check_modbus(options)
+        return results
+
+    return on_modbus(url, use, at=at)
+
+
+@pytest.mark.parametrize("url", WIRES)
+def test_ours_pass_all(url: str) -> None:
+    results = check(url)
+    for r in results:
+        print(r.case.id, r.verdict.value, r.reason)
+    assert [(r.case.id, r.reason) for r in results if r.verdict not in (Verdict.PASSED, Verdict.SKIPPED)] == []
+    skipped = {r.case.id: r.reason for r in results if r.verdict is Verdict.SKIPPED}
+    assert set(skipped.values()) <= {"not on this wire"}

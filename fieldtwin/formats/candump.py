@@ -23,7 +23,7 @@ MAX_LINE = 1024
 
 
 @dataclass(slots=True)
-class Left:
+class LeftOut:
     """What a log holds besides classic data and remote frames."""
 
     fd: int = 0
@@ -42,9 +42,9 @@ def line_of(t_ns: int, frame: CanFrame, channel: str = "can0") -> bytes:
     return f"({seconds}.{ns // 1000:06d}) {channel} {text}\n".encode()
 
 
-def read_log(path: Path, left: Left | None = None) -> Iterator[tuple[int, str, CanFrame]]:
+def read_log(path: Path, left: LeftOut | None = None) -> Iterator[tuple[int, str, CanFrame]]:
     """(ns, channel, frame) of each line. A last line that was cut off is left out. Raises `FileInvalid` with the line."""
-    left = left if left is not None else Left()
+    left = left if left is not None else LeftOut()
     number = 0
     try:
         with path.open("rb") as file:

@@ -35,6 +35,11 @@ class Segments:
 
     __slots__ = ("_waiting", "lost", "next")
 
+    @property
+    def waits(self) -> bool:
+        """Whether something came that lies behind what is missing."""
+        return bool(self._waiting)
+
     def __init__(self) -> None:
         self.next = -1
         self.lost = 0
@@ -56,6 +61,13 @@ class Segments:
             self._waiting[sequence] = data
         full = len(self._waiting) > MAX_WAITING or sum(map(len, self._waiting.values())) > MAX_WAITING_BYTES
         return self._give_up() if full else []
+
+    def acknowledged(self, number: int) -> list[tuple[int, bytes]]:
+        """The receiver has all before `number`: what is missing there was lost by the capture, and will not be repeated."""
+        found: list[tuple[int, bytes]] = []
+        while self._waiting and 0 < (number - self.next) % _SEQUENCES < _SEQUENCES // 2:
+            found += self._give_up()
+        return found
 
     def flush(self) -> list[tuple[int, bytes]]:
         """Nothing follows: what is missing will not come."""
@@ -190,7 +202,9 @@ class Conversations:
             return
         sender, other = (source, data[at] << 8 | data[at + 1]), (target, data[at + 2] << 8 | data[at + 3])
         flags, payload = data[at + 13], data[at + (data[at + 12] >> 4) * 4 : end]
-        if flags & 0x02:
+        if flags & 0x10:
+            self._acknowledged(sender, other, int.from_bytes(data[at + 8 : at + 12]), t_ns)
+        if flags & 0x07 == 0x02:  # with FIN or RST beside it, it opens nothing
             self._opened(sender, other, data[at + 4 : at + 8], acknowledged=bool(flags & 0x10))
             return
         if payload:
@@ -207,6 +221,14 @@ class Conversations:
             self.counters.cut_short += 1
         if flags & 0x04:  # RST
             self._end(_key(False, sender, other))
+
+    def _acknowledged(self, sender: Side, other: Side, number: int, t_ns: int) -> None:
+        conversation = self._open.get(_key(False, sender, other))
+        segments = conversation.segments.get(other) if conversation is not None else None
+        if conversation is not None and segments is not None and segments.waits:
+            for lost, chunk in segments.acknowledged(number):
+                self.counters.lost_bytes += lost
+                self._on_data(conversation, other, chunk, t_ns, lost)
 
     def _opened(self, sender: Side, other: Side, sequence: bytes, *, acknowledged: bool) -> None:
         key = _key(False, sender, other)

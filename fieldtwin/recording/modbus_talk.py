@@ -1,12 +1,13 @@
 """A TCP or UDP conversation that may be Modbus: who asks, in what framing, and its exchanges.
 
 Nothing is taken for granted but a port that the user named: the framing is told from the first bytes of either side, and who
-asks from who opened the connection, from the port, or from the first frame. What is not Modbus is let go after
+asks from the port, from who opened the connection, or from the first frame. What is not Modbus is let go after
 `MAX_UNDECIDED` bytes. Sans-IO.
 """
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Collection
 
 from fieldtwin.decoding.modbus_frames import RtuSplitter
@@ -56,6 +57,14 @@ class ModbusTalk:
         return self.pairer.finish() if self.pairer is not None else []
 
     @property
+    def endpoint(self) -> str:
+        """The server's, as a URL; of a conversation that is not known to be Modbus its second side."""
+        scheme = {"mbap": "tcp", "rtu": "rtu+tcp"}.get(self.framing, self.framing or "tcp")
+        address, port = self.server or self._conversation.sides[1]
+        text = str(ipaddress.ip_address(address))
+        return f"{scheme}://{f'[{text}]' if ':' in text else text}:{port}"
+
+    @property
     def _known_port(self) -> bool:
         return any(side[1] in self._ports or side[1] in MODBUS_PORTS for side in self._conversation.sides)
 
@@ -92,12 +101,12 @@ class ModbusTalk:
 
     def _find_server(self) -> Side:
         left, right = self._conversation.sides
-        if self._conversation.client is not None:
-            return right if self._conversation.client == left else left
         for ports in (self._ports, MODBUS_PORTS):
             known = [side for side in (left, right) if side[1] in ports]
             if len(known) == 1:
                 return known[0]
+        if self._conversation.client is not None:
+            return right if self._conversation.client == left else left
         for side, data, _ in self._seen:
             if self.framing != "rtu" and (told := _asks(data)) is not None:
                 return (right if side == left else left) if told else side

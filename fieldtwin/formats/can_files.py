@@ -1,0 +1,118 @@
+"""CAN logs of other programs (Vector's .asc and .blf, PEAK's .trc) through python-can's readers, as frames with times.
+
+One of the files that know python-can, and only its readers: no interface is opened. They trust a file: so lines and packed blocks
+are checked for their size before, frames afterwards, and what is wrong is `FileInvalid`, whatever they raise. CAN FD and error
+frames are counted and left out. These formats lose things: .trc has no error frames, .asc and .blf have times of their writers.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.formats.candump import LeftOut
+from gateway.core.canframe import CanFrame
+from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+
+SUFFIXES = (".asc", ".blf", ".trc")
+MAX_TIME_S = 1 << 33
+MAX_LINE = 65_536
+MAX_CONTAINER = 16_000_000
+"""Bytes of a packed block of a .blf file when it is unpacked; writers close one at a hundredth of it."""
+_BLOCK = 65_536
+_CONTAINER, _ZLIB = 10, 2
+
+
+def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFrame]]:
+    """(ns, channel, frame), in the file's order. Raises `FileInvalid`, at the number of the message where that is known."""
+    try:
+        from can import CanError
+        from can.io.asc import ASCReader
+        from can.io.blf import BLFReader
+        from can.io.trc import TRCReader
+    except ImportError as e:
+        raise UsageError("python-can is not installed", hint="pip install python-can") from e
+    readers: dict[str, Any] = {".asc": ASCReader, ".blf": BLFReader, ".trc": TRCReader}
+    number = 0
+    try:
+        (_check_blocks if path.suffix.lower() == ".blf" else _check_lines)(path)
+        with readers[path.suffix.lower()](path) as reader:
+            for message in reader:
+                number += 1
+                found = _frame(message, left)
+                if found is not None:
+                    yield found
+    except OSError as e:
+        raise FileInvalid(f"cannot read the log: {e.strerror or e}", path=str(path)) from e
+    except FieldtwinError as e:
+        raise FileInvalid(f"message {number}: {e.message}", path=str(path), got=e.got) from e
+    except (*_FOREIGN, CanError) as e:
+        raise FileInvalid(
+            f"behind message {number}: not a {path.suffix} file: {e or type(e).__name__}", path=str(path)
+        ) from e
+
+
+_FOREIGN = (
+    ValueError, KeyError, IndexError, TypeError, AttributeError, AssertionError, EOFError, NotImplementedError,
+    ArithmeticError, struct.error, zlib.error, StopIteration, RuntimeError, MemoryError, UnboundLocalError,
+)  # fmt: skip
+"""What python-can's readers raise at damaged files, as tried, besides its own CanError."""
+
+
+def _check_lines(path: Path) -> None:
+    """A reader takes a line into memory whatever its length."""
+    since = number = 0
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            for i, piece in enumerate(block.split(b"\n")):
+                since, number = (since + len(piece), number) if i == 0 else (len(piece), number + 1)
+                if since > MAX_LINE:
+                    raise FileInvalid(
+                        "the line is too long", path=str(path), line=number + 1, expected=f"{MAX_LINE} bytes"
+                    )
+
+
+def _check_blocks(path: Path) -> None:
+    """A reader unpacks a container into memory whatever it becomes."""
+    with path.open("rb") as file:
+        head = file.read(8)
+        if len(head) < 8 or head[:4] != b"LOGG":
+            raise FileInvalid("offset 0: not a .blf file", path=str(path), expected="LOGG", got=head[:4].hex())
+        at = max(int.from_bytes(head[4:8], "little"), 8)
+        while True:
+            file.seek(at)
+            head = file.read(32)
+            if len(head) < 32 or head[:4] != b"LOBJ":
+                return
+            size, kind = struct.unpack_from("<II", head, 8)
+            if size < 32 or size > MAX_CONTAINER:
+                raise FileInvalid(f"offset {at}: an object of impossible length", path=str(path), got=str(size))
+            if kind == _CONTAINER and head[16] == _ZLIB:
+                unpacked = zlib.decompressobj().decompress(file.read(size - 32), MAX_CONTAINER + 1)
+                if len(unpacked) > MAX_CONTAINER:
+                    raise FileInvalid(
+                        f"offset {at}: a container that is too large", path=str(path), expected=f"{MAX_CONTAINER} bytes"
+                    )
+            at += size + size % 4
+
+
+def _frame(message: Any, left: LeftOut) -> tuple[int, str, CanFrame] | None:
+    if message.is_fd or len(message.data or b"") > 8 or message.dlc > 8:
+        left.fd += 1
+        return None
+    if message.is_error_frame:
+        left.errors += 1
+        return None
+    t_s = float(message.timestamp)
+    if not 0 <= t_s < MAX_TIME_S:
+        raise FileInvalid("a time that none is", got=str(t_s))
+    remote = bool(message.is_remote_frame)
+    frame = CanFrame(
+        message.arbitration_id, b"" if remote else bytes(message.data), extended=bool(message.is_extended_id),
+        remote=remote, dlc=message.dlc if remote else -1,
+    )  # fmt: skip
+    channel = "" if message.channel is None else str(message.channel)
+    return round(t_s * 1e6) * 1000, f"can{channel}" if channel.isdigit() or not channel else channel, frame

@@ -1,0 +1,183 @@
+"""Tables of measurements as CSV: a time column and signals, as a recording of signals; and back.
+
+The first row names the columns (``pressure (dbar)``: the unit in brackets); commas, semicolons or tabs between them, and behind
+semicolons a decimal comma too. Times are seconds, milliseconds or ISO 8601. Reads a line at a time; a flaw is told with its line.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import BinaryIO
+
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
+
+MAX_LINE = 65_536
+MAX_COLUMNS = 1000
+TIME_NAMES = ("t", "time", "timestamp", "time_s", "t_s", "seconds", "datetime", "date", "utc")
+_NAME = re.compile(r"\s*(.*?)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?\s*")
+
+
+@dataclass(frozen=True, slots=True)
+class TableSummary:
+    """What came of a table. `columns` is signal: column; `bad_values` had no number and stay without a value."""
+
+    rows: int
+    seconds: float
+    bad_values: int
+    columns: dict[str, str] = field(default_factory=dict)
+
+
+def import_csv(
+    path: Path, out: Path, *, columns: Mapping[str, str], time: str = "", device: str = "", made_by: str = ""
+) -> TableSummary:
+    """Turn the table at `path` into the recording `out`. `columns` is signal: column (a name, or ``#3`` for the third); without
+    it every column is a signal. Raises `FileInvalid` with the line, `UsageError` for a column that is not there."""
+    with _open(path) as file:
+        rows = _rows(path, file)
+        line, names = next(rows, (1, []))
+        if not names:
+            raise FileInvalid("the table is empty", path=str(path), line=line, expected="a row of column names")
+        time_at = _column(names, time) if time else _time_column(names, path)
+        chosen = _chosen(names, columns, time_at)
+        signals = {s: SignalInfo(unit=_split(names[i])[1], column=names[i]) for s, i in chosen.items()}
+        first = next(rows, None)
+        if first is None:
+            raise FileInvalid("the table has no rows", path=str(path), line=line + 1)
+        clock = _Clock(path, names[time_at], *first, time_at)
+        header = RecordingHeader(
+            version=1, device=device or f"imported/{path.stem}", kind="signals", source="imported", made_by=made_by,
+            start_utc=clock.start_utc, signals=signals,
+        )  # fmt: skip
+        bad, last_s = 0, 0.0
+        with RecordingWriter(out, header) as writer:
+            for number, row in _chain(first, rows):
+                t_s = clock.seconds(number, row)
+                if t_s < last_s:
+                    raise FileInvalid("time goes back", path=str(path), line=number, got=row[time_at][:40])
+                last_s = t_s
+                values = [_value(row[i]) if i < len(row) else math.nan for i in chosen.values()]
+                bad += sum(map(math.isnan, values))
+                writer.row(round(t_s, 6), values)
+            return TableSummary(writer.records, last_s, bad, {s: names[i] for s, i in chosen.items()})
+
+
+def _open(path: Path) -> BinaryIO:
+    try:
+        return path.open("rb")
+    except OSError as e:
+        raise FileInvalid(f"cannot read the table: {e.strerror or e}", path=str(path)) from e
+
+
+def _rows(path: Path, file: BinaryIO) -> Iterator[tuple[int, list[str]]]:
+    """(line, fields) of each row that is not empty."""
+    number, delimiter = 0, ""
+    while line := file.readline(MAX_LINE + 1):
+        number += 1
+        if len(line) > MAX_LINE:
+            raise FileInvalid("the line is too long", path=str(path), line=number, expected=f"{MAX_LINE} bytes")
+        try:
+            text = line.decode("utf-8-sig" if number == 1 else "utf-8").strip("\r\n")
+            if not text.strip() or text.lstrip().startswith("#"):
+                continue
+            delimiter = delimiter or max(";\t,", key=text.count)
+            fields = next(csv.reader([text], delimiter=delimiter, strict=True))
+        except (UnicodeDecodeError, csv.Error, StopIteration) as e:
+            raise FileInvalid(f"not a row of a table: {e}", path=str(path), line=number) from e
+        if len(fields) > MAX_COLUMNS:
+            raise FileInvalid("too many columns", path=str(path), line=number, expected=str(MAX_COLUMNS))
+        yield number, fields
+
+
+def _chain(first: tuple[int, list[str]], rest: Iterator[tuple[int, list[str]]]) -> Iterator[tuple[int, list[str]]]:
+    yield first
+    yield from rest
+
+
+def _split(column: str) -> tuple[str, str]:
+    """(name, unit) of ``pressure (dbar)``."""
+    found = _NAME.fullmatch(column)
+    return (found[1], found[2] or "") if found else (column, "")
+
+
+def _column(names: list[str], wanted: str) -> int:
+    """The place of a column by its name, with or without its unit, or by ``#3``."""
+    if wanted.startswith("#") and wanted[1:].isdigit() and 1 <= int(wanted[1:]) <= len(names):
+        return int(wanted[1:]) - 1
+    for i, name in enumerate(names):
+        if wanted in (name, name.strip(), _split(name)[0]):
+            return i
+    raise UsageError(f"no column {wanted!r}", expected=", ".join(names[:20]))
+
+
+def _time_column(names: list[str], path: Path) -> int:
+    for wanted in TIME_NAMES:
+        for i, name in enumerate(names):
+            if _split(name)[0].lower() == wanted:
+                return i
+    raise UsageError(f"{path.name}: which column is the time?", expected="--time COLUMN", got=", ".join(names[:20]))
+
+
+def _chosen(names: list[str], columns: Mapping[str, str], time_at: int) -> dict[str, int]:
+    if columns:
+        return {signal: _column(names, wanted) for signal, wanted in columns.items()}
+    chosen: dict[str, int] = {}
+    for i, name in enumerate(names):
+        if i != time_at:
+            plain = re.sub(r"\W+", "_", _split(name)[0].strip().lower()).strip("_") or f"column_{i + 1}"
+            chosen[plain if plain not in chosen else f"{plain}_{i + 1}"] = i
+    if not chosen:
+        raise UsageError("the table has no column besides the time")
+    return chosen
+
+
+class _Clock:
+    """Seconds since the first row, whatever the time column is written in."""
+
+    def __init__(self, path: Path, name: str, line: int, row: list[str], at: int) -> None:
+        self._path, self._at = path, at
+        self._milli = _split(name)[1].lower() in ("ms", "msec") or name.lower().endswith("_ms")
+        self.start_utc = ""
+        self._dates = False
+        text = row[at].strip() if at < len(row) else ""
+        if math.isnan(_value(text)):
+            self._dates = True
+        self._zero = self._read(line, text)
+        if self._dates:
+            self.start_utc = datetime.fromtimestamp(self._zero, UTC).isoformat(timespec="milliseconds")
+
+    def seconds(self, line: int, row: list[str]) -> float:
+        return self._read(line, row[self._at].strip() if self._at < len(row) else "") - self._zero
+
+    def _read(self, line: int, text: str) -> float:
+        if not self._dates:
+            value = _value(text)
+            if math.isfinite(value):
+                return value / 1000 if self._milli else value
+        else:
+            try:
+                when = datetime.fromisoformat(text)
+                return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+            except (ValueError, OverflowError):
+                pass
+        raise FileInvalid(
+            "not a time",
+            path=str(self._path),
+            line=line,
+            expected="seconds, or a date as 2026-01-31T12:00:00Z",
+            got=text[:40],
+        )
+
+
+def _value(text: str) -> float:
+    """A number; NaN where there is none. A comma is a decimal comma: where it divides columns, no field has one."""
+    try:
+        return float(text.strip().replace(",", "."))
+    except ValueError:
+        return math.nan

@@ -91,8 +91,8 @@ def _rtu_length(data: bytes) -> int:
     """Of the frame that `data` begins with, 0 if it is none: the lengths that its function can have first, then any."""
     if len(data) < 4:
         return 0
-    likely, _ = frame_lengths(data)
-    for length in [*likely, *range(4, len(data) + 1)]:
+    lengths: list[int] = [*frame_lengths(data)[0], *range(4, len(data) + 1)]
+    for length in lengths:
         if length <= len(data) and crc16(data[: length - 2]) == int.from_bytes(data[length - 2 : length], "little"):
             return length
     return 0

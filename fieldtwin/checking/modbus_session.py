@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 
-from fieldtwin.checking.device_case import DeviceResult
+from fieldtwin.checking.device_case import DeviceResult, Spoken
 from fieldtwin.checking.modbus_cases import CASES
 from fieldtwin.checking.modbus_learn import learn
 from fieldtwin.checking.modbus_wire import ModbusWire
@@ -49,6 +49,15 @@ class ModbusOptions:
     go_on: Callable[[], str] = lambda: ""
 
 
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """What the device says of itself, what was said before the first case, and the results."""
+
+    identity: dict[str, str]
+    results: list[DeviceResult]
+    before: tuple[Spoken, ...] = ()
+
+
 def traits_of(endpoint: Endpoint) -> frozenset[str]:
     """What cases call the wire: ``rtu-line``, ``ascii-line``, ``rtu-stream``, ``mbap-stream``, ``udp``."""
     framing = framing_of(endpoint)
@@ -62,8 +71,8 @@ async def check_modbus(
     options: ModbusOptions,
     say: Callable[[str], None] = lambda text: None,
     tell: Callable[[DeviceResult], None] = lambda result: None,
-) -> tuple[dict[str, str], list[DeviceResult]]:
-    """What the device says of itself, and the results. Raises `Unreachable` where nobody answers."""
+) -> Checked:
+    """The whole check. Raises `Unreachable` where nobody answers."""
     endpoint = Endpoint.parse(options.endpoint)
     clock = options.clock or WallClock()
     transcript = Transcript(clock)
@@ -83,9 +92,10 @@ async def check_modbus(
         await learn(wire, options.given)
         say(f"the usual request is {wire.good.hex(' ').upper()}, its answer {wire.good_reply.hex(' ').upper()}")
         identity = await read_identity(wire)
+        before = transcript.spoken
         results = await play(wire, CASES, options.plan, transcript, clock, tell, options.go_on)
         await wire.aclose()
-    return identity, results
+    return Checked(identity, results, before)
 
 
 async def read_identity(wire: ModbusWire) -> dict[str, str]:

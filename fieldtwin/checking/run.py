@@ -74,12 +74,13 @@ class Transcript(Tap):
 
 
 W = TypeVar("W", bound=Settling)
+OTHER_WIRE = "not on this wire"
 
 
 def why_not(case: DeviceCase[W], plan: Plan, traits: frozenset[str]) -> str:
     """Why the case is not played under that plan on that wire; empty when it is."""
     if case.wires and not traits & set(case.wires):
-        return "not on this wire"
+        return OTHER_WIRE
     if case.danger.rank > plan.at_most.rank:
         return f"danger {case.danger.value}: --allow {case.danger.value}"
     missing = [need for need in case.needs if need not in plan.has]

@@ -1,4 +1,4 @@
-"""`fieldtwin check`: masters that we did not write are judged by hostile devices."""
+"""`fieldtwin check`: masters and devices that we did not write are judged."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ import json
 import re
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from fieldtwin.cli.check_device_command import modbus
 from fieldtwin.cli.options import Duration, json_option
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
     from emulators.modbus.bank import Table
-    from fieldtwin.conformance.case import Case
+    from fieldtwin.conformance.case import About, Case
     from fieldtwin.conformance.results import CaseResult
 
 DANGERS = ("observe", "read", "write", "disrupt")
@@ -30,7 +31,7 @@ _RANGE = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 
 @click.group("check")
 def command() -> None:
-    """Judge how a master bears devices that misbehave.
+    """Judge a device from outside, or how a master bears devices that misbehave.
 
     Exit code 0 when cases passed and none failed; SKIPPED and INCONCLUSIVE neither pass nor fail.
     """
@@ -131,7 +132,7 @@ def modbus_master(
     if not listen:
         raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
     plan = Plan(
-        _only(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset({"echo"} if echo else ()), Danger(at_most)
+        only_of(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset({"echo"} if echo else ()), Danger(at_most)
     )
     options = Options(Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), _held(hold), command=argv)
     return _judged(
@@ -222,7 +223,7 @@ def canopen_master(
         return _list(cases, as_json)
     if not listen:
         raise UsageError("no endpoint to listen on", expected="--listen ENDPOINT")
-    plan = Plan(_only(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset(), Danger(at_most))
+    plan = Plan(only_of(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset(), Danger(at_most))
     options = Options(
         Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), command=argv, objects=_objects(hold),
         size=int(size), nodes=frozenset(nodes), heartbeat_s=heartbeat_s, bitrate=bitrate,
@@ -297,7 +298,7 @@ def _list(cases: list[Case], as_json: bool) -> int:
     return 0
 
 
-def _only(text: str | None, cases: list[Case]) -> frozenset[str]:
+def only_of(text: str | None, cases: Sequence[About]) -> frozenset[str]:
     """``MB-013,15a`` as ids; an unknown one is `UsageError` with the nearest."""
     from difflib import get_close_matches
 
@@ -335,3 +336,6 @@ def _held(texts: tuple[str, ...]) -> dict[tuple[Table, int], int]:
             raise UsageError("--hold", expected="such as holding:10=5", got=repr(text))
         held[match[1], int(match[2])] = int(value)  # type: ignore[index]
     return held
+
+
+command.add_command(modbus)

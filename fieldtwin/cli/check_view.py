@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from collections import Counter
 from collections.abc import Sequence
+from itertools import groupby
 from types import TracebackType
 from typing import TYPE_CHECKING
 
@@ -15,9 +18,12 @@ from rich.table import Table
 
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.report.model import Verdict
+from gateway.core.connection import Direction
 
 if TYPE_CHECKING:
-    from fieldtwin.conformance.case import Case
+    from fieldtwin.checking.device_case import Spoken
+    from fieldtwin.checking.modbus_session import Checked
+    from fieldtwin.conformance.case import About
     from fieldtwin.conformance.results import CaseResult
 
 STYLE = {
@@ -33,12 +39,12 @@ DANGER = {"observe": "dim", "read": "cyan", "write": "yellow", "disrupt": "magen
 class Progress:
     """A bar on a terminal; where there is none, only what fails is said as it comes."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, at_first: str = "learning how it polls") -> None:
         self._bar = Bar(
             TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed:.0f} cases"), console=talk,
             transient=True, disable=not talk.is_terminal,
         )  # fmt: skip
-        self._task = self._bar.add_task("learning how it polls", total=most)
+        self._task = self._bar.add_task(at_first, total=most)
 
     def __enter__(self) -> Progress:
         self._bar.start()
@@ -87,10 +93,12 @@ def print_results(results: Sequence[CaseResult]) -> None:
     data.print(", ".join(parts) or "no case was chosen")
 
 
-def print_cases(cases: Sequence[Case]) -> None:
+def print_cases(
+    cases: Sequence[About], does: str = "what the device does", must: str = "what the master must do"
+) -> None:
     """All cases, for `--list`."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in ("case", "danger", "what the device does", "what the master must do", "source"):
+    for name in ("case", "danger", does, must, "source"):
         table.add_column(name, overflow="fold")
     for case in cases:
         danger = case.danger.value
@@ -98,3 +106,40 @@ def print_cases(cases: Sequence[Case]) -> None:
             case.id, f"[{DANGER[danger]}]{danger}[/]", escape(case.does), escape(case.must), escape(case.clause)
         )
     data.print(table)
+
+
+def print_paper(checked: Checked, *, as_json: bool) -> None:
+    """What a check would send, case by case; what is not played is left out."""
+    played = [r for r in checked.results if r.spoken]
+    if as_json:
+        cases = [
+            {"id": "before", "title": "how it answers, and who it is", "danger": "read", "sent": _sent(checked.before)}
+        ]
+        cases += [
+            {"id": r.case.id, "title": r.case.title, "danger": r.case.danger.value, "sent": _sent(r.spoken)}
+            for r in played
+        ]
+        json.dump({"kind": "fieldtwin check dry run", "cases": cases}, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+        return
+    data.print("before: how it answers, and who it is", markup=False)
+    _print_sent(_sent(checked.before))
+    for r in played:
+        danger = r.case.danger.value
+        data.print(f"{r.case.id} [{DANGER[danger]}]{danger}[/] {escape(r.case.title)}", soft_wrap=True)
+        _print_sent(_sent(r.spoken))
+    talk.print(
+        f"{len(played)} cases. The usual read stands before each as well. As a device answers that does all it must; "
+        "another leads to other frames in places.", markup=False,
+    )  # fmt: skip
+
+
+def _sent(spoken: Sequence[Spoken]) -> list[str]:
+    return [s.text for s in spoken if s.direction is Direction.SENT]
+
+
+def _print_sent(frames: Sequence[str]) -> None:
+    """A frame a line; the same ones in a row once, with how often."""
+    for text, same in groupby(frames):
+        times = len(list(same))
+        data.print(f"  {text}" + (f"   x {times}" if times > 1 else ""), markup=False, soft_wrap=True)

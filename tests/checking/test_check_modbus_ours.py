@@ -28,8 +28,7 @@ def check(url: str, plan: Plan = ALL, at: int = 1) -> list[DeviceResult]:
         options = ModbusOptions(
             url, at, plan, may_write={"holding": (190, 10), "coil": (3, 1)}, connector=net, clock=clock
         )  # fmt: skip
-        _, results = await check_modbus(options)
-        return results
+        return (await check_modbus(options)).results
 
     return on_modbus(url, use, at=at)
 

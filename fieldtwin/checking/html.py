@@ -1,0 +1,141 @@
+"""The conformance report of a device as one HTML file: no network, no script, readable on paper.
+
+    write_html(subject, results, reproduce, path)
+
+What failed comes first, with every byte; what passed is a line in the table, its bytes folded away.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from fieldtwin.checking.device_case import DeviceResult, Spoken
+from fieldtwin.checking.subject import Subject
+from fieldtwin.conformance.results import summary
+from fieldtwin.report.html import pill
+from fieldtwin.report.markup import Markup, el
+from fieldtwin.report.model import Verdict
+from fieldtwin.report.style import style
+from gateway.core.clock import NS_PER_MS
+from gateway.core.connection import Direction
+from gateway.core.errors import FileInvalid
+
+MOST_LINES = 60
+"""Of one case's bytes."""
+ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Verdict.SKIPPED)
+
+
+def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str, path: Path) -> None:
+    """Write the report; raises `FileInvalid` where that is not possible."""
+    try:
+        path.write_text(render_html(subject, results, reproduce), encoding="utf-8")
+    except OSError as e:
+        raise FileInvalid(f"cannot write the report: {e.strerror or e}", path=str(path)) from e
+
+
+def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> str:
+    """The whole page."""
+    bad = [r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE]
+    body = [_header(subject, results, reproduce)]
+    if bad:
+        body += [el("h2", "What was found", id="found"), *(_finding(r) for r in bad)]
+    body += [el("h2", "All cases", id="cases"), _table(results)]
+    head = el(
+        "head",
+        el("meta", charset="utf-8"),
+        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        el("title", f"check of {subject.name}"),
+        el("style", style()),
+    )
+    return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"
+
+
+def overall(results: Sequence[DeviceResult]) -> Verdict:
+    """What the whole comes to: failed if anything failed, passed if something passed and nothing failed."""
+    verdicts = {r.verdict for r in results}
+    if verdicts & {Verdict.FAILED, Verdict.ERROR}:
+        return Verdict.FAILED
+    return Verdict.PASSED if Verdict.PASSED in verdicts else Verdict.INCONCLUSIVE
+
+
+def _header(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> Markup:
+    facts = [
+        ("device", subject.name),
+        *subject.identity.items(),
+        ("checked", subject.started),
+        ("by", f"{subject.by} on {subject.host}" if subject.by else subject.host),
+        ("danger", f"up to {subject.at_most}" + (f", writing to {', '.join(subject.wrote)}" if subject.wrote else "")),
+        ("reply timeout", f"{subject.timeout_s:g} s"),
+        ("fieldtwin", subject.fieldtwin),
+    ]
+    counts = Counter(r.verdict for r in results)
+    bar = [el("i", cls=v.value, style=f"flex:{counts[v]}") for v in ORDER if counts[v]]
+    rows = [[el("dt", name), el("dd", text)] for name, text in facts if text]
+    title = el("div", el("h1", f"Conformance of {subject.name}"), el("p", summary(results), cls="small"))
+    return el(
+        "div",
+        el("header", title, pill(overall(results), big=True), cls="top"),
+        el("div", bar, cls="bar"),
+        el("dl", rows, cls="facts"),
+        el("p", "Run again: ", el("code", reproduce), cls="small"),
+    )
+
+
+def _finding(result: DeviceResult) -> Markup:
+    case = result.case
+    facts = [
+        ("source", case.clause),
+        ("danger", case.danger.value),
+        ("sent", case.does),
+        ("expected", case.must),
+        ("found", result.reason),
+    ]
+    quiet = "" if result.verdict.bad else " quiet"
+    return el(
+        "section",
+        el("h3", f"{case.id} {case.title} ", pill(result.verdict)),
+        el("dl", [[el("dt", name), el("dd", text)] for name, text in facts], cls="facts"),
+        wire_table(result.spoken),
+        cls=f"failure{quiet}",
+    )
+
+
+def wire_table(spoken: Sequence[Spoken]) -> Markup:
+    """What was said, line by line."""
+    if not spoken:
+        return Markup("")
+    rows = [
+        el(
+            "tr",
+            el("td", f"{s.t_ns / NS_PER_MS:.1f} ms", cls="num"),
+            el("td", "sent" if s.direction is Direction.SENT else "received"),
+            el("td", s.text, cls="raw"),
+        )
+        for s in spoken[:MOST_LINES]
+    ]
+    more = len(spoken) - MOST_LINES
+    table = el("table", rows, cls="frames")
+    return el("div", table, el("p", f"and {more} more", cls="small") if more > 0 else "", cls="wide")
+
+
+def _table(results: Sequence[DeviceResult]) -> Markup:
+    columns = ("case", "verdict", "danger", "sent", "expected", "source", "found")
+    head = el("tr", [el("th", name) for name in columns])
+    return el("div", el("table", el("thead", head), el("tbody", [_row(r) for r in results])), cls="wide")
+
+
+def _row(result: DeviceResult) -> Markup:
+    case = result.case
+    said = el("details", el("summary", f"{len(result.spoken)} on the wire"), wire_table(result.spoken))
+    return el(
+        "tr",
+        el("td", f"{case.id} {case.title}", cls="name", id=case.id),
+        el("td", pill(result.verdict)),
+        el("td", case.danger.value),
+        el("td", case.does),
+        el("td", case.must),
+        el("td", case.clause),
+        el("td", result.reason, said if result.spoken and not result.verdict.bad else "", cls="long"),
+    )

@@ -87,7 +87,8 @@ def _tags(
         return _registers(item, form)
     if protocol == "canopen" and (match := _OBJECT.match(item)):
         index, sub = int(match[1], 16), int(match[2] or "0", 16)
-        return _objects(index, sub, form, dictionary)
+        known = {t.object: t for t in profile.tags.values()} if profile is not None and form.type is None else {}
+        return [known.get(tag.object, tag) for tag in _objects(index, sub, form, dictionary)]
     if dictionary is not None:
         entry = dictionary.find(item)
         return [tag_of_entry(entry)]
@@ -108,6 +109,20 @@ def _by_name(item: str, tags: Mapping[str, Tag]) -> list[Tag]:
         return []
     pattern = re.compile("".join({"*": ".*", "?": "."}.get(c, re.escape(c)) for c in item))
     return [tag for name, tag in tags.items() if pattern.fullmatch(name)]
+
+
+def with_care(tag: Tag, profile: DeviceProfile | None) -> Tag:
+    """A raw address, with the danger and the wear of whatever the profile says stands there: an address is no way round."""
+    if profile is None or tag.name in profile.tags or tag.at is None:
+        return tag
+    at = tag.at
+    there = [
+        t
+        for t in profile.tags.values()
+        if t.at is not None and t.at.table == at.table and t.at.address < at.end and at.address < t.at.end
+    ]
+    dangers = " and ".join(dict.fromkeys(t.danger for t in there if t.danger))
+    return replace(tag, danger=dangers, nonvolatile=any(t.nonvolatile for t in there))
 
 
 def _registers(item: str, form: RawForm) -> list[Tag]:

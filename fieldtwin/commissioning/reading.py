@@ -1,0 +1,166 @@
+"""Which device is meant, opened for asking, and its values as rows for a table or JSON.
+
+It must never write.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterable, Sequence
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.commissioning.live import canopen_at, modbus_at
+from fieldtwin.commissioning.point import Answer, CanopenPoint, ModbusPoint, Point
+from gateway.core.clock import Clock
+from gateway.core.connection import Connector, Tap
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.profile import DeviceProfile, Tag, load_profile
+from gateway.core.values import Quality
+from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from twin.data_files import find
+
+MOST_HEX_BYTES = 48
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """A device: where it is, as which unit or node, and what is known of it."""
+
+    url: str
+    address: int
+    profile: DeviceProfile | None = None
+    dictionary: ObjectDictionary | None = None
+    bitrate: int = 0
+    timeout_s: float = 1.0
+    echo: bool = False
+
+    @property
+    def protocol(self) -> str:
+        return "canopen" if Endpoint.parse(self.url).is_can else "modbus"
+
+
+def target_of(
+    url: str,
+    *,
+    address: int | None = None,
+    profile_name: str = "",
+    eds: Path | None = None,
+    folders: Iterable[Path] = (),
+    bitrate: int = 0,
+    timeout_s: float = 1.0,
+    echo: bool = False,
+) -> Target:
+    """The device that a command line means. Without `address` the profile's own from the factory, else 1.
+
+    A serial line whose URL says no baud rate or frame takes the profile's. Raises `UsageError` where wire and profile do not
+    belong together, `FileInvalid` for a profile or EDS that is none.
+    """
+    endpoint = Endpoint.parse(url)
+    profile = load_profile(find("devices", profile_name, extra=folders)) if profile_name else None
+    protocol = "canopen" if endpoint.is_can else "modbus"
+    if profile is not None and profile.protocol != protocol:
+        raise UsageError(
+            f"{profile.name} is a {profile.protocol} device", expected=f"an endpoint of {profile.protocol}"
+        )
+    if eds is not None and protocol != "canopen":
+        raise UsageError("an EDS is for a CANopen device", got=url)
+    if address is None and profile is not None:
+        address = profile.form.factory.node if protocol == "canopen" else profile.form.factory.unit
+    if profile is not None and endpoint.is_serial and not endpoint.params:
+        factory = profile.form.factory
+        url = str(replace(endpoint, params=(("baudrate", str(factory.baudrate)), ("frame", factory.frame))))
+    address = 1 if address is None else address
+    eds = eds or (profile.eds_path if profile is not None else None)
+    dictionary = load_dictionary(eds, address) if eds is not None else None
+    return Target(url, address, profile, dictionary, bitrate, timeout_s, echo)
+
+
+@asynccontextmanager
+async def point_at(
+    target: Target,
+    *,
+    taps: Sequence[Tap] = (),
+    spacing_s: float = 0.0,
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> AsyncIterator[Point]:
+    """The device, ready to be asked; nothing is sent by opening. Errors as `modbus_at` and `canopen_at`.
+
+    A profile's own pace is kept: its pause between exchanges, and its time to answer where that is longer.
+    """
+    timeout_s = target.timeout_s
+    if target.profile is not None:
+        timing = target.profile.form.timing
+        spacing_s = max(spacing_s, timing.spacing_ms / 1000)
+        timeout_s = max(timeout_s, (timing.timeout_ms or 0) / 1000)
+    if target.protocol == "canopen":
+        async with canopen_at(
+            target.url, target.bitrate, sdo_timeout_s=timeout_s, taps=taps, connector=connector, clock=clock
+        ) as master:
+            yield CanopenPoint(master, target.url, target.address)
+        return
+    async with modbus_at(
+        target.url,
+        timeout_s=timeout_s,
+        spacing_s=spacing_s,
+        echo=target.echo,
+        taps=taps,
+        connector=connector,
+        clock=clock,
+    ) as client:
+        yield ModbusPoint(client, target.url, target.address, target.profile)
+
+
+def dry_point(target: Target) -> Point:
+    """The device for `--dry-run`: it tells frames and can send none."""
+    if target.protocol == "canopen":
+        return CanopenPoint(None, target.url, target.address)
+    return ModbusPoint(None, target.url, target.address, target.profile)
+
+
+def text_of(tag: Tag, answer: Answer) -> str:
+    """A value for a person: with the name of its number where the profile has one; secrets are hidden."""
+    value = answer.value.value
+    if value is None:
+        return "-"
+    if tag.secret:
+        return "(secret)"
+    if isinstance(value, bytes):
+        dots = " ..." if len(value) > MOST_HEX_BYTES else ""
+        return value[:MOST_HEX_BYTES].hex(" ") + dots
+    if isinstance(value, str):
+        return repr(value)
+    named = dict(tag.values).get(int(value)) if value == int(value) else None
+    text = f"{value:.7g}" if isinstance(value, float) else str(int(value))
+    return f"{text} ({named})" if named is not None else text
+
+
+def place_of(tag: Tag) -> str:
+    """Where a tag stands, both ways for registers."""
+    if tag.at is not None:
+        return str(tag.at)
+    assert tag.object is not None
+    return f"{tag.object[0]:04X}h:{tag.object[1]:02X}"
+
+
+def row_of(tag: Tag, answer: Answer) -> dict[str, Any]:
+    """A value as JSON has it. `raw` is what the device sent, in hex (bits one a byte)."""
+    value = answer.value
+    shown = value.value.hex() if isinstance(value.value, bytes) else value.value
+    row = {
+        "name": tag.name,
+        "at": place_of(tag),
+        "type": tag.type,
+        "value": None if tag.secret else shown,
+        "unit": tag.unit,
+        "quality": str(value.quality),
+        "raw": "" if tag.secret else value.raw.hex(),
+    }
+    if isinstance(value.value, int) and not tag.secret and value.value in dict(tag.values):
+        row["meaning"] = dict(tag.values)[value.value]
+    if value.quality is not Quality.GOOD:
+        row["reason"] = str(value.reason)
+    return row | ({"problem": answer.problem} if answer.problem else {})

@@ -1,6 +1,7 @@
 """Where shipped data lies: the wheel's copy, then the checkout (DESIGN.md decision 14).
 
-The user's search order for profiles and systems: what a flag says, FIELDTWIN_PROFILES, ./profiles, shipped.
+The user's search order for profiles and systems: what a flag says, FIELDTWIN_PROFILES, ./profiles, shipped. Before all of that,
+a file in a template finds what the template brings: it is complete, and means its own files.
 """
 
 from __future__ import annotations
@@ -24,6 +25,16 @@ def data_root(base: Path = _HERE) -> Path:
     raise UsageError("the shipped profiles are missing", where=str(base), hint="reinstall fieldtwin")
 
 
+TEMPLATE = "template.json"
+"""The manifest at the top of a template's folder (`twin.template`)."""
+
+
+def template_of(file: Path | None) -> list[Path]:
+    """The folder of the template that `file` is in, as a list of one; empty when it is in none."""
+    above = list(file.parents)[1:2] if file is not None else []
+    return [folder for folder in above if (folder / TEMPLATE).is_file()]
+
+
 def search_path(extra: Iterable[Path] = ()) -> list[Path]:
     """Folders that may hold `devices`, `systems` and `recordings`, best first."""
     folders = [Path(p) for p in extra]
@@ -38,7 +49,10 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
     `beside` is the file that names it: a relative path is tried there first. Raises `UsageError` listing what there is.
     """
     direct = Path(name)
-    for candidate in ([beside.parent / direct] if beside else []) + [direct]:
+    places = [beside.parent / direct] if beside else []
+    if direct.name == name:
+        places += [folder / kind / file for folder in template_of(beside) for file in (f"{name}.yaml", name)]
+    for candidate in (*places, direct):
         if candidate.is_file():
             return candidate
     folders = search_path(extra)
@@ -60,6 +74,7 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
 def find_recording(name: str, beside: Path | None = None) -> Path:
     """A recording by path, beside the file that names it, in ./recordings or shipped."""
     folders = [beside.parent] if beside else []
+    folders += [folder / "recordings" for folder in template_of(beside)]
     folders += [Path(), Path("recordings"), data_root() / "recordings"]
     for folder in folders:
         if (folder / name).is_file():

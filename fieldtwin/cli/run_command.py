@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 import click
 
 from fieldtwin.cli.options import Duration, json_option, pairs, profiles_option
+from fieldtwin.cli.template_question import ask_about_code
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
 from fieldtwin.running.summary import summarise
+from fieldtwin.running.template_here import system_file
 from gateway.core.errors import UsageError
 
 NEITHER = """run needs --plant or --prototype; neither is a default.
@@ -75,6 +77,7 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     metavar="FILE|random",
     help="With --prototype: put these faults in (fieldtwin faults); random, with --virtual: ones that the seed chooses.",
 )
+@click.option("--trust", is_flag=True, help="Run control logic in Python that a template brings, without asking.")
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
 @json_option
@@ -101,13 +104,14 @@ def command(
     ledger: str | None,
     trace: str | None,
     faults: str,
+    trust: bool,
     cold: bool,
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
     """Run SYSTEM: gateway and PLC, each in its own process.
 
-    SYSTEM is a file, or the name of a shipped one such as `observatory`.
+    SYSTEM is a file, the name of a shipped one such as `observatory`, or a template (fieldtwin template): a zip or a folder.
 
     With --prototype the field side is emulated in a process of its own, on real wires: a pty for each serial line, TCP sockets, a
     software CAN bus (or a kernel one, with --can). The same system file runs the plant with --plant.
@@ -123,6 +127,7 @@ def command(
         )
     if prototype and allow_writes:
         raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
+    system = system_file(system, lambda template: trust or ask_about_code(template), plant=plant)
     if virtual:
         if plant or field_host or listen or can or capture:
             raise UsageError(

@@ -1,0 +1,61 @@
+"""Schemas Document, BluePrint, TechnicalManual, BillOfMaterials, Generic, DigitalTemplate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from spec_rig import CLOCK, observatory
+
+from twin.model import DigitalModel
+from twin.physical import EmbeddedControlSystem
+from twin.prototype import DigitalTwinPrototype
+from twin.system import load_system
+from twin.template import (
+    DOCUMENTS,
+    BillOfMaterials,
+    BluePrint,
+    DigitalTemplate,
+    Document,
+    DocumentKind,
+    Generic,
+    TechnicalManual,
+)
+from twin.template_check import examine, put_together
+from twin.template_pack import Extras, collect, pack
+from twin.template_package import FolderPackage
+
+
+def template(tmp_path: Path) -> DigitalTemplate:
+    """The observatory's, with a document of each kind, read back from its package."""
+    system, prototype = observatory()
+    documents: dict[DocumentKind, tuple[Path, ...]] = {}
+    for kind in DOCUMENTS:
+        documents[kind] = (tmp_path / f"{kind}.txt",)
+        documents[kind][0].write_text(f"a {kind}")
+    pack(system, collect(system, (), prototype.path), Extras(documents), "1.0", tmp_path / "T")
+    package = FolderPackage(tmp_path / "T")
+    package.verify()
+    return put_together(package.manifest, examine(package.path, package.manifest), package.path, CLOCK)
+
+
+@pytest.mark.parametrize("kind", [BluePrint, TechnicalManual, BillOfMaterials, Generic])
+def test_Document_each_kind_is_a_document(kind: type[Document]) -> None:
+    assert issubclass(kind, Document)
+    assert kind is not Document
+
+
+def test_DigitalTemplate_is_documents_and_the_embedded_control_system_and_the_digital_model(tmp_path: Path) -> None:
+    made = template(tmp_path)
+    assert {type(document) for document in made.documents} == {BluePrint, TechnicalManual, BillOfMaterials, Generic}
+    assert type(made.ecs) is EmbeddedControlSystem
+    assert type(made.digital_model) is DigitalModel
+
+
+def test_DigitalTemplate_holds_the_physical_twins_own_configuration_and_a_model_of_its_own(tmp_path: Path) -> None:
+    """Prose, rows 2 and 8: the same file, byte for byte; and another model than any twin's."""
+    system, prototype = observatory()
+    made = template(tmp_path)
+    assert made.ecs.system.path.read_bytes() == system.path.read_bytes()
+    again = load_system(str(made.ecs.system.path))
+    assert made.digital_model is not DigitalTwinPrototype(again, prototype, CLOCK).model

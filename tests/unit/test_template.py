@@ -1,0 +1,496 @@
+"""Digital templates: what is packed, that the same is packed the same, and that a stranger's harms nobody."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import stat
+import struct
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from fieldtwin.running.template_here import system_file
+from gateway.core.errors import FileInvalid, NotAllowed, Unreachable, UsageError
+from twin.prototype_file import load_prototype
+from twin.software import modules_hash, wheel_hash
+from twin.system import System, load_system
+from twin.template import MANIFEST, Manifest, check_path, parse_manifest
+from twin.template_check import differences, examine
+from twin.template_pack import Extras, collect, pack
+from twin.template_package import FolderPackage, Package, ZipPackage, open_package, unpack
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+SHIPPED = CHECKOUT / "profiles"
+BLINKER = """
+import helper
+from plc.program import Output, Program
+from gateway.core.image import TagKind
+
+class Blinker(Program):
+    def execute(self, scan):
+        pass
+"""
+
+
+def own_system(folder: Path) -> Path:
+    """A system with nothing in it that is shipped: profile, EDS, recording, control logic in Structured Text and Python."""
+    for sub in ("plant", "devices", "logic"):
+        (folder / sub).mkdir(parents=True)
+    profile = (SHIPPED / "devices" / "inclinometer-cia410.yaml").read_text()
+    (folder / "devices" / "tilt.yaml").write_text(profile.replace("inclinometer-cia410.eds", "tilt.eds"))
+    shutil.copy(SHIPPED / "devices" / "inclinometer-cia410.eds", folder / "devices" / "tilt.eds")
+    shutil.copy(CHECKOUT / "recordings" / "incl.jsonl", folder / "plant" / "tilt.jsonl")
+    (folder / "plant" / "logic").mkdir()
+    (folder / "plant" / "logic" / "count.st").write_text(
+        "PROGRAM Count\nVAR_INPUT tilt : LREAL; END_VAR\nVAR n : DINT; END_VAR\nn := n + 1;\nEND_PROGRAM\n"
+    )
+    (folder / "plant" / "dam.yaml").write_text(
+        "fieldtwin: 1\nsystem: dam\nbuses:\n  can0: {url: 'can:socketcan/can0'}\ndevices:\n"
+        "  tilt: {profile: ../devices/tilt.yaml, bus: can0, node: 5, start: true}\n"
+        "plc:\n  programs:\n    count: {source: logic/count.st, inputs: {tilt: {tag: tilt.slope_long}}}\n"
+    )
+    (folder / "plant" / "dam.prototype.yaml").write_text(
+        "prototype_of: dam.yaml\nbuses: {can0: {listen: 'can:fieldtwin/127.0.0.1:0'}}\n"
+        "devices: {tilt: {recording: tilt.jsonl, at_end: loop}}\n"
+    )
+    return folder / "plant" / "dam.yaml"
+
+
+def with_python(path: Path, marker: Path) -> None:
+    """Let the system at `path` have a program in Python that leaves a marker when it is imported."""
+    text = path.read_text().replace("programs:", "programs:\n    blink: {source: 'python: site_logic:Blinker'}")
+    path.write_text(text)
+    (path.parent / "helper.py").write_text(f"open({str(marker)!r}, 'w').close()\n")
+    (path.parent / "site_logic.py").write_text(BLINKER.replace("Output, ", ""))
+
+
+def packed(system: Path, target: Path, extras: Extras = Extras()) -> Manifest:  # noqa: B008
+    loaded = load_system(str(system))
+    return pack(loaded, collect(loaded, (), system.with_name(f"{system.stem}.prototype.yaml")), extras, "9.9", target)
+
+
+@pytest.fixture
+def dam(tmp_path: Path) -> Path:
+    return own_system(tmp_path / "site")
+
+
+def yes(package: Package) -> bool:
+    return True
+
+
+def no(package: Package) -> bool:
+    return False
+
+
+# -- packing --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_template_has_everything_that_its_system_names(dam: Path, tmp_path: Path) -> None:
+    manual = tmp_path / "manual.pdf"
+    manual.write_bytes(b"%PDF-")
+    manifest = packed(dam, tmp_path / "T.zip", Extras({"technical-manual": (manual,)}))
+    assert {(f.path, f.kind) for f in manifest.files} == {
+        ("systems/dam.yaml", "system"), ("systems/dam.prototype.yaml", "prototype"), ("devices/tilt.yaml", "profile"),
+        ("devices/tilt.eds", "eds"), ("systems/tilt.jsonl", "recording"), ("systems/logic/count.st", "program"),
+        ("model.json", "model"), ("documents/technical-manual/manual.pdf", "document"),
+    }  # fmt: skip
+    assert manifest.software.modules_sha256 == modules_hash()
+    assert manifest.code == ()
+
+
+def test_the_system_file_is_packed_byte_for_byte(dam: Path, tmp_path: Path) -> None:
+    """Prose, row 2: plant, prototype and template have one configuration."""
+    packed(dam, tmp_path / "T.zip")
+    with zipfile.ZipFile(tmp_path / "T.zip") as archive:
+        assert archive.read("systems/dam.yaml") == dam.read_bytes()
+
+
+def test_the_same_files_give_the_same_bytes_whenever_and_in_whatever_order(dam: Path, tmp_path: Path) -> None:
+    first = packed(dam, tmp_path / "a.zip")
+    os.utime(dam, (1, 1))
+    dam.chmod(0o600)
+    second = packed(dam, tmp_path / "b.zip")
+    assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+    assert first.id == second.id
+    packed(dam, tmp_path / "folder")
+    assert (tmp_path / "folder" / MANIFEST).read_bytes() == first.to_json()
+
+
+def test_from_a_template_alone_a_prototype_runs_on_a_machine_that_has_none_of_it(dam: Path, tmp_path: Path) -> None:
+    packed(dam, tmp_path / "T.zip")
+    shutil.rmtree(dam.parent.parent)
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("FIELDTWIN")}
+    environment |= {"PYTHONPATH": str(CHECKOUT), "FIELDTWIN_RUN": str(tmp_path / "r")}
+    run = [sys.executable, "-m", "fieldtwin", "run", "../T.zip", "--prototype", "--virtual", "--for", "5s", "--json"]
+    ended = subprocess.run(run, cwd=empty, env=environment, capture_output=True, text=True, check=False, timeout=50)
+    assert ended.returncode == 0, ended.stderr
+    summary = json.loads(ended.stdout)
+    assert (summary["system"], summary["ok"]) == ("dam", True)
+
+
+def test_the_shipped_observatory_makes_a_whole_template(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "run"))
+    packed(SHIPPED / "systems" / "observatory.yaml", tmp_path / "T.zip")
+    assert Path(system_file(str(tmp_path / "T.zip"), no)).name == "observatory.yaml"
+
+
+def test_what_is_on_this_computer_alone_is_refused(dam: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "tilt.yaml"
+    shutil.copy(dam.parent.parent / "devices" / "tilt.yaml", outside)
+    shutil.copy(dam.parent.parent / "devices" / "tilt.eds", tmp_path / "tilt.eds")
+    dam.write_text(dam.read_text().replace("../devices/tilt.yaml", str(outside)))
+    with pytest.raises(FileInvalid, match="a place on this computer alone"):
+        packed(dam, tmp_path / "T.zip")
+    dam.write_text(dam.read_text().replace(str(outside), "../../tilt.yaml"))
+    with pytest.raises(FileInvalid, match="leads outside"):
+        packed(dam, tmp_path / "T.zip")
+
+
+def test_a_program_that_is_installed_elsewhere_cannot_be_packed(dam: Path, tmp_path: Path) -> None:
+    text = dam.read_text().replace("programs:", "programs:\n    x: {source: 'python: antigravity:Program'}")
+    dam.write_text(text)
+    with pytest.raises(FileInvalid, match="installed on this computer"):
+        packed(dam, tmp_path / "T.zip")
+    assert "antigravity" not in sys.modules
+
+
+def test_a_wheel_of_other_software_is_refused(dam: Path, tmp_path: Path) -> None:
+    wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("twin/__init__.py", "")
+    with pytest.raises(FileInvalid, match="other software than is running here"):
+        packed(dam, tmp_path / "T.zip", Extras(wheel=wheel))
+
+
+def test_a_wheel_has_the_hash_of_what_it_installs(tmp_path: Path) -> None:
+    wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
+    (tmp_path / "x" / "plc" / "__pycache__").mkdir(parents=True)
+    (tmp_path / "x" / "plc" / "a.py").write_text("a = 1\n")
+    (tmp_path / "x" / "plc" / "__pycache__" / "a.pyc").write_text("left out")
+    with zipfile.ZipFile(wheel, "w") as archive:
+        archive.writestr("fieldtwin/_data/profiles/x.yaml", "data is no module")
+        archive.writestr("plc/a.py", "a = 1\n")
+    assert wheel_hash(wheel) == ("9.9", modules_hash(tmp_path / "x"))
+
+
+# -- code ------------------------------------------------------------------------------------------------------------------
+
+
+def test_python_is_named_and_runs_after_a_yes_only(dam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "run"))
+    marker = tmp_path / "it ran"
+    with_python(dam, marker)
+    manifest = packed(dam, tmp_path / "T.zip")
+    assert manifest.code == ("systems/helper.py", "systems/site_logic.py")
+    with pytest.raises(NotAllowed, match="nothing of this template was run"):
+        system_file(str(tmp_path / "T.zip"), no)
+    assert Path(system_file(str(tmp_path / "T.zip"), yes)).is_file()
+    assert not marker.exists(), "asking, unpacking and examining run nothing"
+
+
+def fieldtwin(tmp_path: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """Our command line, without a terminal."""
+    return subprocess.run(
+        [sys.executable, "-m", "fieldtwin", *words],
+        env={**os.environ, "PYTHONPATH": str(CHECKOUT), "FIELDTWIN_RUN": str(tmp_path / "r")},
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False, timeout=50,
+    )  # fmt: skip
+
+
+def test_without_a_terminal_the_answer_is_no_and_trust_says_yes(dam: Path, tmp_path: Path) -> None:
+    marker = tmp_path / "it ran"
+    with_python(dam, marker)
+    packed(dam, tmp_path / "T.zip")
+    checked = fieldtwin(tmp_path, "template", "check", str(tmp_path / "T.zip"))
+    assert (checked.returncode, marker.exists()) == (0, False), checked.stderr
+    assert "its control logic was not looked at" in checked.stderr
+    run = ["run", str(tmp_path / "T.zip"), "--prototype", "--virtual", "--for", "1s"]
+    refused = fieldtwin(tmp_path, *run)
+    assert "control logic in Python: systems/helper.py, systems/site_logic.py" in refused.stderr
+    assert (refused.returncode, marker.exists()) == (2, False), refused.stderr
+    trusted = fieldtwin(tmp_path, *run, "--trust")
+    assert (trusted.returncode, marker.exists()) == (0, True), trusted.stderr
+
+
+def test_left_over_byte_code_in_a_folder_counts_as_code(dam: Path, tmp_path: Path) -> None:
+    packed(dam, tmp_path / "T")
+    (tmp_path / "T" / "systems" / "__pycache__").mkdir()
+    (tmp_path / "T" / "systems" / "__pycache__" / "plc.cpython-311.pyc").write_bytes(b"")
+    assert FolderPackage(tmp_path / "T").code == ("systems/__pycache__/plc.cpython-311.pyc",)
+
+
+# -- strangers' templates -------------------------------------------------------------------------------------------------
+
+
+def reworked(source: Path, target: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
+    """The zip with other contents, its manifest made to fit where `change` leaves the manifest alone."""
+    with zipfile.ZipFile(source) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    change(files)
+    with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return target
+
+
+def unpack_zip(path: Path, target: Path) -> None:
+    with open_package(path) as package:
+        unpack(package, target)
+
+
+@pytest.fixture
+def good(dam: Path, tmp_path: Path) -> Path:
+    packed(dam, tmp_path / "good.zip")
+    return tmp_path / "good.zip"
+
+
+def test_a_wrong_hash_names_file_expected_and_got(good: Path, tmp_path: Path) -> None:
+    def change(files: dict[str, bytes]) -> None:
+        files["devices/tilt.yaml"] = files["devices/tilt.yaml"].replace(b"16", b"61", 1)
+
+    bad = reworked(good, tmp_path / "bad.zip", change)
+    with pytest.raises(FileInvalid, match=r"devices/tilt\.yaml: not what was packed") as caught:
+        unpack_zip(bad, tmp_path / "out")
+    with open_package(good) as package:
+        assert caught.value.expected.endswith(package.manifest.by_path()["devices/tilt.yaml"].sha256)
+    assert len(caught.value.got) == 64
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.zip", "good.zip", "site"], "nothing is left of it"
+
+
+def add(name: str, data: bytes = b"x") -> Callable[[dict[str, bytes]], None]:
+    return lambda files: files.update({name: data})
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../evil", "/etc/evil", "a/../../evil", "a\\..\\evil", "C:evil", "a//b", "a/./b", "NUL", "aux.txt", "x ", "\x7f"],
+)
+def test_a_path_outside_is_refused_in_the_zip_and_in_the_manifest(good: Path, tmp_path: Path, name: str) -> None:
+    with pytest.raises(FileInvalid):
+        unpack_zip(reworked(good, tmp_path / "bad.zip", add(name)), tmp_path / "deep" / "er" / "out")
+    with pytest.raises(FileInvalid, match="a path that a template cannot have"):
+        check_path(name, "here")
+    assert not list(tmp_path.rglob("*evil*"))
+
+
+@given(path=st.text(max_size=40))
+@example(path="..")
+@example(path="a/..")
+def test_a_path_that_passes_stays_inside(path: str) -> None:
+    try:
+        check_path(path, "here")
+    except FileInvalid:
+        return
+    top = Path("/somewhere/deep")
+    assert Path(os.path.normpath(top / path)).is_relative_to(top)
+    assert os.path.normpath(top / path) != str(top)
+
+
+def test_files_that_the_manifest_does_not_name_are_refused(good: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid, match=r"'systems/plc\.py' is not in the manifest"):
+        unpack_zip(reworked(good, tmp_path / "bad.zip", add("systems/plc.py")), tmp_path / "out")
+    with pytest.raises(FileInvalid, match=r"'model\.json' is missing"):
+        unpack_zip(reworked(good, tmp_path / "bad.zip", lambda f: f.pop("model.json") and None), tmp_path / "out")
+
+
+def test_links_are_refused(good: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(good, "a") as archive:
+        link = zipfile.ZipInfo("systems/link")
+        link.external_attr = (stat.S_IFLNK | 0o777) << 16
+        archive.writestr(link, "/etc/passwd")
+    with pytest.raises(FileInvalid, match="no plain file"), open_package(good):
+        pass
+    folder = tmp_path / "folder"
+    own = own_system(tmp_path / "again")
+    packed(own, folder)
+    (folder / "model.json").unlink()
+    (folder / "model.json").symlink_to("/etc/passwd")
+    with pytest.raises(FileInvalid, match="no plain file"):
+        FolderPackage(folder)
+
+
+def test_a_file_packed_too_tightly_is_refused_before_it_is_unpacked(good: Path, tmp_path: Path) -> None:
+    zeros = bytes(3 << 20)
+
+    def change(files: dict[str, bytes]) -> None:
+        manifest = json.loads(files[MANIFEST])
+        manifest["files"].append(
+            {
+                "path": "recordings/z.jsonl",
+                "kind": "recording",
+                "bytes": len(zeros),
+                "sha256": hashlib.sha256(zeros).hexdigest(),
+            }
+        )
+        files[MANIFEST] = json.dumps(manifest).encode()
+        files["recordings/z.jsonl"] = zeros
+
+    with pytest.raises(FileInvalid, match="packed too tightly"):
+        unpack_zip(reworked(good, tmp_path / "bad.zip", change), tmp_path / "out")
+
+
+@pytest.mark.parametrize("key", ["bytes", "count"])
+def test_sizes_and_counts_are_bounded_before_memory_is_spent(good: Path, tmp_path: Path, key: str) -> None:
+    def change(files: dict[str, bytes]) -> None:
+        manifest = json.loads(files[MANIFEST])
+        if key == "bytes":
+            manifest["files"][0]["bytes"] = 1 << 40
+        else:
+            one = manifest["files"][0]
+            manifest["files"] += [{**one, "path": f"x{i}"} for i in range(10_001)]
+        files[MANIFEST] = json.dumps(manifest).encode()
+
+    with (
+        pytest.raises(FileInvalid, match=r"too large|too many"),
+        open_package(reworked(good, tmp_path / "bad.zip", change)),
+    ):
+        pass
+
+
+def test_a_directory_of_millions_of_entries_is_not_even_read(good: Path, tmp_path: Path) -> None:
+    data = bytearray(good.read_bytes())
+    at = data.rfind(b"PK\x05\x06")
+    struct.pack_into("<L", data, at + 12, 0x7FFF_FFFF)
+    (tmp_path / "bad.zip").write_bytes(data)
+    with pytest.raises(FileInvalid, match="too many files"), open_package(tmp_path / "bad.zip"):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"fieldtwin_template": 2}, "packed by a newer fieldtwin"),
+        ({"fieldtwin_template": 0}, "the form of the template"),
+        ({"surprise": 1}, "surprise"),
+        ({"system_file": "model.json"}, "the system file 'model.json' is not among the files"),
+        ({"files": "all"}, "no manifest of a template"),
+    ],
+)
+def test_a_manifest_that_is_none_is_refused(good: Path, tmp_path: Path, change: dict[str, object], says: str) -> None:
+    with open_package(good) as package:
+        text = package.manifest.to_json()
+    with pytest.raises(FileInvalid, match=says):
+        parse_manifest(json.dumps({**json.loads(text), **change}).encode(), "here")
+
+
+@given(
+    text=st.binary(max_size=200)
+    | st.recursive(st.none() | st.integers() | st.text(), st.lists).map(msgspec.json.encode)
+)
+def test_no_bytes_are_a_manifest_or_else_a_clear_error(text: bytes) -> None:
+    with pytest.raises(FileInvalid):
+        parse_manifest(text, "here")
+
+
+@given(cut=st.integers(0, 20_000), flips=st.lists(st.tuples(st.integers(0, 20_000), st.integers(1, 255)), max_size=4))
+def test_a_damaged_zip_is_refused_or_is_what_was_packed(
+    tmp_path_factory: pytest.TempPathFactory, cut: int, flips: list[tuple[int, int]]
+) -> None:
+    place = tmp_path_factory.getbasetemp()
+    source = place / "undamaged.zip"
+    if not source.exists():
+        packed(own_system(place / "damage"), source)
+    data = bytearray(source.read_bytes())
+    for at, mask in flips:
+        data[at % len(data)] ^= mask
+    if cut < len(data) and not flips:
+        del data[cut:]
+    (place / "damaged.zip").write_bytes(data)
+    try:
+        with open_package(place / "damaged.zip") as package:
+            package.verify()
+            assert set(package.manifest.by_path()) >= {"systems/dam.yaml"}
+    except FileInvalid:
+        pass
+
+
+def test_a_template_that_counts_on_what_this_computer_has_is_not_whole(dam: Path, tmp_path: Path) -> None:
+    dam.write_text(dam.read_text().replace("../devices/tilt.yaml", "inclinometer-cia410"))
+    manifest = packed(dam, tmp_path / "T")
+    assert examine(tmp_path / "T", manifest).name == "dam"
+    (tmp_path / "T" / "devices" / "inclinometer-cia410.yaml").unlink()
+    lean = msgspec.structs.replace(
+        manifest, files=tuple(f for f in manifest.files if f.path != "devices/inclinometer-cia410.yaml")
+    )
+    with pytest.raises(FileInvalid, match=r"devices/inclinometer-cia410.yaml is not in the template"):
+        examine(tmp_path / "T", lean)
+
+
+def test_another_model_than_the_systems_is_found(dam: Path, tmp_path: Path) -> None:
+    manifest = packed(dam, tmp_path / "T")
+    (tmp_path / "T" / "model.json").write_text("{}")
+    with pytest.raises(FileInvalid, match="not the digital model of its system"):
+        examine(tmp_path / "T", manifest)
+
+
+def test_a_template_means_its_own_files_whatever_else_there_is(
+    dam: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bare name in a template is not looked up in FIELDTWIN_PROFILES, here, or among what is shipped."""
+    dam.write_text(dam.read_text().replace("../devices/tilt.yaml", "inclinometer-cia410"))
+    packed(dam, tmp_path / "T")
+    other = tmp_path / "other" / "devices"
+    other.mkdir(parents=True)
+    (other / "inclinometer-cia410.yaml").write_text("device: x/other\nsource: x\nprotocol: modbus\n")
+    monkeypatch.setenv("FIELDTWIN_PROFILES", str(other.parent))
+    monkeypatch.chdir(other)
+    system: System = load_system(str(tmp_path / "T" / "systems" / "dam.yaml"))
+    assert system.devices["tilt"].profile.path == str(tmp_path / "T" / "devices" / "inclinometer-cia410.yaml")
+    assert load_prototype(system).devices["tilt"].recording == tmp_path / "T" / "systems" / "tilt.jsonl"
+
+
+# -- unpacking, comparing ---------------------------------------------------------------------------------------------
+
+
+def test_pack_unpack_and_pack_again_are_the_same(good: Path, tmp_path: Path) -> None:
+    unpack_zip(good, tmp_path / "out")
+    assert packed(tmp_path / "out" / "systems" / "dam.yaml", tmp_path / "again.zip")
+    assert (tmp_path / "again.zip").read_bytes() == good.read_bytes()
+
+
+def test_a_folder_in_use_is_left_alone(good: Path, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine").touch()
+    with pytest.raises(UsageError, match="the folder is not empty"):
+        unpack_zip(good, tmp_path / "out")
+
+
+def test_a_full_disk_is_said_before_anything_is_written(
+    good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)._replace(free=10)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    with pytest.raises(Unreachable, match="the disk is too full"):
+        unpack_zip(good, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_templates_are_compared_file_by_file(dam: Path, tmp_path: Path) -> None:
+    before = packed(dam, tmp_path / "a.zip")
+    dam.write_text(dam.read_text() + "# more\n")
+    (dam.parent / "tilt.jsonl").rename(dam.parent / "other.jsonl")
+    prototype = dam.with_name("dam.prototype.yaml")
+    prototype.write_text(prototype.read_text().replace("tilt.jsonl", "other.jsonl"))
+    after = packed(dam, tmp_path / "b.zip")
+    assert [(d.what, d.path) for d in differences(before, after)] == [
+        ("changed", "systems/dam.prototype.yaml"), ("changed", "systems/dam.yaml"), ("added", "systems/other.jsonl"),
+        ("removed", "systems/tilt.jsonl"),
+    ]  # fmt: skip
+    assert differences(before, before) == []
+
+
+def test_the_zip_says_what_it_is_made_of(good: Path) -> None:
+    with ZipPackage(good) as package:
+        assert json.loads(package.text("model.json"))["initial"] == {"state": "STANDBY", "period_s": 0}

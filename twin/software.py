@@ -1,0 +1,60 @@
+"""Which control software this is: one hash over its modules, the same in a checkout, where it is installed, and in its wheel.
+
+Two machines with the same hash run the same program, whatever their version numbers say. Shipped profiles and recordings are data
+and have hashes of their own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import zipfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from gateway.core.errors import FileInvalid
+
+PACKAGES = ("emulators", "fieldtwin", "gateway", "plc", "twin")
+HERE = Path(__file__).resolve().parent.parent
+MAX_MODULE_BYTES = 16 << 20
+_LEFT_OUT = re.compile(r"(^|/)__pycache__/|\.pyc$|^fieldtwin/_data/|(^|/)\.")
+
+
+def modules_hash(folder: Path = HERE) -> str:
+    """SHA-256 over the names and contents of all modules below `folder`, as 64 hexadecimal digits."""
+    return _hash(_modules_below(folder))
+
+
+def _modules_below(folder: Path) -> Iterator[tuple[str, bytes]]:
+    for package in PACKAGES:
+        for path in (folder / package).rglob("*"):
+            name = path.relative_to(folder).as_posix()
+            if not _LEFT_OUT.search(name) and path.is_file():
+                yield name, path.read_bytes()
+
+
+def wheel_hash(wheel: Path) -> tuple[str, str]:
+    """Version of a wheel of ours, and the same hash over what it would install. Raises `FileInvalid`."""
+    match = re.fullmatch(r"fieldtwin-([0-9A-Za-z.!+_]+)-[^-]+-[^-]+-[^-]+\.whl", wheel.name)
+    if match is None:
+        raise FileInvalid("no wheel of fieldtwin", path=str(wheel), expected="fieldtwin-VERSION-py3-none-any.whl")
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            return match[1], _hash(_modules_in(archive))
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as e:
+        raise FileInvalid(f"cannot read the wheel: {e}", path=str(wheel)) from e
+
+
+def _modules_in(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:
+    for entry in archive.infolist():
+        if entry.filename.split("/")[0] in PACKAGES and not entry.is_dir() and not _LEFT_OUT.search(entry.filename):
+            with archive.open(entry) as file:
+                data = file.read(MAX_MODULE_BYTES + 1)
+            if len(data) > MAX_MODULE_BYTES:
+                raise FileInvalid("too large for a module", path=entry.filename, expected=f"{MAX_MODULE_BYTES} bytes")
+            yield entry.filename, data
+
+
+def _hash(modules: Iterable[tuple[str, bytes]]) -> str:
+    lines = sorted(f"{name}\0{hashlib.sha256(data).hexdigest()}\n" for name, data in modules)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -1,0 +1,108 @@
+"""Whether a template is what it should be: complete, of one piece, and able to run by itself. And how two of them differ.
+
+Looks at a folder whose hashes were verified. It reads system file, profiles and prototype; it imports control logic only where
+it was told that it may.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from gateway.core.clock import Clock
+from gateway.core.errors import FileInvalid
+from twin.system import System, load_system
+from twin.template import DigitalTemplate, Manifest, describe_model
+from twin.template_pack import MODEL, collect
+from twin.template_package import Package
+
+TEXT = (".yaml", ".yml", ".st", ".xml", ".py", ".eds", ".dcf", ".json", ".md", ".txt", ".csv")
+MAX_SHOWN_BYTES = 256 * 1024
+
+
+def examine(folder: Path, manifest: Manifest, *, plant: bool = False) -> System:
+    """Load the template's system and see that nothing it names is missing from the template. Runs no control logic.
+
+    With `plant` the prototype's file and what it names are not looked at: they take emulators, which a plant need not have.
+    Raises `FileInvalid` for the first thing wrong.
+    """
+    where = str(folder)
+    system = load_system(str(folder / manifest.system_file))
+    if system.name != manifest.system:
+        raise FileInvalid(
+            "the manifest and the system file differ", path=where, expected=manifest.system, got=system.name
+        )
+    prototype = folder / manifest.prototype_file if manifest.prototype_file and not plant else None
+    needed = collect(system, prototype=prototype)
+    files = manifest.by_path()
+    top = folder.resolve()
+    for path, item in needed.items.items():
+        if path not in files or (item.source is not None and not item.source.resolve().is_relative_to(top)):
+            raise FileInvalid(f"{path} is not in the template", path=where, expected="everything that its system names")
+    if (folder / MODEL).read_bytes() != describe_model(system):
+        raise FileInvalid(
+            f"{MODEL} is not the digital model of its system",
+            path=where,
+            hint="pack the template again with this version",
+        )
+    return system
+
+
+def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock) -> DigitalTemplate:
+    """Make the template's control system, and its prototype where it has one: what a run would do first.
+
+    This imports control logic in Python. Raises `FileInvalid`.
+    """
+    template = DigitalTemplate(manifest, system)
+    if manifest.prototype_file:
+        from twin.prototype import DigitalTwinPrototype  # a plant has no emulators installed
+        from twin.prototype_file import load_prototype
+
+        DigitalTwinPrototype(system, load_prototype(system, folder / manifest.prototype_file), clock)
+    return template
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A file that two templates do not have in common: `before` and `after` are hashes, empty where there is none."""
+
+    path: str
+    kind: str
+    before: str
+    after: str
+
+    @property
+    def what(self) -> str:
+        return "added" if not self.before else "removed" if not self.after else "changed"
+
+
+def differences(before: Manifest, after: Manifest) -> list[Difference]:
+    """Files that differ, by path, and the control software."""
+    old, new = before.by_path(), after.by_path()
+    found = []
+    if before.software.modules_sha256 != after.software.modules_sha256:
+        a, b = before.software, after.software
+        found.append(
+            Difference("fieldtwin", "software", f"{a.version} {a.modules_sha256}", f"{b.version} {b.modules_sha256}")
+        )
+    for path in sorted({*old, *new}):
+        a_hash, b_hash = (side[path].sha256 if path in side else "" for side in (old, new))
+        if a_hash != b_hash:
+            found.append(Difference(path, (new.get(path) or old[path]).kind, a_hash, b_hash))
+    return found
+
+
+def unified(before: Package, after: Package, path: str) -> Iterator[str]:
+    """Lines of a unified diff of one text file; none for other files, and those of more than `MAX_SHOWN_BYTES`."""
+    sides = []
+    for package in (before, after):
+        file = package.manifest.by_path().get(path)
+        if file is not None and (not path.lower().endswith(TEXT) or file.bytes > MAX_SHOWN_BYTES):
+            return
+        try:
+            sides.append(package.text(path).decode().splitlines() if file is not None else [])
+        except UnicodeDecodeError:
+            return
+    yield from difflib.unified_diff(sides[0], sides[1], f"a/{path}", f"b/{path}", lineterm="")

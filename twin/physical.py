@@ -137,13 +137,16 @@ def _check_variables(system: System, bound: BoundProgram) -> None:
                 )
 
 
-def gateway_config(system: System, *, allow_writes: bool, free_ports: bool = False) -> GatewayConfig:
-    """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host;
-    and no line is strict about silences: those of virtual ports say nothing."""
+def gateway_config(
+    system: System, *, allow_writes: bool, free_ports: bool = False, true_silences: bool | None = None
+) -> GatewayConfig:
+    """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host.
+    Without `true_silences` no line is strict about them: those of virtual ports say nothing, which `free_ports` implies."""
+    true_silences = not free_ports if true_silences is None else true_silences
     serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
     return GatewayConfig(
-        buses={name: replace(bus, strict=bus.strict and not free_ports) for name, bus in system.buses.items()},
+        buses={name: replace(bus, strict=bus.strict and true_silences) for name, bus in system.buses.items()},
         devices=system.devices,
         cycle_ms=fastest_ms(system),
         plc_lost_ms=max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system)),
@@ -235,11 +238,14 @@ class EmbeddedControlSystem:
         *,
         allow_writes: bool,
         free_ports: bool = False,
+        true_silences: bool | None = None,
         listen: Listen = TcpListener.open,
     ) -> Gateway:
         """The gateway with its drivers. Which wires `connector` opens, and where `listen` lets clients in, nobody from here
         on knows."""
-        config = gateway_config(self.system, allow_writes=allow_writes, free_ports=free_ports)
+        config = gateway_config(
+            self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences
+        )
         return Gateway(config, connector, clock, image, audit, log, listen)
 
     def command_lists(self, clock: Clock) -> dict[str, frozenset[str]]:

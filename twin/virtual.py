@@ -108,6 +108,7 @@ class VirtualPrototype:
             log,
             allow_writes=True,
             free_ports=True,
+            true_silences=True,
             listen=self.net.listen_for_clients,
         )
         self.plc = Runner(

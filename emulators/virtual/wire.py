@@ -37,14 +37,18 @@ class MemoryWire:
         self._received = SerialPacer(settings) if settings is not None else None
 
     def write(self, direction: Direction, data: bytes) -> None:
-        """`data` is on the wire now, behind what is on it already."""
+        """`data` is on the wire now, behind what is on it already. What comes as one piece is heard when it is whole; of one
+        that follows another without a pause the first character is heard by itself, or the line would seem to be silent."""
         if not data:
             return
         receiver, pacer = self._way(direction)
         if pacer is None:
             receiver.arrived(data)
-        else:
-            self.loop.call_at_ns(pacer.send(self.loop.now_ns, len(data)), receiver.arrived, data)
+            return
+        if pacer.busy_until_ns > self.loop.now_ns and len(data) > 1:
+            self.loop.call_at_ns(pacer.send(self.loop.now_ns, 1), receiver.arrived, data[:1])
+            data = data[1:]
+        self.loop.call_at_ns(pacer.send(self.loop.now_ns, len(data)), receiver.arrived, data)
 
     def ended(self, direction: Direction) -> None:
         """The writer of `direction` hung up: behind what is on its way, the other side learns of it."""

@@ -89,9 +89,8 @@ def _rtu_replies(data: bytes) -> tuple[list[Answer], bytes]:
 
 def _rtu_length(data: bytes) -> int:
     """Of the frame that `data` begins with, 0 if it is none: the lengths that its function can have first, then any."""
-    if len(data) < 4:
-        return 0
-    lengths: list[int] = [*frame_lengths(data)[0], *range(4, len(data) + 1)]
+    least = 5 if len(data) > 1 and data[1] & 0x80 else 4  # the CRC of 01 80 is 01 80: an exception is no shorter one
+    lengths: list[int] = [*(frame_lengths(data)[0] if len(data) >= least else ()), *range(least, len(data) + 1)]
     for length in lengths:
         if length <= len(data) and crc16(data[: length - 2]) == int.from_bytes(data[length - 2 : length], "little"):
             return length

@@ -36,8 +36,8 @@ async def must_refuse(wire: ModbusWire, pdu: bytes, *codes: int, may_lack: bool 
     answer = heard.first
     if answer is None or answer.unit != wire.unit:
         after = await wire.still_good()
-        return failed(f"{heard} instead of {named(codes[0])}" + (f"; the next request: {after}" if after else ""))
-    if may_lack and answer.refusal == 0x01 and 0x01 not in codes:
+        return failed(f"{heard} instead of {named(codes[0])}" + (f"; the request afterwards: {after}" if after else ""))
+    if may_lack and answer.pdu == bytes((pdu[0] | 0x80, 0x01)) and 0x01 not in codes:
         raise NotHere(f"it has no function {pdu[0]:02X}")
     wrong = refused(pdu, answer, *codes)
     return failed(wrong) if wrong else passed(named(answer.refusal))

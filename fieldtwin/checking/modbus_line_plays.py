@@ -98,7 +98,8 @@ async def broadcast_read(wire: ModbusWire) -> Finding:
 async def _silent_neighbour(wire: ModbusWire) -> int:
     """A unit id that nobody has. Raises `Unsaid` if all that were tried are somebody."""
     for unit in _neighbours(wire):
-        if (await wire.ask(wire.good, unit)).nothing:
+        if (await wire.ask(wire.good, unit, due=False)).nothing:
+            await wire.settle()
             return unit
     raise Unsaid("every other unit id that was tried is answered: see MB-029")
 
@@ -111,7 +112,7 @@ async def other_unit(wire: ModbusWire) -> Finding:
     """MB-029: requests to other units. Three that answer alike are one device that answers for all."""
     said = []
     for unit in _neighbours(wire):
-        heard = await wire.ask(wire.good, unit)
+        heard = await wire.ask(wire.good, unit, due=False)
         if heard.nothing:
             after = await wire.still_good()
             return failed(f"the request afterwards: {after}") if after else passed(f"silence for unit {unit}")

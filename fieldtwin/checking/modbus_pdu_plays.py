@@ -37,7 +37,7 @@ async def high_function(wire: ModbusWire) -> Finding:
     """MB-035: function 83h; code 01 or silence, the same both times."""
     seen = []
     for _ in range(2):
-        heard = await wire.ask(b"\x83\x00\x00\x00\x01")
+        heard = await wire.ask(b"\x83\x00\x00\x00\x01", due=False)
         if heard.nothing:
             seen.append("silence")
         elif heard.first is not None and heard.first.refusal == 0x01 and not heard.rest:
@@ -220,11 +220,11 @@ async def listen_only(wire: ModbusWire) -> Finding:
     echo = await wire.ask(b"\x08\x00\x00\x5a\x5a")
     if echo.first is None or echo.first.refusal:
         raise NotHere(f"it has no function 08: {echo}")
-    entered = await wire.ask(b"\x08\x00\x04\x00\x00")
+    entered = await wire.ask(b"\x08\x00\x04\x00\x00", due=False)
     if entered.first is not None and entered.first.refusal:
         raise NotHere(f"it has no listen-only mode: {entered}")
-    meanwhile = await wire.ask(wire.good)
-    left = await wire.ask(b"\x08\x00\x01\x00\x00")
+    meanwhile = await wire.ask(wire.good, due=False)
+    left = await wire.ask(b"\x08\x00\x01\x00\x00", due=False)
     after = await wire.still_good()
     if not entered.nothing:
         return failed(f"{entered} instead of silence to 08/04")

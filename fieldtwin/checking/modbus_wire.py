@@ -23,6 +23,10 @@ IDENTIFICATION = b"\x2b\x0e"
 """What may be asked by function 2B; it carries CANopen's services as well, which may write."""
 MOST_HEARD = 65_536
 """Bytes that a device may say at once; one that says more babbles."""
+CALM_S = 0.8
+"""After this silence on a line no receiver waits for the rest of a frame, however slow its timers are (libmodbus: 0.5 s)."""
+PATIENCE = 3
+"""So many timeouts are waited for an answer that is due before it is called silence: slow is no fault."""
 GATEWAY_SAYS_NO = (0x0A, 0x0B)
 """Exceptions of a gateway that has no such device: nobody is there."""
 
@@ -187,15 +191,18 @@ class ModbusWire:
         self._echo_left = self._echo_left[same:] if same else b""
         return chunk[same:]
 
-    async def ask(self, pdu: bytes, unit: int | None = None, *, count: int = 1) -> Heard:
-        """A request in a good frame, and what comes back. On a wire with transaction ids only replies to it count."""
+    async def ask(self, pdu: bytes, unit: int | None = None, *, due: bool = True) -> Heard:
+        """A request in a good frame, and what comes back; where no answer is `due`, silence is believed sooner.
+
+        On a wire with transaction ids only replies to it count.
+        """
         number = self.next_transaction()
         await self.say(self.frame(pdu, unit, number), pdu)
-        heard = await self.hear(count)
+        heard = await self.hear(within_s=self.timeout_s * (PATIENCE if due else 1))
         if self.framing in ("mbap", "udp"):
             late = [a for a in heard.answers if a.transaction != number]
             if late and len(late) == len(heard.answers):  # of something earlier: ours may follow
-                more = await self.hear(count)
+                more = await self.hear()
                 ours = tuple(a for a in more.answers if a.transaction == number)
                 return Heard(ours or heard.answers, heard.rest + more.rest, more.closed)
         return heard
@@ -218,8 +225,11 @@ class ModbusWire:
             return answer.pdu == usual
         return answer.pdu[:2] == usual[:2] and len(answer.pdu) == len(usual)
 
-    async def still_good(self) -> str:
-        """Empty when `good` is answered as usual, else what came instead."""
+    async def still_good(self, *, at_once: bool = False) -> str:
+        """Empty when `good` is answered as usual, else what came instead. On a line that is asked after a long silence,
+        unless `at_once`."""
+        if self.serial and not at_once:
+            await self.clock.sleep_until_ns(self._quiet_since_ns + round(CALM_S * NS_PER_S))
         heard = await self.ask(self.good)
         return "" if len(heard.answers) == 1 and self.is_good(heard.first) and not heard.rest else str(heard)
 
@@ -234,7 +244,7 @@ class ModbusWire:
                         await self.reopen()
                 await self.drain()
                 self._echo_left = b""
-                if not await self.still_good():
+                if not await self.still_good(at_once=True):
                     return True
             except Unreachable:
                 await self.pause(self.timeout_s)

@@ -23,7 +23,8 @@ MAX_LINE = 65_536
 MAX_CONTAINER = 16_000_000
 """Bytes of a packed block of a .blf file when it is unpacked; writers close one at a hundredth of it."""
 _BLOCK = 65_536
-_CONTAINER, _ZLIB = 10, 2
+_CONTAINER, _PLAIN, _ZLIB = 10, 0, 2
+MAX_OBJECT = 65_536
 
 
 def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFrame]]:
@@ -81,7 +82,7 @@ def _check_blocks(path: Path) -> None:
         head = file.read(8)
         if len(head) < 8 or head[:4] != b"LOGG":
             raise FileInvalid("offset 0: not a .blf file", path=str(path), expected="LOGG", got=head[:4].hex())
-        at = max(int.from_bytes(head[4:8], "little"), 8)
+        at, rest = max(int.from_bytes(head[4:8], "little"), 8), b""
         while True:
             file.seek(at)
             head = file.read(32)
@@ -90,13 +91,33 @@ def _check_blocks(path: Path) -> None:
             size, kind = struct.unpack_from("<II", head, 8)
             if size < 32 or size > MAX_CONTAINER:
                 raise FileInvalid(f"offset {at}: an object of impossible length", path=str(path), got=str(size))
-            if kind == _CONTAINER and head[16] == _ZLIB:
-                unpacked = zlib.decompressobj().decompress(file.read(size - 32), MAX_CONTAINER + 1)
-                if len(unpacked) > MAX_CONTAINER:
+            if kind == _CONTAINER and head[16] in (_PLAIN, _ZLIB):
+                packed = file.read(size - 32)
+                data = packed
+                if head[16] == _ZLIB:
+                    data = zlib.decompressobj().decompress(packed, MAX_CONTAINER + 1)
+                if len(data) > MAX_CONTAINER:
                     raise FileInvalid(
                         f"offset {at}: a container that is too large", path=str(path), expected=f"{MAX_CONTAINER} bytes"
                     )
+                rest = _check_objects(rest + data, path, at)
             at += size + size % 4
+
+
+def _check_objects(data: bytes, path: Path, container_at: int) -> bytes:
+    """Objects of a size that lets a reader go on, and end; what is left of one that goes on in the next container."""
+    at = 0
+    while (found := data.find(b"LOBJ", at, at + 8)) >= 0 and found + 16 <= len(data):
+        (size,) = struct.unpack_from("<I", data, found + 8)
+        if not 32 <= size <= MAX_OBJECT:
+            raise FileInvalid(
+                f"offset {container_at}: the container has an object of impossible length", path=str(path),
+                expected=f"32 to {MAX_OBJECT} bytes", got=str(size),
+            )  # fmt: skip
+        if found + size > len(data):
+            break
+        at = found + size
+    return data[at:][:MAX_OBJECT]
 
 
 def _frame(message: Any, left: LeftOut) -> tuple[int, str, CanFrame] | None:

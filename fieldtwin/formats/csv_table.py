@@ -55,17 +55,33 @@ def import_csv(
             version=1, device=device or f"imported/{path.stem}", kind="signals", source="imported", made_by=made_by,
             start_utc=clock.start_utc, signals=signals,
         )  # fmt: skip
-        bad, last_s = 0, 0.0
-        with RecordingWriter(out, header) as writer:
-            for number, row in _chain(first, rows):
-                t_s = clock.seconds(number, row)
-                if t_s < last_s:
-                    raise FileInvalid("time goes back", path=str(path), line=number, got=row[time_at][:40])
-                last_s = t_s
-                values = [_value(row[i]) if i < len(row) else math.nan for i in chosen.values()]
-                bad += sum(map(math.isnan, values))
-                writer.row(round(t_s, 6), values)
-            return TableSummary(writer.records, last_s, bad, {s: names[i] for s, i in chosen.items()})
+        if out.exists():
+            raise FileInvalid("the recording exists already", path=str(out), hint="choose another name with --out")
+        part = out.with_name(out.name + ".part")
+        part.unlink(missing_ok=True)
+        try:
+            with RecordingWriter(part, header) as writer:
+                last_s, bad = _copy(_chain(first, rows), clock, chosen, writer, path)
+            part.rename(out)
+        finally:
+            part.unlink(missing_ok=True)
+        return TableSummary(writer.records, last_s, bad, {s: names[i] for s, i in chosen.items()})
+
+
+def _copy(
+    rows: Iterator[tuple[int, list[str]]], clock: _Clock, chosen: Mapping[str, int], writer: RecordingWriter, path: Path
+) -> tuple[float, int]:
+    """The last time, and how many fields had no number."""
+    bad, last_s = 0, 0.0
+    for number, row in rows:
+        t_s = clock.seconds(number, row)
+        if t_s < last_s:
+            raise FileInvalid("time goes back", path=str(path), line=number, got=f"{t_s} s behind {last_s} s")
+        last_s = t_s
+        values = [_value(row[i]) if i < len(row) else math.nan for i in chosen.values()]
+        bad += sum(map(math.isnan, values))
+        writer.row(round(t_s, 6), values)
+    return last_s, bad
 
 
 def _open(path: Path) -> BinaryIO:

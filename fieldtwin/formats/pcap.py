@@ -54,7 +54,10 @@ def read_capture(path: Path) -> Iterator[Captured]:
             while line := file.readline(MAX_LINE_BYTES):
                 number += 1
                 try:
-                    captured = _captured(json.loads(line))
+                    read = json.loads(line)
+                    if "started" in read:
+                        continue  # a session of `WireLog`
+                    captured = _captured(read)
                 except (ValueError, KeyError, TypeError, FieldtwinError) as e:
                     if not line.endswith(b"\n") and not file.read(1):
                         return

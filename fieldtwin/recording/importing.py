@@ -1,0 +1,236 @@
+"""What a foreign file is, and what becomes of it: the one door of `fieldtwin import` besides casts of a CTD.
+
+By content where a format has a mark (pcap, pcapng, a trace of ours, mbpoll's banner), else by the file's name. Opens files; the
+formats themselves are in `fieldtwin.formats`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import IO
+
+from fieldtwin.formats.can_files import SUFFIXES as CAN_SUFFIXES
+from fieldtwin.formats.can_files import read_can_file
+from fieldtwin.formats.candump import LeftOut, line_of, read_log
+from fieldtwin.formats.packet_file import is_packet_file
+from fieldtwin.formats.pcap import read_capture
+from fieldtwin.formats.poll_text import IS_POLL_TEXT, read_polls
+from fieldtwin.recording.draft import Drafts
+from fieldtwin.recording.pairing import Bad, PairCounters, Pairer, pairer
+from fieldtwin.recording.rotating import RotatingFile
+from gateway.connections.tap import Captured
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import Direction
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.recording import RecordingHeader, encode_exchange, encode_header
+from gateway.protocols.modbus.framings import framing_of
+
+CNV = (".cnv", ".cnv.gz", ".cnv.bz2")
+KINDS = ".pcap, .pcapng, .log (candump), .asc, .blf, .trc, .csv, .cnv, .txt (mbpoll, modpoll), a capture of fieldtwin's"
+MAX_LINE = 65_536
+
+
+@dataclass(slots=True)
+class TextSummary:
+    """What came of a log, a capture or a poll session."""
+
+    out: Path | None = None
+    records: int = 0
+    seconds: float = 0.0
+    left_out: LeftOut = field(default_factory=LeftOut)
+    pairs: PairCounters = field(default_factory=PairCounters)
+    bad_file: Path | None = None
+    profiles: list[Path] = field(default_factory=list)
+
+
+def kind_of(path: Path) -> str:
+    """packets, can, csv, cnv, polls or capture. Raises `UsageError`, or `FileInvalid` where the file cannot be read."""
+    name = path.name.lower()
+    if name.endswith(CNV):
+        return "cnv"
+    try:
+        with path.open("rb") as file:
+            head = file.read(512)
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    if is_packet_file(head) or name.endswith((".pcap", ".pcapng", ".cap", ".pcap.gz", ".pcapng.gz")):
+        return "packets"
+    if path.suffix.lower() in (".log", *CAN_SUFFIXES):
+        return "can"
+    if path.suffix.lower() in (".csv", ".tsv"):
+        return "csv"
+    if IS_POLL_TEXT.search(head.decode("latin-1")):
+        return "polls"
+    if head[:1] == b"{" and b'"t_ns"' in head:
+        return "capture"
+    raise UsageError(f"cannot import {path.name!r}", expected=KINDS)
+
+
+def import_can(path: Path, out: Path) -> TextSummary:
+    """A CAN log of whatever program as candump writes it. Raises `FileInvalid`."""
+    summary = TextSummary()
+    frames: Iterator[tuple[int, str, CanFrame]] = (
+        read_log(path, summary.left_out) if path.suffix.lower() == ".log" else read_can_file(path, summary.left_out)
+    )
+    return _write_log(frames, out, summary)
+
+
+def _write_log(frames: Iterable[tuple[int, str, CanFrame]], out: Path, summary: TextSummary) -> TextSummary:
+    first_ns, last_ns = -1, 0
+    with _New(out) as file:
+        for t_ns, channel, frame in frames:
+            first_ns = t_ns if first_ns < 0 else first_ns
+            last_ns = max(last_ns, t_ns)
+            file.line(t_ns / 1e9, line_of(t_ns, frame, channel))
+        summary.records = file.lines
+    summary.out, summary.seconds = out, max(last_ns - first_ns, 0) / 1e9
+    return summary
+
+
+def import_polls(path: Path, out: Path) -> TextSummary:
+    """A session of modpoll or mbpoll as a recording of exchanges, with a draft profile. Raises `FileInvalid` with the line."""
+    summary, drafts = TextSummary(out), Drafts()
+    with path.open("rb") as source, _New(out, encode_header(_header(path, out, ""))) as file:
+        for exchange in read_polls(_lines(source, path), str(path)):
+            file.line(exchange.t_s, encode_exchange(exchange))
+            drafts.note(exchange)
+            summary.seconds = exchange.t_s
+            summary.pairs.exchanges += 1
+            summary.pairs.unanswered += exchange.reply is None
+        summary.records = file.lines
+    summary.profiles = write_drafts(drafts, out, path.name)
+    return summary
+
+
+def import_capture(path: Path, out: Path, framing: str = "", url: str = "") -> TextSummary:
+    """A capture or tap of ours (`fieldtwin run --capture`, `record --tap`, a log of what a verb sent) as a recording.
+
+    Of several endpoints `url` says which; `framing` (rtu, ascii, mbap) where it is not the endpoint's. Raises `FileInvalid`,
+    `UsageError`.
+    """
+    seen = [Endpoint.parse(url)] if url else endpoints_of(path)
+    if len(seen) != 1:
+        there = ", ".join(map(str, seen)) or "nothing"
+        raise UsageError(f"{path.name} holds {there}", expected="one of them", hint="--endpoint URL")
+    endpoint = seen[0]
+    items = (c for c in read_capture(path) if c.endpoint == endpoint)
+    if endpoint.is_can:
+        frames = ((c.t_ns, "can0", c.item) for c in items if isinstance(c.item, CanFrame))
+        return _write_log(frames, out, TextSummary())
+    return _pair_capture(items, path, out, endpoint, framing or framing_of(endpoint))
+
+
+def endpoints_of(path: Path) -> list[Endpoint]:
+    """The endpoints of a capture, in the order in which they are met; 64 at most."""
+    found: dict[Endpoint, None] = {}
+    for captured in read_capture(path):
+        if len(found) < 64:
+            found.setdefault(captured.endpoint)
+    return list(found)
+
+
+def _pair_capture(items: Iterable[Captured], path: Path, out: Path, endpoint: Endpoint, framing: str) -> TextSummary:
+    summary, drafts = TextSummary(out), Drafts()
+    wire: Pairer | None = None
+    with _New(out, encode_header(_header(path, out, str(endpoint)))) as file, BadFile(out, str(endpoint)) as bad:
+        for captured in items:
+            if wire is None:
+                wire = pairer(framing, captured.t_ns, bad.keep)
+                first_ns = captured.t_ns
+            summary.seconds = (captured.t_ns - first_ns) / 1e9
+            if isinstance(captured.item, bytes):
+                for e in wire.feed(captured.direction is Direction.SENT, captured.item, captured.t_ns):
+                    file.line(e.t_s, encode_exchange(e))
+                    drafts.note(e)
+        for e in wire.finish() if wire is not None else ():
+            file.line(e.t_s, encode_exchange(e))
+            drafts.note(e)
+        summary.records = file.lines
+    if wire is not None:
+        summary.pairs = wire.counters
+    summary.bad_file = bad.path if bad.lines else None
+    summary.profiles = write_drafts(drafts, out, path.name)
+    return summary
+
+
+def write_drafts(drafts: Drafts, recording: Path, origin: str) -> list[Path]:
+    """The draft profiles beside a recording: ``NAME.unit1.yaml``."""
+    found = []
+    for unit, text in drafts.texts(recording.stem, origin).items():
+        path = recording.with_suffix(f".unit{unit}.yaml")
+        path.write_text(text, encoding="utf-8")
+        found.append(path)
+    return found
+
+
+def _header(path: Path, out: Path, endpoint: str) -> RecordingHeader:
+    return RecordingHeader(
+        version=1, device=f"imported/{out.stem}", kind="exchanges", source="imported", endpoint=endpoint,
+        made_by=f"fieldtwin import {path.name}",
+    )  # fmt: skip
+
+
+def _lines(source: IO[bytes], path: Path) -> Iterator[str]:
+    number = 0
+    while line := source.readline(MAX_LINE + 1):
+        number += 1
+        if len(line) > MAX_LINE:
+            raise FileInvalid("the line is too long", path=str(path), line=number, expected=f"{MAX_LINE} bytes")
+        yield line.decode("utf-8", "replace")
+
+
+class _New:
+    """A recording that has its name only when it is whole: until then ``NAME.part``."""
+
+    def __init__(self, out: Path, head: bytes = b"") -> None:
+        if out.exists():
+            raise FileInvalid("the recording exists already", path=str(out), hint="choose another name with --out")
+        self._out = out
+        self._part = out.with_name(out.name + ".part")
+        self._part.unlink(missing_ok=True)
+        self._file = RotatingFile(self._part, head, max_bytes=1 << 50)
+
+    def __enter__(self) -> RotatingFile:
+        return self._file
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._file.close()
+        if kind is None:
+            self._part.rename(self._out)
+        else:
+            self._part.unlink(missing_ok=True)
+
+
+class BadFile:
+    """What became no part of an exchange, kept beside a recording as a capture (``NAME.bad.jsonl``), the first `most`."""
+
+    def __init__(self, recording: Path, endpoint: str, most: int = 100_000) -> None:
+        self.path = recording.with_suffix(".bad.jsonl")
+        self._endpoint, self._most = endpoint, most
+        self._file: RotatingFile | None = None
+        self.lines = 0
+
+    def __enter__(self) -> BadFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def keep(self, bad: Bad, endpoint: str = "") -> None:
+        """One more of them."""
+        if self._file is None:
+            self.path.unlink(missing_ok=True)
+            self._file = RotatingFile(self.path)
+        self.lines += 1
+        if self.lines <= self._most:
+            direction = Direction.SENT if bad.sent else Direction.RECEIVED
+            line = {
+                "t_ns": bad.t_ns, "endpoint": endpoint or self._endpoint, "direction": direction.value,
+                "hex": bad.data.hex(), "why": bad.why,
+            }  # fmt: skip
+            self._file.line(0.0, json.dumps(line, separators=(",", ":")).encode() + b"\n")

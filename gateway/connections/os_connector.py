@@ -48,7 +48,8 @@ class OsConnector(Connector):
                 raise UsageError(f"{endpoint}: {scheme}: cannot be opened here", expected=BYTE_SCHEMES)
 
     async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
-        """Open ``can:socketcan/CHANNEL`` or ``can:fieldtwin/HOST:PORT``. Raises as `Connector` says."""
+        """Open ``can:socketcan/CHANNEL``, ``can:fieldtwin/HOST:PORT``, or any other interface of python-can. Raises as
+        `Connector` says."""
         if not endpoint.is_can:
             raise UsageError(f"{endpoint} is no CAN bus", expected="can:INTERFACE/CHANNEL")
         match endpoint.interface:
@@ -60,7 +61,7 @@ class OsConnector(Connector):
                 from gateway.connections.soft_bus import SoftBusConnection
 
                 return await SoftBusConnection.open(endpoint, bitrate)
-            case interface:
-                raise UsageError(
-                    f"{endpoint}: unknown kind of CAN interface {interface!r}", expected="socketcan or fieldtwin"
-                )
+            case _:
+                from gateway.connections.can_adapter import AdapterConnection
+
+                return await AdapterConnection.open(endpoint, bitrate)

@@ -9,6 +9,7 @@
 ``tls://host:802?ca=FILE&cert=FILE&key=FILE``       Modbus/TCP Security; ``name=HOST`` where the certificate has another
 ``can:socketcan/can0``                              a kernel CAN interface
 ``can:fieldtwin/127.0.0.1:29536``                   the software CAN bus
+``can:pcan/PCAN_USBBUS1?bitrate=250000``            an adapter of python-can: pcan, kvaser, slcan, virtual...
 ``pty:line1``                                       (listening side only) a virtual serial port with that link name
 ==================================================  =====================================================
 

@@ -1,0 +1,250 @@
+"""A CAN adapter of any kind that python-can knows: PCAN, Kvaser, slcan, gs_usb, IXXAT, Vector, its virtual bus...
+
+``can:INTERFACE/CHANNEL`` with python-can's own names: ``can:pcan/PCAN_USBBUS1?bitrate=250000``, ``can:kvaser/0``,
+``can:slcan//dev/ttyACM0@115200``. The adapter's driver is imported when it is opened, so a computer without it only
+misses it then. Reading blocks in a thread: few drivers have a descriptor that a loop could watch.
+
+What the frames mean is not known here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import can
+
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import CANConnection, CanConnection, closed_here
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, Unreachable, UsageError, WireError
+from gateway.wallclock import WallClock
+
+POLL_S = 0.05
+"""How long the reading thread waits in the driver: closing takes as long at most."""
+
+SEND_TIMEOUT_S = 2.0
+
+_OWN = frozenset({"bitrate", "listen"})
+"""Parameters of the endpoint that are read here; others are the driver's (``?app_name=CANalyzer``)."""
+
+_RATELESS = frozenset({"virtual", "udp_multicast"})
+"""Interfaces without a bit rate."""
+
+
+class AdapterConnection(CanConnection):
+    """One handle on an adapter. Make it with `open`. `bitrate` is what the adapter was set to, 0 where it has none."""
+
+    def __init__(self, endpoint: Endpoint, bus: can.BusABC, bitrate: int = 0, max_pending: int = 4096) -> None:
+        super().__init__(CANConnection(), endpoint, max_pending)
+        self.bitrate = bitrate
+        self.malformed = 0
+        """What the driver delivered and is no classic frame (CAN FD)."""
+        self._bus = bus
+        self._clock = WallClock()
+        self._loop = asyncio.get_running_loop()
+        self._turn = asyncio.Lock()
+        self._sender = ThreadPoolExecutor(1, "can-send")
+        self._stopping = threading.Event()
+        self._reader = threading.Thread(target=self._read, name=f"reads {endpoint}", daemon=True)
+        self._reader.start()
+
+    @classmethod
+    async def open(cls, endpoint: Endpoint, bitrate: int, *, max_pending: int = 4096) -> AdapterConnection:
+        """Open the adapter at `bitrate` bit/s, or at ``?bitrate=`` of the endpoint. ``?listen=1``: it does not even acknowledge.
+
+        Raises `UsageError` for an interface that python-can has not, a driver that is not installed, and an adapter that
+        would have to guess its bit rate (a node at a wrong one destroys everybody's frames); `EndpointBusy` or
+        `Unreachable` where there is no such adapter.
+        """
+        rate = _bitrate(endpoint, bitrate)
+        words = _words(endpoint, rate)
+        opening = asyncio.get_running_loop().run_in_executor(None, _open, endpoint, words)
+        try:
+            bus = await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            opening.add_done_callback(_shut_unwanted)
+            raise
+        return cls(endpoint, bus, rate, max_pending)
+
+    async def send(self, frame: CanFrame) -> None:
+        """Give `frame` to the driver. Raises `ConnectionLost` when the adapter is gone, `WireError` when its queue stays
+        full for `SEND_TIMEOUT_S`."""
+        if frame.error:
+            raise UsageError("an error frame cannot be sent", got=str(frame), where=str(self.endpoint))
+        message = can.Message(
+            arbitration_id=frame.can_id,
+            is_extended_id=frame.extended,
+            is_remote_frame=frame.remote,
+            dlc=frame.dlc,
+            data=frame.data,
+        )
+        async with self._turn:
+            if self._lost is not None:
+                raise self._loss()
+            try:
+                await self._loop.run_in_executor(self._sender, self._bus.send, message, SEND_TIMEOUT_S)
+            except can.CanTimeoutError as e:
+                raise WireError(
+                    f"the adapter took no frame for {SEND_TIMEOUT_S:g} s",
+                    where=str(self.endpoint),
+                    hint="does another node acknowledge? is the bit rate right, the cable in?",
+                ) from e
+            except (OSError, can.CanError, ValueError) as e:
+                self.feed_lost(_gone(self.endpoint, e))
+                raise self._loss() from e
+
+    async def aclose(self) -> None:
+        """Close the adapter. Closing twice does nothing."""
+        self.feed_lost(closed_here(self.endpoint))
+        if not self._stopping.is_set():
+            self._stopping.set()
+            await self._loop.run_in_executor(None, self._shut)
+        self.inbound.data_stream.clear()
+
+    def _shut(self) -> None:
+        self._reader.join()
+        self._sender.shutdown()
+        try:
+            self._bus.shutdown()
+        except (OSError, can.CanError):  # unplugged: slcan says good-bye to a port that is gone, and leaves it open
+            port = getattr(self._bus, "serialPortOrig", None)
+            if port is not None:
+                port.close()
+
+    # -- the reading thread ----------------------------------------------------------------------------------------
+
+    def _read(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                message = self._bus.recv(POLL_S)
+            except (OSError, can.CanError, ValueError) as e:
+                self._tell(self.feed_lost, _gone(self.endpoint, e))
+                return
+            if message is not None:
+                self._tell(self._take, message)
+
+    def _tell(self, what: Any, item: Any) -> None:
+        try:
+            self._loop.call_soon_threadsafe(what, item)
+        except RuntimeError:
+            self._stopping.set()  # the loop is closed: nobody is there to be told
+
+    def _take(self, message: can.Message) -> None:
+        if self._lost is not None:
+            return
+        if message.is_fd:
+            self.malformed += 1
+            return
+        try:
+            frame = CanFrame(
+                message.arbitration_id,
+                b"" if message.is_remote_frame else bytes(message.data),
+                extended=message.is_extended_id,
+                remote=message.is_remote_frame,
+                error=message.is_error_frame,
+                dlc=min(message.dlc, 8),
+                t_ns=self._clock.monotonic_ns(),  # drivers' own stamps have other origins
+            )
+        except Desync:
+            self.malformed += 1
+            return
+        self.feed(frame)
+
+
+def _bitrate(endpoint: Endpoint, asked: int) -> int:
+    text = endpoint.param("bitrate", "0")
+    if not text.isascii() or not text.isdigit() or len(text) > 7:
+        raise UsageError(f"{endpoint}: bitrate", expected="bit/s, such as 250000", got=repr(text))
+    said = int(text)
+    if said and asked and said != asked:
+        raise UsageError(f"{endpoint}: two bit rates", expected=f"{asked} bit/s", got=f"{said} bit/s")
+    rate = said or asked
+    if not rate and endpoint.interface not in _RATELESS:
+        raise UsageError(
+            f"{endpoint}: an adapter needs the bit rate of its bus",
+            expected="?bitrate=250000 behind the channel",
+            hint="one that guesses wrong destroys everybody's frames",
+        )
+    return rate
+
+
+def _words(endpoint: Endpoint, rate: int) -> dict[str, Any]:
+    """What python-can's constructor is given."""
+    if endpoint.interface not in can.VALID_INTERFACES:
+        known = sorted(set(can.VALID_INTERFACES) | {"socketcan", "fieldtwin"})
+        raise UsageError(f"{endpoint}: unknown kind of CAN interface {endpoint.interface!r}", expected=", ".join(known))
+    words: dict[str, Any] = {k: _typed(v) for k, v in endpoint.params if k not in _OWN}
+    if rate and endpoint.interface not in _RATELESS:
+        words["bitrate"] = rate
+    listen = endpoint.param("listen", "0")
+    if listen not in ("0", "1"):
+        raise UsageError(f"{endpoint}: listen", expected="0 or 1", got=repr(listen))
+    if listen == "1":
+        words |= _listen_only(endpoint)
+    return words
+
+
+def _typed(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return {"true": True, "false": False}.get(text.lower(), text)
+
+
+def _listen_only(endpoint: Endpoint) -> dict[str, Any]:
+    """How this driver is told to be silent, as far as python-can can tell it."""
+    match endpoint.interface:
+        case "slcan":
+            return {"listen_only": True}
+        case "pcan" | "ixxat":
+            return {"state": can.BusState.PASSIVE}
+        case "kvaser":
+            return {"driver_mode": False}  # DRIVER_MODE_SILENT
+        case "virtual" | "udp_multicast":
+            return {}  # nothing acknowledges there
+        case interface:
+            raise UsageError(f"{endpoint}: python-can has no listen-only mode for {interface}", got="listen=1")
+
+
+def can_listen_only(endpoint: Endpoint) -> bool:
+    """Whether ``?listen=1`` is possible there."""
+    return endpoint.interface in ("slcan", "pcan", "ixxat", "kvaser", "virtual", "udp_multicast")
+
+
+def _open(endpoint: Endpoint, words: dict[str, Any]) -> can.BusABC:
+    channel: str | int = int(endpoint.path) if endpoint.path.isdigit() else endpoint.path
+    try:
+        return can.Bus(interface=endpoint.interface, channel=channel, ignore_config=True, **words)
+    except (can.CanInterfaceNotImplementedError, ImportError, NameError, AttributeError) as e:  # Kvaser's: NameError
+        raise _no_driver(endpoint, e) from e
+    except (TypeError, ValueError) as e:
+        raise UsageError(f"{endpoint}: the driver of {endpoint.interface} refuses these settings", got=str(e)) from e
+    except (can.CanError, OSError) as e:
+        if "library not found" in str(e):  # PCAN's
+            raise _no_driver(endpoint, e) from e
+        if "busy" in str(e).lower() or "in use" in str(e).lower():
+            raise EndpointBusy("the adapter is held by another program", where=str(endpoint), hint=str(e)) from e
+        raise Unreachable(f"cannot open the adapter: {e}", where=str(endpoint), hint="is it plugged in?") from e
+
+
+def _no_driver(endpoint: Endpoint, error: Exception) -> UsageError:
+    return UsageError(
+        f"{endpoint}: the driver of {endpoint.interface} is not on this computer",
+        got=str(error),
+        hint="its maker's library, and python-can's extra for it: pip install 'python-can[...]'",
+    )
+
+
+def _shut_unwanted(opening: asyncio.Future[can.BusABC]) -> None:
+    """Whoever asked for the adapter went away before it was open."""
+    if not opening.cancelled() and opening.exception() is None:
+        opening.result().shutdown()
+
+
+def _gone(endpoint: Endpoint, error: Exception) -> ConnectionLost:
+    return ConnectionLost(f"the CAN adapter is gone: {error}", where=str(endpoint))

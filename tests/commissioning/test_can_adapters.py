@@ -1,0 +1,89 @@
+"""Any CAN interface of python-can as a connection: its virtual bus, slcan to the software bus, and what is refused."""
+
+from __future__ import annotations
+
+import pytest
+from support import eventually, run
+
+from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.slcan_port import SlcanPort
+from gateway.connections.can_adapter import AdapterConnection
+from gateway.connections.os_connector import OsConnector
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import CanConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost, UsageError
+
+FRAMES = (
+    CanFrame(0x705, b"\x05"),
+    CanFrame(0x18FF1234, b"12345678", extended=True),
+    CanFrame(0x605, remote=True, dlc=8),
+)
+
+
+async def _exchange(one: CanConnection, other: CanConnection) -> None:
+    for frame in FRAMES:
+        await one.send(frame)
+    got = [await other.recv() for _ in FRAMES]
+    assert [g.key() for g in got] == [f.key() for f in FRAMES]
+    assert all(g.t_ns for g in got)
+
+
+def test_two_handles_on_a_virtual_bus_hear_each_other() -> None:
+    async def main() -> None:
+        url = Endpoint.parse("can:virtual/commissioning-1")
+        one, other = await OsConnector().open_can(url, 0), await OsConnector().open_can(url, 0)
+        assert isinstance(one, AdapterConnection)
+        await _exchange(one, other)
+        await _exchange(other, one)
+        await one.aclose()
+        await one.aclose()
+        with pytest.raises(ConnectionLost):
+            await one.send(FRAMES[0])
+        await other.aclose()
+        with pytest.raises(ConnectionLost):
+            await other.recv()
+
+    run(main())
+
+
+def test_slcan_reaches_the_software_bus() -> None:
+    async def main() -> None:
+        server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 250_000, paced=False)
+        slcan = await SlcanPort.open(server.runner, Endpoint.parse("tcp://127.0.0.1:0"))
+        host, port = slcan.bound
+        adapter = await OsConnector().open_can(
+            Endpoint.parse(f"can:slcan/socket://{host}:{port}?bitrate=250000&sleep_after_open=0"), 0
+        )
+        assert isinstance(adapter, AdapterConnection)
+        assert adapter.bitrate == 250_000
+        node = await OsConnector().open_can(server.bound, 0)
+        await eventually(lambda: len(slcan.clients) == 1)
+        await _exchange(adapter, node)
+        await _exchange(node, adapter)
+        await adapter.aclose()
+        await slcan.aclose()
+        await node.aclose()
+        await server.aclose()
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("url", "bitrate", "says"),
+    [
+        ("can:toaster/0", 250_000, "unknown kind of CAN interface 'toaster'"),
+        ("can:pcan/PCAN_USBBUS1", 0, "needs the bit rate"),
+        ("can:pcan/PCAN_USBBUS1?bitrate=250000", 125_000, "two bit rates"),
+        ("can:pcan/PCAN_USBBUS1?bitrate=fast", 0, "bit/s, such as 250000"),
+        ("can:vector/0?listen=1", 250_000, "no listen-only mode for vector"),
+        ("can:kvaser/0?listen=yes", 250_000, "0 or 1"),
+        ("can:pcan/PCAN_USBBUS1", 250_000, "driver of pcan is not on this computer"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(url: str, bitrate: int, says: str) -> None:
+    async def main() -> None:
+        with pytest.raises(UsageError, match=says):
+            await OsConnector().open_can(Endpoint.parse(url), bitrate)
+
+    run(main())

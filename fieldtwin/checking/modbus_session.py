@@ -102,7 +102,7 @@ async def read_identity(wire: ModbusWire) -> dict[str, str]:
     """What the device says of itself by FC 43/14 and FC 17; empty where it says nothing."""
     identity: dict[str, str] = {}
     for code in (0x01, 0x02):
-        answer = (await wire.ask(bytes((0x2B, 0x0E, code, 0)))).first
+        answer = (await wire.ask(bytes((0x2B, 0x0E, code, 0)), due=False)).first
         if answer is None or answer.refusal or len(answer.pdu) < 7:
             break
         place = 7
@@ -112,7 +112,7 @@ async def read_identity(wire: ModbusWire) -> dict[str, str]:
             if text := shown(raw):
                 identity[name] = text
             place += 2 + answer.pdu[place + 1]
-    answer = (await wire.ask(b"\x11")).first
+    answer = (await wire.ask(b"\x11", due=False)).first
     if answer is not None and not answer.refusal and len(answer.pdu) > 2:
         identity["server id"] = shown(answer.pdu[2:]) or answer.pdu[2:].hex(" ").upper()
     await wire.settle()

@@ -105,13 +105,14 @@ def serve_libmodbus(job: dict[str, Any]) -> None:
         listening = lib.modbus_tcp_listen(context, 1)
         with socket.socket(fileno=listening) as listener:
             say(job["row"], listener.getsockname()[1])
-            accepted = ctypes.c_int(listening)
-            lib.modbus_tcp_accept(context, ctypes.byref(accepted))
-            while (size := lib.modbus_receive(context, query)) >= 0:
-                if size:
-                    lib.modbus_reply(context, query, size, mapping)
-            lib.modbus_close(context)
-        return
+            while True:  # one client after the other
+                accepted = ctypes.c_int(listening)
+                if lib.modbus_tcp_accept(context, ctypes.byref(accepted)) < 0:
+                    return
+                while (size := lib.modbus_receive(context, query)) >= 0:
+                    if size:
+                        lib.modbus_reply(context, query, size, mapping)
+                lib.modbus_close(context)
     context = ctypes.c_void_p(lib.modbus_new_rtu(job["line"].encode(), BAUD_RATE, ord("N"), 8, 1))
     lib.modbus_set_slave(context, job["units"][0])
     if lib.modbus_connect(context) != 0:

@@ -1,0 +1,47 @@
+"""`fieldtwin check modbus` on devices that we did not write: pymodbus's and libmodbus's servers get the verdicts that are known."""
+
+from __future__ import annotations
+
+import asyncio
+import tempfile
+import tomllib
+from pathlib import Path
+
+import pytest
+from strangers import check_all, version_of
+
+from fieldtwin.checking.device_case import DeviceResult
+from fieldtwin.report.model import Verdict
+
+pytestmark = [pytest.mark.interop, pytest.mark.slow, pytest.mark.timeout(120)]
+KNOWN = tomllib.loads((Path(__file__).parent / "strangers.toml").read_text())
+WIRES = [(peer, wire) for peer in ("pymodbus", "libmodbus") for wire in KNOWN[peer]]
+_found: dict[tuple[str, str], list[DeviceResult]] = {}
+
+
+def found_on(peer: str, wire: str) -> list[DeviceResult]:
+    """Played once, all of them at the same time."""
+
+    async def main(folder: Path) -> list[list[DeviceResult]]:
+        return await asyncio.gather(*(check_all(p, w, folder) for p, w in here))
+
+    if not _found:
+        here = [(p, w) for p, w in WIRES if version_of(p)]
+        with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+            _found.update(zip(here, asyncio.run(main(Path(folder))), strict=True))
+    return _found[peer, wire]
+
+
+@pytest.mark.parametrize(("peer", "wire"), WIRES)
+def test_verdicts_are_the_known_ones(peer: str, wire: str) -> None:
+    here = version_of(peer)
+    if not here:
+        pytest.skip(f"{peer} is not installed")
+    results = found_on(peer, wire)
+    known = KNOWN[peer][wire]
+    found = {r.case.id: f"{r.verdict.value}: {r.reason}" for r in results if r.verdict is not Verdict.PASSED}
+    if here == KNOWN["versions"][peer]:
+        assert found == known
+    else:
+        assert set(found) <= set(known), "a case that the known version passed"
+    assert len(results) > len(known)

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from spec_rig import CLOCK, observatory, rig
 from support import run
 
+from emulators.distorted_registers import DistortedRegisters
 from gateway.connections.os_connector import OsConnector
 from gateway.core.connection import PROTOCOL, ByteConnection, RS232Connection, TCPConnection
 from gateway.core.errors import Bug, FileInvalid, UnknownCommand
@@ -165,6 +166,7 @@ def test_TransmitterDriver_is_a_pure_relay(tmp_path_factory: pytest.TempPathFact
             driver = r.register_driver("modem")
             assert isinstance(driver, TransmitterDriver)
             near = r.unit("modem").bank
+            assert isinstance(near, DistortedRegisters)
             ear: Consumer[DATA] = Consumer(driver.emitter.event)
             driver.emitter.subscribe(ear)
             await driver.synchronise()
@@ -195,9 +197,9 @@ def message(words: list[int], box: Box) -> bytes:
     return b"".join(word.to_bytes(2) for word in words[2:])[: words[1]][: box.bytes]
 
 
-def put_into_inbox(near: object, box: Box, sequence: int, payload: bytes) -> None:
+def put_into_inbox(near: DistortedRegisters, box: Box, sequence: int, payload: bytes) -> None:
     """What arrives over the acoustic link, without waiting for it: the cells that the modem itself sets."""
-    cells = near._cells  # type: ignore[attr-defined]
+    cells = near._bank._cells  # type: ignore[attr-defined]
     padded = payload + b"\0" * (len(payload) % 2)
     body = [int.from_bytes(padded[i : i + 2]) for i in range(0, len(padded), 2)]
     cells.poke("holding", box.at.address, sequence, len(payload), *body)

@@ -29,6 +29,21 @@ def wait_for(condition: Callable[[], Any], within_s: float = 10.0, what: str = "
         time.sleep(0.02)
 
 
+def every_device_online(gateway: Asking, within_s: float = 40.0) -> None:
+    """Wait until the gateway has all its devices; where it has not, say what it knows of them."""
+    with_what: dict[str, Any] = {}
+
+    def online() -> bool:
+        with_what.update(gateway("get"))
+        return all(device["online"] for device in with_what["devices"].values())
+
+    try:
+        wait_for(online, within_s, "every device online")
+    except AssertionError as e:
+        told = {name: with_what.get(name) for name in ("devices", "buses", "plc")}
+        raise AssertionError(f"{e}: {json.dumps(told, indent=1)}") from None
+
+
 def alive(pid: int) -> bool:
     """True while the process runs (a zombie does not)."""
     try:

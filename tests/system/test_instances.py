@@ -16,6 +16,7 @@ from procs import (
     Asking,
     Fieldtwin,
     command_from_far,
+    every_device_online,
     fieldtwin,
     held_by,
     no_tracebacks,
@@ -71,7 +72,7 @@ def samples(gateway: Asking) -> dict[int, dict[str, bytes]]:
 
 def make_active(run: Fieldtwin, instance: str) -> None:
     gateway, field = run.control(instance, "gateway"), run.control(instance, "field")
-    wait_for(lambda: all(d["online"] for d in gateway("get")["devices"].values()), 15, "every device online")
+    every_device_online(gateway)
     command_from_far(field("get")["far"]["modem"], 1, 1)
     wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0001", 10, "the sensor samples")
 

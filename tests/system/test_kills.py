@@ -16,6 +16,7 @@ from procs import (
     Fieldtwin,
     alive,
     command_from_far,
+    every_device_online,
     fieldtwin,
     free_port,
     held_by,
@@ -36,7 +37,7 @@ def make_active(run: Fieldtwin, instance: str, field: Asking, sequence: int = 1)
     """Command a period of 1 s from the far end and wait until the sensor samples."""
     plc = run.control(instance, "plc")
     gateway = run.control(instance, "gateway")
-    wait_for(lambda: all(d["online"] for d in gateway("get")["devices"].values()), 15, "every device online")
+    every_device_online(gateway)
     command_from_far(field("get")["far"]["modem"], sequence, 1)
     wait_for(lambda: state_of(plc) == "ACTIVE", 10, "ACTIVE")
     wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0001", 10, "the sensor samples")

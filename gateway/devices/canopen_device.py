@@ -263,6 +263,8 @@ class CanopenDriver(DeviceDriver):
             return
         if self.master.node_state(self.node) not in (NmtState.OPERATIONAL, None) and not self.operational:
             return  # a TPDO that overtook its node's last heartbeat: the state decides
+        if self.master.heartbeat_lost(self.node):
+            return  # whoever sends this, the node's state is not known: only its heartbeat brings it back (CO-038)
         try:
             values = seen.mapping.unpack(data)
         except PdoLengthMismatch:

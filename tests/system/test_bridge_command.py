@@ -98,7 +98,7 @@ def test_mbpoll_through_the_bridge(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_pymodbus_clients_through_the_bridge_and_read_only_unless_told(tmp_path: Path) -> None:
     async def reads(port: int, unit: int) -> None:
-        client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=3)
+        client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=10)
         assert await client.connect()
         try:
             for turn in range(30):
@@ -113,7 +113,7 @@ def test_pymodbus_clients_through_the_bridge_and_read_only_unless_told(tmp_path:
             client.close()
 
     async def main() -> None:
-        async with line_of_two(tmp_path) as banks, bridge(tmp_path, "--json") as (program, port):
+        async with line_of_two(tmp_path) as banks, bridge(tmp_path, "--json", "--timeout", "1s") as (program, port):
             # pymodbus numbers its transactions from 1 in each client: both use the same ids at the same time (MB-061)
             await asyncio.gather(reads(port, 1), reads(port, 2))
             assert banks[1].read("holding", 0, 1, 0) == [100]

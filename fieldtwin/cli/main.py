@@ -28,6 +28,7 @@ COMMANDS = {
     "check": ("fieldtwin.cli.check_command", "Judge a Modbus or CANopen device, or master: verdicts, waivers."),
     "read": ("fieldtwin.cli.read_command", "Read values of one device, by name or address."),
     "write": ("fieldtwin.cli.write_command", "Write values of one device: asked for, read back, put back."),
+    "dump": ("fieldtwin.cli.dump_command", "Read all that a device holds: values, holes, limits, latency."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
     "test": ("fieldtwin.cli.test_command", "Run scenarios against a prototype, and judge it."),
     "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),

@@ -154,7 +154,7 @@ class ModbusPoint:
         await self.client.execute(self.unit, write_request(tag, data, self._functions))
 
     def read_frames(self, tags: Sequence[Tag]) -> list[str]:
-        return [self._frame(_read_request(r.range)) for r in self._plan(self._with_scales(tags)).reads]
+        return [self._frame(read_request(r.range)) for r in self._plan(self._with_scales(tags)).reads]
 
     def write_frames(self, tag: Tag, data: bytes) -> list[str]:
         return [self._frame(write_request(tag, data, self._functions))]
@@ -280,7 +280,8 @@ def write_request(tag: Tag, data: bytes, functions: Sequence[int] | None) -> Req
     return WriteRegisters(at.address, words)
 
 
-def _read_request(at: RegisterRange) -> Request[Any]:
+def read_request(at: RegisterRange) -> Request[Any]:
+    """The request that reads a range."""
     if at.table == "coil" or at.table == "discrete":
         return ReadBits(at.table, at.address, at.count)
     return ReadRegisters(at.table, at.address, at.count)

@@ -1,0 +1,152 @@
+"""One question to a device and what came of it, with the patience that a sweep needs: busy is not no, and silence may be noise.
+
+It must never ask anything that changes the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from fieldtwin.commissioning.dump_objects import ObjectKey
+from fieldtwin.commissioning.dump_sweep import Outcome, Refused, Silent, Taken
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.errors import Bug, CrcError, Desync, ModbusExceptionReply, ReplyTimeout, SdoAborted, UsageError
+from gateway.core.profile import RegisterRange
+from gateway.protocols.canopen.abort_codes import TIMED_OUT
+from gateway.protocols.canopen.master import CanopenMaster
+from gateway.protocols.modbus.client import ModbusClient
+from gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog
+from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
+from gateway.protocols.modbus.request import Request
+
+ACKNOWLEDGE, BUSY, NO_PATH, NO_TARGET = 0x05, 0x06, 0x0A, 0x0B
+BUSY_WAIT_S = 0.2
+MOST_BUSY = 10
+LOOPBACK_WORD = 0xA537
+
+PROBES: tuple[tuple[int, Request[Any]], ...] = (
+    (0x07, ReadExceptionStatus()),
+    (0x08, Diagnostics(0, LOOPBACK_WORD)),
+    (0x0B, GetCommEventCounter()),
+    (0x0C, GetCommEventLog()),
+    (0x11, ReportServerId()),
+    (0x2B, ReadDeviceIdentification(1)),
+)
+"""Functions that only tell something. Whether others exist nobody can ask without doing something."""
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What came of a question: `us` microseconds from the question to the last byte of the answer, `requests` it took."""
+
+    outcome: Outcome
+    us: int
+    requests: int
+
+
+class Asker(Protocol):
+    """Asks one device."""
+
+    async def read(self, asked: RegisterRange | ObjectKey) -> Asked:
+        """Read that. Raises only what ends the connection."""
+        ...
+
+    async def function(self, request: Request[Any]) -> Asked:
+        """Send that request."""
+        ...
+
+
+class ModbusAsker:
+    """A unit behind `client`. What got no good reply is asked `retries` times more; behind each exchange the line has
+    `spacing_s` for others."""
+
+    def __init__(
+        self, client: ModbusClient, unit: int, clock: Clock, *, retries: int = 2, spacing_s: float = 0.0
+    ) -> None:
+        if unit == 0:
+            raise UsageError("unit 0 is a broadcast: nobody answers", expected="--unit from 1 on")
+        self._client, self._unit, self._clock = client, unit, clock
+        self._retries, self._spacing_ns = retries, round(spacing_s * NS_PER_S)
+        self._free_ns = 0
+
+    async def read(self, asked: RegisterRange | ObjectKey) -> Asked:
+        if not isinstance(asked, RegisterRange):
+            raise Bug("a unit has registers", got=str(asked))
+        return await self._patiently(lambda: self._read(asked))
+
+    async def function(self, request: Request[Any]) -> Asked:
+        async def once() -> tuple[bytes, int]:
+            reply = await self._client.execute(self._unit, request)
+            return reply.raw, reply.t_ns
+
+        return await self._patiently(once)
+
+    async def _read(self, at: RegisterRange) -> tuple[bytes, int]:
+        if at.table == "coil" or at.table == "discrete":
+            bits = await self._client.read_bits(self._unit, at.table, at.address, at.count)
+            return bytes(bits.bits), bits.t_ns
+        reply = await self._client.read_registers(self._unit, at.table, at.address, at.count)
+        return reply.raw, reply.t_ns
+
+    async def _patiently(self, once: Callable[[], Awaitable[tuple[bytes, int]]]) -> Asked:
+        lost = busy = 0
+        while True:
+            await self._clock.sleep_until_ns(self._free_ns)
+            asked_ns = self._clock.monotonic_ns()
+            try:
+                raw, t_ns = await once()
+            except ModbusExceptionReply as e:
+                if e.code in (NO_PATH, NO_TARGET):
+                    raise  # a gateway speaks, and not the device
+                if e.code not in (ACKNOWLEDGE, BUSY) or busy >= MOST_BUSY:
+                    return Asked(Refused(e.code), self._us(asked_ns), lost + busy + 1)
+                busy += 1
+                await self._clock.sleep_until_ns(self._clock.monotonic_ns() + round(BUSY_WAIT_S * NS_PER_S))
+            except (ReplyTimeout, CrcError, Desync) as e:
+                lost += 1
+                if lost > self._retries:
+                    return Asked(Silent(e.message), self._us(asked_ns), lost + busy)
+            else:
+                return Asked(Taken(raw), max(0, t_ns - asked_ns) // 1000, lost + busy + 1)
+            finally:
+                self._free_ns = self._clock.monotonic_ns() + self._spacing_ns
+
+    def _us(self, since_ns: int) -> int:
+        return (self._clock.monotonic_ns() - since_ns) // 1000
+
+
+class CanopenAsker:
+    """A node behind `master`. A pause of `spacing_s` after each transfer leaves the bus to others."""
+
+    def __init__(
+        self, master: CanopenMaster, node: int, clock: Clock, *, retries: int = 2, spacing_s: float = 0.0
+    ) -> None:
+        self._master, self._node, self._clock = master, node, clock
+        self._retries, self._spacing_ns = retries, round(spacing_s * NS_PER_S)
+
+    async def read(self, asked: RegisterRange | ObjectKey) -> Asked:
+        if not isinstance(asked, ObjectKey):
+            raise Bug("a node has objects", got=str(asked))
+        lost = 0
+        while True:
+            asked_ns = self._clock.monotonic_ns()
+            try:
+                outcome: Outcome = Taken(await self._master.sdo_upload(self._node, asked.index, asked.subindex))
+            except SdoAborted as e:
+                if e.code != TIMED_OUT:
+                    outcome = Refused(e.code)
+                else:
+                    outcome = Silent(e.message)
+            except (ReplyTimeout, CrcError, Desync) as e:
+                outcome = Silent(e.message)
+            now_ns = self._clock.monotonic_ns()
+            lost += isinstance(outcome, Silent)
+            if self._spacing_ns:
+                await self._clock.sleep_until_ns(now_ns + self._spacing_ns)
+            if not isinstance(outcome, Silent) or lost > self._retries:
+                return Asked(outcome, (now_ns - asked_ns) // 1000, lost + (not isinstance(outcome, Silent)))
+
+    async def function(self, request: Request[Any]) -> Asked:
+        raise Bug("a node has no functions", got=str(request))

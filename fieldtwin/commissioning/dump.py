@@ -1,0 +1,330 @@
+"""Dumping a device: the questions of a sweep are asked, every answer is written down before the next question.
+
+It goes on where a killed one stopped, by answering the sweep's questions from the file as far as that goes. It must never write
+to the device, and asks nothing that is not logged.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+from fieldtwin.commissioning.asking import PROBES, Asked, Asker
+from fieldtwin.commissioning.dump_file import Dump, DumpWriter, key_of, outcome_of
+from fieldtwin.commissioning.dump_objects import EVERYTHING, ListedObjects, ObjectKey, ObjectSweep, of_dictionary
+from fieldtwin.commissioning.dump_profile import ProfileSweep, dumped_tags
+from fieldtwin.commissioning.dump_sweep import Outcome, Refused, Silent, Sweep, TableMap, Taken
+from fieldtwin.commissioning.latency import Histogram
+from fieldtwin.commissioning.reading import Target
+from fieldtwin.commissioning.wire_log import WireLog
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.errors import FileInvalid, Unreachable
+from gateway.core.profile import RegisterRange, Table, gap_text
+
+TABLES: tuple[Table, ...] = ("holding", "input", "coil", "discrete")
+ALL_TABLES = tuple(RegisterRange(table, 0, 65536) for table in TABLES)
+NOT_OF_THE_JOB = ("ended", "latency", "resumed")
+"""Lines that every session writes for itself."""
+
+Progress = Callable[[int, int, int], None]
+"""``(done, total, requests)``: addresses (or reads of a later pass) done and in all, and requests sent."""
+Sweeping = Sweep | ProfileSweep | ObjectSweep | ListedObjects
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What is dumped. For Modbus `spans`, or the profile's tags where there are none; for CANopen `objects`, or the EDS.
+
+    `stride` as in `Sweep`; `most` the longest read to try; `pairs`: the device knows pairs of registers only. `passes` times
+    through, `every_s` from the start of one to the start of the next. `functions`: ask which harmless functions there are.
+    """
+
+    target: Target
+    spans: tuple[RegisterRange, ...] = ()
+    objects: tuple[tuple[int, int], ...] = ()
+    stride: int = 8
+    most: int | None = None
+    pairs: bool = False
+    passes: int = 1
+    every_s: float = 0.0
+    functions: bool = True
+
+    def header(self) -> dict[str, Any]:
+        """What makes two dumps the same job; the endpoint may be called otherwise tomorrow."""
+        target = self.target
+        ranges = [gap_text(s) for s in self.spans] or [f"{a:04X}h..{b:04X}h" for a, b in self.objects]
+        return {
+            "fieldtwin_dump": 1,
+            "protocol": target.protocol,
+            "address": target.address,
+            "ranges": ranges,
+            "profile": target.profile.name if target.profile is not None else None,
+            "profile_hash": target.profile.hash if target.profile is not None else None,
+            "eds": target.dictionary.path if target.dictionary is not None and not self.objects else None,
+            "stride": self.stride,
+            "most": self.most,
+            "pairs": self.pairs,
+        }
+
+    def sweeps(self) -> list[Sweeping]:
+        target = self.target
+        if target.protocol == "canopen":
+            if self.objects or target.dictionary is None:
+                return [ObjectSweep(self.objects or EVERYTHING)]
+            return [of_dictionary(target.dictionary)]
+        if not self.spans and target.profile is not None:
+            return [ProfileSweep(target.profile, dumped_tags(target.profile)[0])]
+        grain = 2 if self.pairs else 1
+        return [
+            Sweep(
+                span,
+                most=self.most,
+                stride=self.stride,
+                grain=1 if span.table in ("coil", "discrete") else grain,
+            )
+            for span in self.spans or ALL_TABLES
+        ]
+
+
+@dataclass
+class Result:
+    """What a dump came to. `requests` are those sent in this session, `replayed` those answered from the file."""
+
+    maps: list[TableMap] = field(default_factory=list)
+    functions: dict[int, dict[str, Any]] = field(default_factory=dict)
+    latency: dict[str, Histogram] = field(default_factory=dict)
+    requests: int = 0
+    replayed: int = 0
+    answered: int = 0
+    given_up: list[str] = field(default_factory=list)
+
+
+class Dumper:
+    """One session of a job. `earlier`: the dump that is gone on with."""
+
+    def __init__(
+        self,
+        job: Job,
+        asker: Asker,
+        clock: Clock,
+        writer: DumpWriter,
+        log: WireLog | None = None,
+        earlier: Dump | None = None,
+        progress: Progress = lambda done, total, requests: None,
+    ) -> None:
+        self._job, self._asker, self._clock, self._writer, self._log = job, asker, clock, writer, log
+        lines = earlier.lines if earlier is not None else []
+        self._recorded = deque(line for line in lines if not line.keys() & set(NOT_OF_THE_JOB))
+        self._progress = progress
+        self.result = Result()
+
+    async def run(self) -> Result:
+        """Everything. Raises `Unreachable` where the device answered nothing at all, and what ends a connection; what was
+        answered until then is in the file."""
+        result = self.result
+        self._pass(0)
+        sweeps = self._job.sweeps()
+        total, done = sum(_size(s) for s in sweeps), 0
+        for sweep in sweeps:
+            await self._follow(sweep, done, total)
+            done += _size(sweep)
+            self._map(sweep)
+        if self._job.functions and self._job.target.protocol == "modbus":
+            await self._functions()
+        if not result.answered:
+            raise Unreachable("nobody answers", where=f"{self._job.target.url} address {self._job.target.address}")
+        for number in range(1, self._job.passes):
+            await self._again(number, sweeps)
+        self._writer.write({"latency": {name: h.describe() for name, h in sorted(result.latency.items())}})
+        self._writer.write({"ended": _iso(self._clock.utc_ns()), "requests": result.requests})
+        return result
+
+    # -- passes ---------------------------------------------------------------------------------------------------
+
+    async def _follow(self, sweep: Sweeping, done: int, total: int) -> None:
+        asking: Generator[Any, Outcome, None] = sweep.asking()
+        try:
+            asked = next(asking)
+            while True:
+                outcome = await self._outcome(asked)
+                self._progress(done + _place(sweep, asked), total, self.result.requests)
+                asked = asking.send(outcome)
+        except StopIteration:
+            pass
+
+    def _map(self, sweep: Sweeping) -> None:
+        maps = list(sweep.maps.values()) if isinstance(sweep, ProfileSweep) else []
+        maps += [sweep.found] if isinstance(sweep, Sweep) else []
+        given_up = [m.given_up for m in maps] if isinstance(sweep, Sweep) else [sweep.given_up]
+        self.result.given_up += [text for text in given_up if text]
+        for found in maps:
+            self.result.maps.append(found)
+            self._write(_map_line(found))
+
+    async def _again(self, number: int, sweeps: Sequence[Sweeping]) -> None:
+        """A later pass: what the first one found, in the fewest reads."""
+        if not self._recorded and self._job.every_s:
+            await self._clock.sleep_until_ns(self._pass_ns + round(self._job.every_s * NS_PER_S))
+        self._pass(number)
+        reads: list[RegisterRange | ObjectKey] = []
+        for sweep in sweeps:
+            if isinstance(sweep, Sweep):
+                reads += sweep.found.reads()
+            elif isinstance(sweep, ProfileSweep):
+                reads += sweep.reads()
+        reads += [ObjectKey(*key) for key in self._objects_found]
+        for i, asked in enumerate(reads):
+            await self._read_again(asked)
+            self._progress(i + 1, len(reads), self.result.requests)
+
+    async def _read_again(self, asked: RegisterRange | ObjectKey) -> None:
+        """A read that is refused now is halved: where two sweeps' reads met there may be a border."""
+        outcome = await self._outcome(asked)
+        if isinstance(outcome, Refused) and isinstance(asked, RegisterRange) and asked.count > 1:
+            half = asked.count // 2
+            await self._read_again(RegisterRange(asked.table, asked.address, half))
+            await self._read_again(RegisterRange(asked.table, asked.address + half, asked.count - half))
+
+    async def _functions(self) -> None:
+        for found in self.result.maps:
+            function = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}[found.table]
+            line = {"function": function, "cells": found.cells, "max_read": found.max_read}
+            known = self.result.functions.get(function)
+            if known is None or known.get("cells", 0) < found.cells:
+                self.result.functions[function] = line
+        for number, request in PROBES:
+            taken = self._next_recorded("function", number)
+            if taken is None:
+                asked = await self._ask(lambda request=request: self._asker.function(request))  # type: ignore[misc]
+                taken = {"function": number} | _line(asked)
+                self._writer.write(taken)
+            self._count(number, taken)
+            self.result.functions[number] = taken
+
+    # -- one question ---------------------------------------------------------------------------------------------
+
+    async def _outcome(self, asked: RegisterRange | ObjectKey) -> Outcome:
+        key = key_of(asked)
+        line = self._next_recorded("read", key)
+        if line is None:
+            line = {"read": key} | _line(await self._ask(lambda: self._asker.read(asked)))
+            self._writer.write(line)
+        outcome = outcome_of(line)
+        if isinstance(asked, ObjectKey) and isinstance(outcome, Taken):
+            self._objects_found[(asked.index, asked.subindex)] = None
+        self._count(_function(asked), line)
+        return outcome
+
+    async def _ask(self, question: Callable[[], Any]) -> Asked:
+        if self._log is not None and self._log.full:
+            raise FileInvalid(
+                "the log of what is sent is full", path=str(self._log.path), hint="move it, then --resume"
+            )
+        asked: Asked = await question()
+        self.result.requests += asked.requests
+        return asked
+
+    def _count(self, function: int, line: dict[str, Any]) -> None:
+        self.result.answered += "silent" not in line
+        if "hex" in line:  # a refusal costs a device less
+            name = f"{function:02X}" if function else "SDO"
+            self.result.latency.setdefault(name, Histogram()).add(int(line["us"]))
+
+    # -- the file -------------------------------------------------------------------------------------------------
+
+    def _pass(self, number: int) -> None:
+        self._pass_ns = self._clock.monotonic_ns()
+        self._objects_found: dict[tuple[int, int], None] = self._objects_found if number else {}
+        self._write({"pass": number, "at": _iso(self._clock.utc_ns())})
+
+    def _write(self, line: dict[str, Any]) -> None:
+        """A line of the job, unless it was written in an earlier session."""
+        what = next(iter(line))
+        if self._next_recorded(what, line[what]) is None:
+            self._writer.write(line)
+
+    def _next_recorded(self, what: str, name: object) -> dict[str, Any] | None:
+        if not self._recorded:
+            return None
+        line = self._recorded.popleft()
+        if line.get(what) != name:
+            raise FileInvalid(
+                "the dump that is gone on with asked otherwise", path=str(self._writer.path), expected=str(name),
+                got=str(line)[:60], hint="start another file",
+            )  # fmt: skip
+        self.result.replayed += 1
+        return line
+
+
+def check_resumable(job: Job, earlier: Dump) -> None:
+    """Raise `FileInvalid` when `earlier` is the dump of another job."""
+    now = job.header()
+    different = [key for key, value in now.items() if earlier.header.get(key) != value]
+    if different:
+        raise FileInvalid(
+            "this is the dump of another job",
+            path=earlier.path,
+            expected=", ".join(f"{key} {now[key]!r}" for key in different),
+            got=", ".join(repr(earlier.header.get(key)) for key in different),
+        )
+
+
+def started(job: Job, clock: Clock) -> dict[str, Any]:
+    """The header of a new dump."""
+    return job.header() | {"endpoint": job.target.url, "started": _iso(clock.utc_ns())}
+
+
+def _map_line(found: TableMap) -> dict[str, Any]:
+    def texts(spans: list[tuple[int, int]]) -> list[str]:
+        return [gap_text(RegisterRange(found.table, a, b - a)) for a, b in spans]
+
+    return {
+        "map": found.table,
+        "readable": texts(found.readable),
+        "holes": texts(found.holes),
+        "voids": texts(found.voids),
+        "borders": found.borders,
+        "max_read": found.max_read,
+        "limit_proved": found.limit_proved,
+        "pairs": found.grain == 2,
+        "codes": {f"{code:02X}": n for code, n in found.codes.items()},
+        "given_up": found.given_up,
+    }
+
+
+def _line(asked: Asked) -> dict[str, Any]:
+    outcome = asked.outcome
+    if isinstance(outcome, Taken):
+        return {"hex": outcome.raw.hex(), "us": asked.us}
+    if isinstance(outcome, Refused):
+        return {"code": outcome.code, "us": asked.us}
+    assert isinstance(outcome, Silent)
+    return {"silent": outcome.problem}
+
+
+def _function(asked: RegisterRange | ObjectKey) -> int:
+    return {"coil": 1, "discrete": 2, "holding": 3, "input": 4}[asked.table] if isinstance(asked, RegisterRange) else 0
+
+
+def _size(sweep: Sweeping) -> int:
+    if isinstance(sweep, Sweep):
+        return sweep.span.count
+    if isinstance(sweep, ObjectSweep):
+        return sum(last - first + 1 for first, last in sweep.ranges)
+    return len(sweep.keys) if isinstance(sweep, ListedObjects) else sum(r.range.count for r in sweep.plan.reads)
+
+
+def _place(sweep: Sweeping, asked: RegisterRange | ObjectKey) -> int:
+    """How far a sweep is when it has asked this."""
+    if isinstance(sweep, Sweep) and isinstance(asked, RegisterRange):
+        return asked.address - sweep.span.address
+    if isinstance(sweep, ObjectSweep) and isinstance(asked, ObjectKey):
+        return sum(max(0, min(last, asked.index) - first + 1) for first, last in sweep.ranges)
+    return 0
+
+
+def _iso(utc_ns: int) -> str:
+    return datetime.fromtimestamp(utc_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")

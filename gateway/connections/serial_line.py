@@ -21,6 +21,7 @@ from typing import cast
 import serial
 from serial.tools import list_ports
 
+from gateway.connections.line_counters import LineCounters, read_control_lines, read_counters
 from gateway.connections.rs485 import let_driver_switch
 from gateway.core.connection import ByteConnection, RS232Connection, closed_here
 from gateway.core.endpoint import Endpoint
@@ -100,6 +101,14 @@ class SerialConnection(ByteConnection):
             await self._drain()
             self._fail(closed_here(self.endpoint))
         self.inbound.data_stream.clear()
+
+    def counters(self) -> LineCounters | None:
+        """What the driver counted, errors among it; None where it counts nothing."""
+        return read_counters(self._fd) if self._lost is None else None
+
+    def control_lines(self) -> dict[str, bool]:
+        """CTS, DSR, DCD, RI, DTR and RTS as they are now; empty where the port has none."""
+        return read_control_lines(self._fd) if self._lost is None else {}
 
     def on_room(self) -> None:
         if not self._reading and self._lost is None and len(self.inbound.data_stream) <= self.max_pending // 2:

@@ -1,0 +1,56 @@
+"""Many unit ids, one device? A device on TCP often answers whatever unit it is asked as. Pure.
+
+Alike are units that answer the same question with the same bytes. That says little of a few (new meters all read 0) and
+everything of all: nobody has 32 devices at 32 ids spread over all that exist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fieldtwin.commissioning.sweep import UnitAnswer
+
+SPREAD = 32
+"""So many ids spread over all must answer before they are taken for one device."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alike:
+    """`units` answer alike. `one_device`: they are one; else it is possible and not known."""
+
+    units: tuple[int, ...]
+    one_device: bool
+    why: str
+
+
+def likeness(answers: Sequence[UnitAnswer], asked: int, again: Sequence[UnitAnswer] = ()) -> Alike | None:
+    """Whether the units that answered, of `asked`, are one device; `again` are their answers a second time.
+
+    None where they are several, or fewer than three.
+    """
+    if len(answers) < 3 or len(answers) < asked:
+        return None
+    units = tuple(sorted(a.unit for a in answers))
+    contents = {a.reply for a in answers}
+    if len(contents) == 1:
+        text = next(iter(contents)).hex(" ")
+        if asked >= SPREAD:
+            return Alike(units, True, f"all {asked} unit ids that were asked answered with the same bytes ({text})")
+        return Alike(units, False, f"{asked} units answer with the same bytes ({text}): one device, or new ones alike")
+    before = {a.unit: a.reply for a in answers}
+    changed = sum(1 for a in again if before.get(a.unit) not in (None, a.reply))
+    if asked >= SPREAD and changed > len(answers) // 2:
+        return Alike(units, False, f"all {asked} unit ids answer, and each with something else a moment later")
+    return None
+
+
+def spread_over(units: Sequence[int]) -> tuple[int, ...]:
+    """`SPREAD` of `units` spread over all, likely ones first among them; all where there are no more."""
+    if len(units) <= SPREAD:
+        return tuple(units)
+    ordered = sorted(units)
+    likely = [u for u in (1, 255, 0, 2, 247, 3) if u in units]
+    steps = SPREAD - len(likely)
+    others = [u for u in ordered if u not in likely]
+    return (*likely, *(others[i * len(others) // steps] for i in range(steps)))

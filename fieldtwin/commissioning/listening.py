@@ -1,0 +1,109 @@
+"""Which settings a line runs at, from listening at one after the other: nothing is sent. Pure: what was heard in, a verdict out.
+
+A line that carries traffic shows something at every setting, so silence needs one look only. Where bytes come, the setting
+at which they are whole frames is the right one. Parity is known where the port counts its errors; a stop bit more is never
+seen by a receiver, which looks at one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from fieldtwin.commissioning.settings import name_of
+from fieldtwin.commissioning.traffic import Heard
+from gateway.connections.line_counters import LineCounters
+from gateway.core.clock import NS_PER_S
+from gateway.core.endpoint import SerialSettings
+
+SHORTEST_S, LONGEST_S = 1.5, 6.0
+"""How long one setting is listened to: longer where the line is silent for long between bursts."""
+
+ENOUGH_BYTES = 400
+"""So many bytes without one good frame, and this is not the setting."""
+
+
+@dataclass(frozen=True, slots=True)
+class Audition:
+    """What was heard at `settings`, and what the port counted meanwhile (None: it counts nothing)."""
+
+    settings: SerialSettings
+    heard: Heard
+    errors: LineCounters | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LineVerdict:
+    """The settings of the line. `sure` says whether it may be relied upon, `why` in a sentence; `others` fit as well."""
+
+    settings: SerialSettings
+    framing: str
+    sure: bool
+    why: str
+    others: tuple[SerialSettings, ...] = ()
+    heard: Heard | None = None
+
+
+def dwell_over(heard: Heard, elapsed_s: float) -> bool:
+    """Whether this setting has been listened to for long enough."""
+    if heard.sure or elapsed_s >= LONGEST_S:
+        return True
+    if heard.bytes >= ENOUGH_BYTES and not heard.good_bytes:
+        return True
+    wanted_s = max(SHORTEST_S, min(LONGEST_S, 2.5 * heard.longest_gap_ns / NS_PER_S))
+    return elapsed_s >= wanted_s and not (heard.frames > 0 and not heard.sure)
+
+
+def judge(auditions: Iterable[Audition]) -> LineVerdict | None:
+    """The best of what was heard; None where nothing makes sense."""
+    good = [a for a in auditions if a.heard.frames and a.heard.share > 0.2]
+    if not good:
+        return None
+    good.sort(key=_rank)
+    best = good[0]
+    heard, errors = best.heard, best.errors
+    evidence = f"{heard.frames} whole frames, {heard.share:.0%} of {heard.bytes} bytes"
+    if not heard.sure:
+        why = f"only {evidence}: listen longer"
+        return LineVerdict(best.settings, heard.framing, False, why, (), heard)
+    if errors is None:
+        others = _same_bits(best.settings, [a.settings for a in good if a is not best and a.heard.sure])
+        why = f"{evidence}; this port counts no parity errors, so the parity is not proved"
+        return LineVerdict(best.settings, heard.framing, False, why, others, heard)
+    if errors.parity + errors.frame:
+        why = f"{evidence}, yet {errors.parity} parity and {errors.frame} framing errors: another parity, or a bad line"
+        return LineVerdict(best.settings, heard.framing, False, why, (), heard)
+    if best.settings.parity == "N":
+        two = SerialSettings(best.settings.baudrate, best.settings.frame[:2] + "2")
+        why = f"{evidence}, no framing error (a receiver cannot tell one stop bit from two)"
+        return LineVerdict(best.settings, heard.framing, True, why, (two,), heard)
+    return LineVerdict(best.settings, heard.framing, True, f"{evidence}, no parity error", (), heard)
+
+
+def worth_hearing(first: SerialSettings, candidates: Sequence[SerialSettings]) -> list[SerialSettings]:
+    """`first`, then the others, each once."""
+    return list(dict.fromkeys([first, *candidates]))
+
+
+def siblings(settings: SerialSettings) -> list[SerialSettings]:
+    """The same baud rate with the other parities: what else a good-looking setting may be."""
+    bits = settings.frame[0]
+    return [SerialSettings(settings.baudrate, bits + p + "1") for p in "NEO" if p != settings.parity]
+
+
+def _rank(audition: Audition) -> tuple[int, int, float, int]:
+    errors = audition.errors
+    wrong = errors.parity + errors.frame if errors is not None else 0
+    return (not audition.heard.sure, wrong > 0, -audition.heard.share, wrong)
+
+
+def _same_bits(settings: SerialSettings, others: list[SerialSettings]) -> tuple[SerialSettings, ...]:
+    found = [o for o in others if o.baudrate == settings.baudrate]
+    two = SerialSettings(settings.baudrate, settings.frame[:2] + "2")
+    return tuple(dict.fromkeys([*found, *([two] if settings.parity == "N" else [])]))
+
+
+def describe(verdict: LineVerdict) -> str:
+    """One line for a person."""
+    also = f" (or {', '.join(name_of(o) for o in verdict.others)})" if verdict.others else ""
+    return f"{name_of(verdict.settings)}{also}: {verdict.why}"

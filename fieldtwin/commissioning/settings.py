@@ -1,0 +1,135 @@
+"""Serial settings and unit ids in the order in which they are worth trying, and how long trying takes. Pure arithmetic."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from fieldtwin.commissioning.sweep import expected_s
+from gateway.core.endpoint import Endpoint, SerialSettings
+
+LIKELY = tuple(
+    SerialSettings(baudrate, frame)
+    for baudrate, frame in (
+        (9600, "8N1"), (19200, "8E1"), (9600, "8E1"), (19200, "8N1"), (38400, "8N1"), (115200, "8N1"), (57600, "8N1"),
+        (4800, "8N1"), (38400, "8E1"), (115200, "8E1"), (9600, "8O1"), (2400, "8N1"), (57600, "8E1"), (19200, "8O1"),
+        (4800, "8E1"), (2400, "8E1"),
+    )
+)  # fmt: skip
+"""What devices are delivered with, most frequent first. Two stop bits are not tried by themselves: a receiver looks at one."""
+
+BAUDRATES = (9600, 19200, 38400, 115200, 57600, 4800, 2400, 1200)
+FRAMES = ("8N1", "8E1", "8O1", "8N2")
+ASCII_FRAMES = ("7E1", "8N1", "8E1", "7O1", "7N2", "7N1")
+
+UNITS = (1, 2, 3, 4, 5, 10, 16, 247, 17, 6, 7, 8, 9, 11, 32, 20, 100, 126, 50, 12, 64, 128, 13, 14, 15, 200)
+"""Unit ids that devices are delivered with or first given; no device is delivered with 42."""
+
+SERIAL_UNITS = tuple(range(1, 248))
+TCP_UNITS = (*range(1, 248), 0, 255)
+
+OPENING_S = 0.02
+"""What changing the settings of a port takes."""
+
+
+def settings_said(endpoint: Endpoint) -> SerialSettings | None:
+    """The settings that the endpoint itself says, None where it leaves them open."""
+    return endpoint.serial if endpoint.is_serial and endpoint.param("baudrate") else None
+
+
+def with_settings(endpoint: Endpoint, settings: SerialSettings) -> Endpoint:
+    """The same port with other settings."""
+    kept = tuple((k, v) for k, v in endpoint.params if k not in ("baudrate", "frame"))
+    return replace(endpoint, params=(("baudrate", str(settings.baudrate)), ("frame", settings.frame), *kept))
+
+
+def name_of(settings: SerialSettings) -> str:
+    """``9600 8N1``."""
+    return f"{settings.baudrate} {settings.frame}"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One stretch of a scan: these units at these settings (None: no serial line). `request_chars` for its time."""
+
+    settings: SerialSettings | None
+    units: tuple[int, ...]
+    request_chars: int
+    timeout_s: float
+    interval_s: float
+
+    @property
+    def seconds(self) -> float:
+        """How long it takes where nobody answers."""
+        char_s = self.settings.char_time_s if self.settings else 0.0
+        opening_s = OPENING_S if self.settings else 0.0
+        return opening_s + expected_s(
+            len(self.units),
+            self.request_chars,
+            char_time_s=char_s,
+            timeout_s=self.timeout_s,
+            interval_s=self.interval_s,
+        )
+
+
+def seconds_of(steps: Iterable[Step]) -> float:
+    """How long all of them take where nobody answers."""
+    return sum(step.seconds for step in steps)
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """What each question is given: `timeout_s`, and `interval_s` from one to the next at least."""
+
+    timeout_s: float
+    interval_s: float
+    ascii: bool = False
+
+    def step(self, settings: SerialSettings | None, units: Sequence[int]) -> Step:
+        return Step(settings, tuple(units), 17 if self.ascii else 8, self.timeout_s, self.interval_s)
+
+
+def quick_pass(
+    pace: Pace, candidates: Sequence[SerialSettings], units: Sequence[int], budget_s: float = 30.0
+) -> list[Step]:
+    """The likely units at the likely settings, as many of both as `budget_s` allows: some units everywhere first."""
+    steps: list[Step] = []
+    left_s = budget_s
+    for first, last in ((0, 5), (5, 10), (10, 18), (18, len(UNITS))):
+        batch = [u for u in UNITS if u in units][first:last]
+        for settings in candidates if batch else ():
+            step = pace.step(settings, batch)
+            if step.seconds > left_s:
+                return steps
+            left_s -= step.seconds
+            steps.append(step)
+    return steps
+
+
+def full_pass(
+    pace: Pace, candidates: Sequence[SerialSettings | None], units: Sequence[int], done: Iterable[Step] = ()
+) -> list[Step]:
+    """Every unit at every one of `candidates`, without what was `done`."""
+    asked: dict[SerialSettings | None, set[int]] = {}
+    for step in done:
+        asked.setdefault(step.settings, set()).update(step.units)
+    steps = []
+    for settings in candidates:
+        left = [u for u in units if u not in asked.get(settings, set())]
+        if left:
+            steps.append(pace.step(settings, left))
+    return steps
+
+
+def all_settings(*, ascii_mode: bool, frames: Sequence[str] = ()) -> list[SerialSettings]:
+    """Baud rate x parity x stop bits, likely ones first."""
+    frames = frames or (ASCII_FRAMES if ascii_mode else FRAMES)
+    every = [SerialSettings(baudrate, frame) for frame in frames for baudrate in BAUDRATES]
+    return every if ascii_mode else list(dict.fromkeys([*LIKELY, *every]))
+
+
+def likely_settings(*, ascii_mode: bool) -> list[SerialSettings]:
+    """What a quick pass tries."""
+    if not ascii_mode:
+        return list(LIKELY)
+    return [SerialSettings(b, f) for f in ("7E1", "8N1") for b in (9600, 19200, 38400, 115200, 4800)]

@@ -1,0 +1,87 @@
+"""What a serial port's driver counted and what its control lines say: ``TIOCGICOUNT`` and ``TIOCMGET`` of Linux (tty_ioctl(4)).
+
+A pty, many USB adapters and other operating systems count nothing; then there is None, never zeros. Only reads.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass, fields
+from typing import Protocol, runtime_checkable
+
+TIOCGICOUNT = 0x545D
+TIOCMGET = 0x5415
+_INTS = struct.Struct("@20i")  # struct serial_icounter_struct: 11 counters, 9 reserved
+_INT = struct.Struct("@i")
+
+_LINES = {"CTS": 0x020, "DSR": 0x100, "DCD": 0x040, "RI": 0x080, "DTR": 0x002, "RTS": 0x004}
+
+
+@dataclass(frozen=True, slots=True)
+class LineCounters:
+    """Since the driver was loaded: characters both ways, and errors of reception. `overrun`: the UART was not read in time;
+    `buffer_overrun`: the kernel's buffer was full; `breaks`: the line was held at 0 for longer than a character."""
+
+    rx: int = 0
+    tx: int = 0
+    frame: int = 0
+    overrun: int = 0
+    parity: int = 0
+    breaks: int = 0
+    buffer_overrun: int = 0
+
+    def since(self, before: LineCounters) -> LineCounters:
+        """What was counted from `before` to this; counters wrap at 32 bits."""
+        return LineCounters(
+            *((getattr(self, f.name) - getattr(before, f.name)) & 0xFFFF_FFFF for f in fields(LineCounters))
+        )
+
+    @property
+    def errors(self) -> int:
+        return self.frame + self.overrun + self.parity + self.breaks + self.buffer_overrun
+
+
+@runtime_checkable
+class CountsErrors(Protocol):
+    """A connection whose port may count errors."""
+
+    def counters(self) -> LineCounters | None:
+        """What the port has counted, None where it counts nothing."""
+        ...
+
+    def control_lines(self) -> dict[str, bool]:
+        """CTS, DSR, DCD, RI (inputs) and DTR, RTS (ours); empty where the port has none."""
+        ...
+
+
+def unpack_counters(data: bytes) -> LineCounters:
+    """Read the kernel's struct: cts, dsr, rng, dcd, rx, tx, frame, overrun, parity, brk, buf_overrun."""
+    numbers = _INTS.unpack(data)
+    rx, tx, frame, overrun, parity, breaks, buffer_overrun = (n & 0xFFFF_FFFF for n in numbers[4:11])
+    return LineCounters(rx, tx, frame, overrun, parity, breaks, buffer_overrun)
+
+
+def read_counters(descriptor: int) -> LineCounters | None:
+    """Ask the driver; None where it has no such counters."""
+    answer = _ask(descriptor, TIOCGICOUNT, _INTS.size)
+    return unpack_counters(answer) if answer is not None else None
+
+
+def read_control_lines(descriptor: int) -> dict[str, bool]:
+    """Ask the driver; empty where it has no such lines."""
+    answer = _ask(descriptor, TIOCMGET, _INT.size)
+    if answer is None:
+        return {}
+    bits = _INT.unpack(answer)[0]
+    return {name: bool(bits & bit) for name, bit in _LINES.items()}
+
+
+def _ask(descriptor: int, request: int, size: int) -> bytes | None:
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    try:
+        return fcntl.ioctl(descriptor, request, bytes(size))
+    except OSError:
+        return None

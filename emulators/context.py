@@ -8,9 +8,10 @@ command of each register that a request asks for.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
+
+import msgspec
 
 from gateway.core.errors import Bug, FileInvalid, UnknownCommand, UsageError
 from gateway.core.values import COMMAND, RECORDING
@@ -40,9 +41,11 @@ class UsedUp(FileInvalid):
     """The recording has nothing left, and the prototype file says that this is an error."""
 
 
-@dataclass(frozen=True, slots=True)
-class Recorded:
-    """A recorded response, when it was recorded (seconds since the recording's start) and how long it had taken."""
+class Recorded(msgspec.Struct, frozen=True):
+    """A recorded response, when it was recorded (seconds since the recording's start) and how long it had taken.
+
+    A struct and not a dataclass: for long recordings they are made when they are asked for.
+    """
 
     t_s: float
     response: RECORDING
@@ -55,13 +58,19 @@ head of a list would cost as many steps as there are behind it."""
 
 
 class _Series:
-    """What was recorded for one command, how far it was taken, and the last one taken. The list may be another's, too."""
+    """What was recorded for one command, how far it was taken, and the last one taken. The list may be another's, too.
 
-    __slots__ = ("at", "last", "recorded", "shared", "skip", "when_used_up")
+    `whole`: it was given as it is, and nothing is added to it or dropped from it.
+    """
 
-    def __init__(self, when_used_up: WhenUsedUp, recorded: list[Recorded] | None = None) -> None:
-        self.recorded = [] if recorded is None else recorded
+    __slots__ = ("at", "last", "recorded", "shared", "skip", "when_used_up", "whole")
+
+    def __init__(
+        self, when_used_up: WhenUsedUp, recorded: Sequence[Recorded] | None = None, *, whole: bool = False
+    ) -> None:
+        self.recorded: Sequence[Recorded] = [] if recorded is None else recorded
         self.shared = recorded is not None
+        self.whole = whole
         self.at = 0
         self.last: Recorded | None = None
         self.skip = 0  # taken since, and still in the context's order of arrival
@@ -77,9 +86,15 @@ class _Series:
         self.at += 1
         wanted_again = self.shared or self.when_used_up is WhenUsedUp.LOOP
         if self.at >= RELEASE_AT and 2 * self.at >= len(self.recorded) and not wanted_again:
-            del self.recorded[: self.at]
+            del _own(self)[: self.at]
             self.at = 0
         return recorded
+
+
+def _own(series: _Series) -> list[Recorded]:
+    """The list of a series that is nobody else's."""
+    assert isinstance(series.recorded, list)
+    return series.recorded
 
 
 class VirtualContext:
@@ -104,6 +119,7 @@ class VirtualContext:
         self.taken = 0
         self.dropped = 0
         self._left = 0
+        self._held = 0  # of those left the ones that were added one by one: their number is bounded
         self._fixed = commands is not None
         self._series: dict[bytes, _Series] = {command.data: _Series(when_used_up) for command in commands or ()}
         self._order: deque[_Series] = deque()  # one entry for each added and not yet known to be gone
@@ -140,7 +156,7 @@ class VirtualContext:
     def _find(self, command: COMMAND) -> _Series | None:
         series = self._series.get(command.data)
         if series is None and self._origin is not None and (there := self._origin.get(command.data)) is not None:
-            series = self._series[command.data] = _Series(there.when_used_up, there.recorded)
+            series = self._series[command.data] = _Series(there.when_used_up, there.recorded, whole=there.whole)
         return series
 
     def add(self, command: COMMAND, recorded: Recorded) -> None:
@@ -154,13 +170,24 @@ class VirtualContext:
             if len(self._series) >= self.max_entries:
                 raise FileInvalid("the recording holds too many different requests", expected=str(self.max_entries))
             series = self._series[command.data] = _Series(self.when_used_up)
-        if self._left >= self.max_entries:
+        if self._held >= self.max_entries:
             self._drop_oldest()
         if series.shared:
             raise Bug("something was added to a context that was copied")
-        series.recorded.append(recorded)
+        _own(series).append(recorded)
         self._order.append(series)
         self._left += 1
+        self._held += 1
+
+    def add_series(self, command: COMMAND, recorded: Sequence[Recorded]) -> None:
+        """All that was recorded for a command of which nothing was added: whoever gives it bounds it, and it does not count
+        for `max_entries`. It may make its items when they are asked for."""
+        if self._origin is not None or self._fixed or command.data in self._series:
+            raise Bug("a series for a command that is there, or of a context that is fixed")
+        if len(self._series) >= self.max_entries:
+            raise FileInvalid("the recording holds too many different requests", expected=str(self.max_entries))
+        self._series[command.data] = _Series(self.when_used_up, recorded, whole=True)
+        self._left += len(recorded)
 
     def set_policies(self, policies: Mapping[bytes, WhenUsedUp]) -> None:
         """Other policies for single commands, which must be in the list."""
@@ -168,6 +195,13 @@ class VirtualContext:
             if data not in self._series:
                 raise self._unknown(COMMAND(data))
             self._series[data].when_used_up = policy
+
+    def peek(self, command: COMMAND) -> Recorded | None:
+        """What was returned last for a command or, before that, what will be; None where there is nothing."""
+        series = self._find(command)
+        if series is None:
+            return None
+        return series.last or (series.recorded[series.at] if series.left else None)
 
     def take(self, command: COMMAND) -> RECORDING:
         """SPEC: the command must be in the list; a recording of the context is returned and removed.
@@ -184,7 +218,8 @@ class VirtualContext:
             raise self._unknown(command)
         if not series.left and series.at and series.when_used_up is WhenUsedUp.LOOP:
             self._left += series.at
-            if self._origin is None:
+            if self._origin is None and not series.whole:
+                self._held += series.at
                 self._order.extend([series] * series.at)
             series.at = 0
         if series.left:
@@ -197,8 +232,9 @@ class VirtualContext:
         recorded = series.take()
         self._left -= 1
         self.taken += 1
-        if self._origin is not None:
+        if self._origin is not None or series.whole:
             return recorded  # nothing is added, so nobody asks for the order
+        self._held -= 1
         series.skip += 1
         while self._order and self._order[0].skip:  # forget the order of those that are gone
             self._order.popleft().skip -= 1
@@ -210,8 +246,9 @@ class VirtualContext:
             if series.skip:
                 series.skip -= 1
                 continue
-            del series.recorded[series.at]
+            del _own(series)[series.at]
             self._left -= 1
+            self._held -= 1
             self.dropped += 1
             return
 

@@ -64,6 +64,10 @@ class Counters:
             other._by_cell[place] = (mine, i)
         return other
 
+    def counts(self, unit: int, cell: Cell) -> bool:
+        """Whether the register is one of a counter."""
+        return (unit, cell) in self._by_cell
+
     def learn(self, unit: int, cell: Cell, value: int, t_s: float) -> bool:
         """A register was recorded. Returns whether it is one of a counter."""
         found = self._by_cell.get((unit, cell))

@@ -41,6 +41,18 @@ from twin.data_files import data_root, find
 )
 @click.option("--speed", type=float, default=0.0, help="Play recordings this much faster.")
 @click.option(
+    "--unknown",
+    type=click.Choice(["exception", "silence", "interpolate"]),
+    default=None,
+    help="For a recording: what a request gets that nobody made when it was recorded. Default: exception.",
+)
+@click.option(
+    "--at-end",
+    type=click.Choice(["hold", "loop", "error"]),
+    default=None,
+    help="For a recording: when its values are used up: hold the last (default), begin again, or exception 04.",
+)
+@click.option(
     "--prototype-file", type=click.Path(exists=True, dir_okay=False), help="For a system: another prototype file."
 )
 @click.option(
@@ -64,6 +76,8 @@ def command(
     bitrate: int | None,
     recordings: tuple[str, ...],
     speed: float,
+    unknown: str | None,
+    at_end: str | None,
     prototype_file: str | None,
     listen: tuple[str, ...],
     control: str,
@@ -79,8 +93,11 @@ def command(
     fieldtwin emulate ctd-reference --on tcp://127.0.0.1:1502        the same on Modbus TCP
     fieldtwin emulate drive-cia402 --on can:fieldtwin/127.0.0.1:29536     a drive on a software CAN bus, made or joined
     fieldtwin emulate drive.eds --node 5 --on can:fieldtwin/127.0.0.1:0   a CANopen node from its data sheet
+    fieldtwin emulate site.jsonl --on rtu:/tmp/ttyV0                 what was recorded, answered again, no profile needed
     """
     kind, path = _kind(what, tuple(Path(p) for p in profiles))
+    if kind != "recording" and (unknown or at_end):
+        raise UsageError("--unknown and --at-end are for a recording", got=f"a {kind}")
     if kind == "system":
         if endpoints or (unit, node, bitrate) != (None, None, None):
             raise UsageError(
@@ -105,6 +122,8 @@ def command(
                 )
             )
         )
+    from emulators.context import WhenUsedUp
+    from emulators.replay.replay import NeverRecorded
     from fieldtwin.running.device_here import run_device
     from fieldtwin.running.loops import run as run_loop
 
@@ -127,7 +146,13 @@ def command(
     unit = node if unit is None else unit
     recording = Path(recordings[0]) if recordings else None
     serial = any(endpoint.startswith("pty:") for endpoint in endpoints)
-    return run_loop(run_device(kind, path, endpoints, unit, recording, speed or 1.0, bitrate), serial=serial)
+    return run_loop(
+        run_device(
+            kind, path, endpoints, unit, recording, speed or 1.0, bitrate, unknown=NeverRecorded(unknown or "exception"),
+            at_end=WhenUsedUp(at_end or "hold"),
+        ),
+        serial=serial,
+    )  # fmt: skip
 
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:

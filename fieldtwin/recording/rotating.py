@@ -7,11 +7,13 @@ parts, which `parts_of` finds again. It must never know what the lines say, nor 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from gateway.core.errors import Bug, FileInvalid
+from gateway.core.recording import Exchange, RecordingHeader, RecordingReader
 
 MAX_PARTS = 9999
 MB = 1_000_000
@@ -112,6 +114,24 @@ def parts_of(path: Path) -> list[Path]:
         if (name := found.name[len(path.stem) + 1 : len(path.stem) + 5]).isdigit()
     )
     return [*([path] if path.is_file() or not numbers else []), *(part(path, n) for n in numbers)]
+
+
+def oldest_part(path: Path) -> Path:
+    """The first part of the recording that is still there."""
+    return parts_of(path)[0]
+
+
+def header_of(path: Path) -> RecordingHeader:
+    """The header of the recording at `path`. Raises `FileInvalid`."""
+    with RecordingReader(oldest_part(path)) as reader:
+        return reader.header
+
+
+def exchanges_of(path: Path) -> Iterator[Exchange]:
+    """The exchanges of all parts of a recording, in order. Raises `FileInvalid`."""
+    for found in parts_of(path):
+        with RecordingReader(found) as reader:
+            yield from reader.exchanges()
 
 
 def _escaped(text: str) -> str:

@@ -27,19 +27,21 @@ from emulators.models.sampled_sensor import SampledSensor
 from emulators.recorded_device import load_replay
 from emulators.replay.can_log import SUFFIX, CanLog
 from emulators.replay.profiled import ProfiledReplay
-from emulators.replay.replay import ExchangeReplay
+from emulators.replay.replay import ExchangeReplay, NeverRecorded
 from emulators.replay.unit import ReplayUnit
 from emulators.signals import SignalPlayer, SignalTrack
 from emulators.stated import parts_of
 from fieldtwin.cli.talk import talk
+from fieldtwin.recording.rotating import exchanges_of, header_of, oldest_part
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.until_stopped import until_stopped
+from gateway.connections.os_connector import OsConnector
 from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint
+from gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from gateway.core.errors import UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import RecordingReader, shown
+from gateway.core.recording import shown
 from gateway.wallclock import WallClock
 from twin.data_files import find_recording
 from twin.field import unit_limits
@@ -59,14 +61,21 @@ async def run_device(
     recording: Path | None,
     speed: float,
     bitrate: int | None = None,
+    *,
+    unknown: NeverRecorded = NeverRecorded.EXCEPTION,
+    at_end: WhenUsedUp = WhenUsedUp.HOLD,
 ) -> int:
-    """Serve until SIGINT or SIGTERM; raises what ends the serving before. `bitrate` is for a CAN bus, None for the usual one."""
+    """Serve until SIGINT or SIGTERM; raises what ends the serving before. `bitrate` is for a CAN bus, None for the usual one.
+
+    `unknown` and `at_end` are for a recording without a profile: what is answered to a request that was never recorded, and
+    when what was recorded is used up.
+    """
     host = DeviceHost(speed)
     try:
         async with Nursery() as nursery:  # inside: who serves is stopped before what it serves on is closed
             wires = [Endpoint.parse(url) for url in endpoints]
             if kind == "recording":
-                units = host.replayed(path, unit_id)
+                units = host.replayed(path, unit_id, unknown, at_end)
             else:
                 profile = load_profile(path)
                 wires = [_as_from_the_factory(wire, profile) for wire in wires]
@@ -117,19 +126,26 @@ class DeviceHost:
         talk.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
         return ProfiledReplay(profile, replay, recorded)
 
-    def replayed(self, path: Path, unit_id: int | None) -> dict[int, ModbusUnit]:
-        """The units of a recording of exchanges, or the one that is asked for."""
-        with RecordingReader(path) as reader:
-            if reader.header.kind != "exchanges":
-                raise UsageError(
-                    "a recording of signals needs a device to play it",
-                    where=str(path),
-                    hint=f"fieldtwin emulate PROFILE --recording {path.name} --on ...",
-                )
-            replay = ExchangeReplay(reader.exchanges())
-        talk.print(f"plays {shown(path)}", soft_wrap=True)
-        wanted = [unit_id] if unit_id is not None else list(replay.units)
-        return {number: ReplayUnit(replay, number, f"{path.name}:{number}") for number in wanted}
+    def replayed(
+        self, path: Path, unit_id: int | None, unknown: NeverRecorded, at_end: WhenUsedUp
+    ) -> dict[int, ModbusUnit]:
+        """The units of a recording of exchanges, or the one that is asked for; the only one answers under any id."""
+        if header_of(path).kind != "exchanges":
+            raise UsageError(
+                "a recording of signals needs a device to play it",
+                where=str(path),
+                hint=f"fieldtwin emulate PROFILE --recording {path.name} --on ...",
+            )
+        replay = ExchangeReplay(exchanges_of(path), never_recorded=unknown, when_used_up=at_end)
+        if not replay.units:
+            raise UsageError("the recording holds no exchange", where=str(path))
+        talk.print(f"plays {shown(oldest_part(path))}", soft_wrap=True)
+        if replay.context.dropped:
+            talk.print(f"  it is too long: the oldest {replay.context.dropped} exchanges are left out", soft_wrap=True)
+        if unit_id is None:
+            return {number: ReplayUnit(replay, number, f"{path.name}:{number}") for number in replay.units}
+        recorded = replay.units[0] if len(replay.units) == 1 else unit_id
+        return {unit_id: ReplayUnit(replay, recorded, f"{path.name}:{recorded}")}
 
     @staticmethod
     def _recording_of(profile: DeviceProfile) -> str | None:
@@ -150,11 +166,14 @@ class DeviceHost:
         return SignalPlayer(track, self._clock.monotonic_ns(), speed=self._speed, at_end=WhenUsedUp.LOOP)
 
     async def serve(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
-        """Modbus units on a virtual serial port, a socket that stands for one, or Modbus TCP over TCP, UDP or TLS.
+        """Modbus units on a serial port (a virtual one, where there is none at that path), a socket that stands for one, or
+        Modbus TCP over TCP, UDP or TLS.
 
         A line takes ``mode=ascii``, and ``echo=1`` where the master is to hear itself.
         """
-        if wire.scheme in ("pty", "ascii"):
+        if wire.scheme in SERIAL_SCHEMES and Path(wire.path).is_char_device():
+            await self._serve_port(nursery, units, wire)
+        elif wire.scheme in ("pty", *SERIAL_SCHEMES):
             await self._serve_pty(nursery, units, wire)
         elif wire.scheme == "rtu+tcp":
             line, echo = _line(wire, units), wire.param("echo") == "1"
@@ -171,8 +190,18 @@ class DeviceHost:
         else:
             raise UsageError(
                 f"cannot emulate on {wire}",
-                expected="pty:PATH, ascii:PATH, tcp://HOST:PORT, rtu+tcp://HOST:PORT, udp://HOST:PORT or tls://HOST:PORT",
+                expected="rtu:PATH, ascii:PATH, pty:PATH, tcp://HOST:PORT, rtu+tcp://HOST:PORT, udp://HOST:PORT or tls://HOST:PORT",
             )
+
+    async def _serve_port(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
+        """A port that is there: this is a device on a real line."""
+        line: LineSlave = AsciiSlave(units) if wire.scheme == "ascii" else RtuSlave(units)
+        end = await OsConnector().open_bytes(wire)
+        self._closing.append(end)
+        nursery.start(serve_rtu(end, line, self._clock, as_recorded(wire.serial)), f"units on {wire}")
+        talk.print(
+            f"units {_list(units)} on the port {wire.path} ({wire.serial.baudrate} {wire.serial.frame})", soft_wrap=True
+        )
 
     async def _serve_pty(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
         line, echo = _line(wire, units), wire.param("echo") == "1"
@@ -226,7 +255,7 @@ class DeviceHost:
 
 def _as_from_the_factory(wire: Endpoint, profile: DeviceProfile) -> Endpoint:
     """What is not said of a virtual port's settings is as the device leaves the factory; ASCII has a frame of its own."""
-    if wire.scheme not in ("pty", "ascii"):
+    if wire.scheme not in ("pty", *SERIAL_SCHEMES):
         return wire
     factory = profile.form.factory
     usual = {"baudrate": str(factory.baudrate)}

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import sqlite3
 from collections import deque
-from importlib.resources import files
 from pathlib import Path
 
 from gateway.core.errors import FileInvalid, Unreachable
+from gateway.store.schema import migrate, refuse_newer
 
 QUEUE = 10_000
-SCHEMA = 1
 
 
 class ExchangeLog:
@@ -28,27 +27,15 @@ class ExchangeLog:
         self.dropped = 0
         try:
             self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+            refuse_newer(self._db, path)
             self._db.execute("PRAGMA journal_mode=WAL")
-            self._migrate()
+            migrate(self._db, path)
             self._db.execute("INSERT INTO run (system, prototype) VALUES (?, ?)", (system, prototype))
             self._run = self._db.execute("SELECT max(id) FROM run").fetchone()[0]
         except sqlite3.DatabaseError as e:
             raise FileInvalid(
                 f"not a store of ours: {e}", path=str(path), hint="move it away; a new one is made"
             ) from e
-
-    def _migrate(self) -> None:
-        (version,) = self._db.execute("PRAGMA user_version").fetchone()
-        if version > SCHEMA:
-            raise FileInvalid(
-                "the store was written by a newer fieldtwin",
-                path=str(self._path),
-                expected=f"schema {SCHEMA}",
-                got=str(version),
-            )
-        for number in range(version + 1, SCHEMA + 1):
-            script = files("gateway.store").joinpath(f"{number:04d}_schema.sql").read_text(encoding="utf-8")
-            self._db.executescript(f"BEGIN;{script}PRAGMA user_version={number};COMMIT;")
 
     def append(self, rows: list[tuple[str, int, int, bytes]]) -> None:
         """Queue rows of (tag, sequence, monotonic ns, payload)."""

@@ -1,0 +1,48 @@
+"""The numbered schemas of a SQLite file of ours, and bringing an old file up to date.
+
+Each number is a script beside this file, run once, in one transaction with the number itself: a file is of one version or of the
+next, never between. A file that a newer fieldtwin wrote is left alone.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from importlib.resources import files
+from pathlib import Path
+
+from gateway.core.errors import FileInvalid
+
+SCRIPTS = {1: "0001_schema.sql", 2: "0002_knowledge.sql"}
+LATEST = max(SCRIPTS)
+
+
+def script(number: int) -> str:
+    """The SQL that leads to version `number`."""
+    return files("gateway.store").joinpath(SCRIPTS[number]).read_text(encoding="utf-8")
+
+
+def refuse_newer(db: sqlite3.Connection, path: Path) -> int:
+    """The version of the file; before anything is changed in it. Raises `FileInvalid` for one that is newer than this program."""
+    (version,) = db.execute("PRAGMA user_version").fetchone()
+    if version > LATEST:
+        raise FileInvalid(
+            "the store was written by a newer fieldtwin",
+            path=str(path),
+            expected=f"schema {LATEST} or older",
+            got=str(version),
+            hint="it is left as it is",
+        )
+    return int(version)
+
+
+def migrate(db: sqlite3.Connection, path: Path) -> None:
+    """Bring the file to the latest version. `db` is in autocommit mode. Raises `FileInvalid` for a newer one."""
+    for number in range(refuse_newer(db, path) + 1, LATEST + 1):
+        try:
+            db.executescript(f"BEGIN IMMEDIATE;{script(number)}PRAGMA user_version={number};COMMIT;")
+        except sqlite3.DatabaseError:
+            if db.in_transaction:
+                db.execute("ROLLBACK")
+            (now,) = db.execute("PRAGMA user_version").fetchone()
+            if now < number:  # else another process did it meanwhile
+                raise

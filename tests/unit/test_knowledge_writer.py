@@ -1,0 +1,143 @@
+"""Writing knowledge: nobody waits, a slow or full store loses nothing that fits the queue, and what was lost is known."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from support import eventually, run
+
+from gateway.core.errors import Unreachable
+from gateway.store.event import Event, Kind, StoreFull
+from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from gateway.wallclock import WallClock
+from twin.knowledge import KnowledgeWriter, known_at
+
+
+def value(number: float) -> Event:
+    return Event(0, int(number), Kind.VALUE, "ctd.pressure", float(number))
+
+
+class Moody(SqliteKnowledge):
+    """A store whose disk is full while `full`, and has `room` left."""
+
+    full = False
+    room = 1 << 40
+    slow: asyncio.Event | None = None
+
+    async def append(self, origin: str, events: Sequence[Event]) -> int:
+        if self.slow is not None:
+            await self.slow.wait()
+        if self.full:
+            raise StoreFull("no room for more knowledge")
+        return await super().append(origin, events)
+
+    def room_bytes(self) -> int | None:
+        return self.room
+
+
+async def moody(tmp_path: Path) -> tuple[Moody, str]:
+    store = await Moody.open(tmp_path / "k.db", offload=in_place)
+    assert isinstance(store, Moody)
+    return store, await store.own("plant", system="s", prototype=True, log="aa")
+
+
+def test_what_is_observed_is_written_in_order_and_told(tmp_path: Path) -> None:
+    async def main() -> None:
+        store, origin = await moody(tmp_path)
+        told: list[int] = []
+        writer = KnowledgeWriter(store, origin, WallClock(), on_written=told.append)
+        running = asyncio.create_task(writer.run())
+        for n in range(100):
+            writer.observe(value(n))
+        await eventually(lambda: writer.written == 100)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        assert [e.value for e in await store.read(origin, 1, 200)] == [float(n) for n in range(100)]
+        assert told[-1] == 100
+        await store.aclose()
+
+    run(main())
+
+
+def test_through_a_full_disk_nothing_is_lost_that_fits_the_queue_and_the_rest_is_counted_on_record(
+    tmp_path: Path,
+) -> None:
+    async def main() -> None:
+        store, origin = await moody(tmp_path)
+        said: list[str] = []
+        writer = KnowledgeWriter(store, origin, WallClock(), capacity=10, on_trouble=said.append)
+        store.full = True
+        for n in range(13):
+            writer.observe(value(n))
+            if n == 5:
+                with pytest.raises(Unreachable):
+                    await writer.flush()
+        store.full = False
+        await writer.flush()
+        kept = await store.read(origin, 1, 99)
+        assert (kept[0].kind, kept[0].value) == (Kind.LOSS, 3)
+        assert [e.value for e in kept[1:]] == [float(n) for n in range(3, 13)]
+        assert writer.dropped == 3
+        await writer.flush()
+        assert await store.span(origin) == (1, 11), "a loss is told once"
+        await store.aclose()
+
+    run(main())
+
+
+def test_short_room_is_said_early_once_and_when_it_is_over(tmp_path: Path) -> None:
+    async def main() -> None:
+        store, origin = await moody(tmp_path)
+        said: list[str] = []
+        writer = KnowledgeWriter(store, origin, WallClock(), reserve_bytes=100 << 20, on_trouble=said.append)
+        for room in (1 << 40, 99 << 20, 98 << 20, 1 << 40):
+            store.room = room
+            writer.observe(value(1))
+            await writer.flush()
+        assert said == ["the disk of the knowledge is almost full: 99 MiB left", ""]
+        assert writer.written == 4, "early: while it can still be written"
+        await store.aclose()
+
+    run(main())
+
+
+def test_who_is_stopped_in_the_middle_of_writing_writes_nothing_twice(tmp_path: Path) -> None:
+    async def main() -> None:
+        store, origin = await moody(tmp_path)
+        store.slow = asyncio.Event()
+        writer = KnowledgeWriter(store, origin, WallClock())
+        writer.observe(value(1))
+        flushing = asyncio.create_task(writer.flush())
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        flushing.cancel()
+        store.slow.set()
+        with pytest.raises(asyncio.CancelledError):
+            await flushing
+        writer.observe(value(2))
+        await writer.flush()
+        assert [e.value for e in await store.read(origin, 1, 99)] == [1.0, 2.0]
+        await store.aclose()
+
+    run(main())
+
+
+def test_knowledge_replayed_is_what_was_last_known(tmp_path: Path) -> None:
+    async def main() -> None:
+        store, origin = await moody(tmp_path)
+        await store.append(
+            origin,
+            [
+                value(1), Event(0, 2, Kind.COMMAND, "shore", b"\0\1"), Event(0, 3, Kind.STATE, "relay", 1), value(4),
+                Event(0, 5, Kind.LOSS, "knowledge", 7), Event(0, 9, Kind.STATE, "relay", -1),
+            ],
+        )  # fmt: skip
+        known = await known_at(store.replay(origin, 0, 9))
+        assert {n: e.value for n, e in known.latest.items()} == {"ctd.pressure": 4.0, "relay": 1}
+        assert ([c.value for c in known.commands], known.lost, known.events) == ([b"\0\1"], 7, 5)
+        await store.aclose()
+
+    run(main())

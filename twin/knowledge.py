@@ -1,0 +1,170 @@
+"""The knowledge of a twin: what it has seen, decided and refused, written as it comes and read back as it was.
+
+`KnowledgeWriter` stands between those who notice things, who never wait, and the store, which may be slow or full. Its queue
+has a bound; what does not fit is counted, and the count is knowledge too. It knows no database.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from operator import itemgetter
+
+from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.errors import Unreachable
+from gateway.store.event import Event, Kind, KnowledgeStore
+
+QUEUE = 200_000
+"""Four seconds of the fastest writing that we promise."""
+BATCH = 10_000
+EVERY_MS = 100
+RETRY_MS = 1000
+RESERVE_BYTES = 64 << 20
+LOSS_NAME = "knowledge"
+_SAYS_WHAT_IS = {int(Kind.VALUE), int(Kind.STATE)}
+_NAME_OF = itemgetter(3)
+
+
+class KnowledgeWriter:
+    """Writes one origin's events in batches. `observe` never waits and never fails; `run` writes until cancelled.
+
+    `on_trouble` is told once when the room runs short (`reserve_bytes`), once when nothing can be written, and with ``""`` when
+    that is over. `on_written` is told the last number after each batch.
+    """
+
+    def __init__(
+        self,
+        store: KnowledgeStore,
+        origin: str,
+        clock: Clock,
+        *,
+        capacity: int = QUEUE,
+        reserve_bytes: int = RESERVE_BYTES,
+        on_trouble: Callable[[str], None] = lambda text: None,
+        on_written: Callable[[int], None] = lambda last: None,
+    ) -> None:
+        self.origin = origin
+        self.written = 0
+        self.dropped = 0
+        self.last = 0
+        self.trouble = ""
+        self._store = store
+        self._clock = clock
+        self._queue: deque[Event] = deque()
+        self._capacity = capacity
+        self._reserve = reserve_bytes
+        self._on_trouble = on_trouble
+        self._on_written = on_written
+        self._lost = 0
+        """Dropped, and not yet on record."""
+
+    @property
+    def queued(self) -> int:
+        """Events that were noticed and are not in the store yet."""
+        return len(self._queue)
+
+    def observe(self, event: Event) -> None:
+        """Take an event. A full queue drops its oldest."""
+        if len(self._queue) >= self._capacity:
+            self._queue.popleft()
+            self.dropped += 1
+            self._lost += 1
+        self._queue.append(event)
+
+    async def run(self) -> None:
+        """Write what comes, for good. A store that refuses is tried again; nothing that it took is written twice."""
+        while True:
+            wait_ms = EVERY_MS
+            try:
+                await self.flush()
+            except Unreachable as e:
+                self._say(str(e))
+                wait_ms = RETRY_MS
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + wait_ms * NS_PER_MS)
+
+    async def flush(self) -> int:
+        """Write everything that is queued; how many events. Raises `Unreachable`, and keeps what was not written."""
+        done = 0
+        while self._queue or self._lost:
+            done += await self._write()
+        self._look_at_room()
+        return done
+
+    async def _write(self) -> int:
+        lost = self._lost
+        batch = [self._queue.popleft() for _ in range(min(BATCH, len(self._queue)))]
+        admitted = [Event(0, self._clock.utc_ns() // NS_PER_MS, Kind.LOSS, LOSS_NAME, lost)] if lost else []
+        writing = asyncio.ensure_future(self._store.append(self.origin, [*admitted, *batch]))
+        try:
+            self.last = await asyncio.shield(writing)
+        except asyncio.CancelledError:
+            with suppress(
+                Unreachable
+            ):  # it may be in the store or not: who is asked to stop looks, so that nothing is there twice
+                await writing
+                batch = []
+            self._give_back(batch)
+            raise
+        except Unreachable:
+            self._give_back(batch)
+            raise
+        self._lost -= lost
+        self.written += len(batch)
+        self._on_written(self.last)
+        return len(batch)
+
+    def _give_back(self, batch: list[Event]) -> None:
+        """Put events back in front; the oldest go when there came too many meanwhile."""
+        room = max(0, self._capacity - len(self._queue))
+        gone = max(0, len(batch) - room)
+        self.dropped += gone
+        self._lost += gone
+        self._queue.extendleft(reversed(batch[gone:]))
+
+    def _look_at_room(self) -> None:
+        room = self._store.room_bytes()
+        if room is not None and room < self._reserve:
+            self._say(f"the disk of the knowledge is almost full: {room >> 20} MiB left")
+        else:
+            self._say("")
+
+    def _say(self, text: str) -> None:
+        kind = text.partition(":")[0]
+        if kind != self.trouble.partition(":")[0]:
+            self._on_trouble(text)
+        self.trouble = text
+
+
+@dataclass
+class Known:
+    """What knowledge says was so at a time: the latest event of each tag and state machine, and how many events said so."""
+
+    latest: dict[str, Event] = field(default_factory=dict)
+    commands: list[Event] = field(default_factory=list)
+    events: int = 0
+    lost: int = 0
+
+    def learn(self, events: list[Event]) -> None:
+        """Take a block of events, in order."""
+        self.events += len(events)
+        if {event[2] for event in events} <= _SAYS_WHAT_IS:  # most blocks, and those of a day are many
+            self.latest.update(zip(map(_NAME_OF, events), events, strict=True))
+            return
+        for event in events:
+            if event.kind in _SAYS_WHAT_IS:
+                self.latest[event.name] = event
+            elif event.kind == Kind.COMMAND:
+                self.commands.append(event)
+            elif event.kind == Kind.LOSS and isinstance(event.value, int):
+                self.lost += event.value
+
+
+async def known_at(blocks: AsyncIterator[list[Event]]) -> Known:
+    """Replay blocks of events into what was known at their end."""
+    known = Known()
+    async for block in blocks:
+        known.learn(block)
+    return known

@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 
-from fieldtwin.checking.device_case import DeviceResult, Spoken
+from fieldtwin.checking.checked import Checked, shown
+from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.modbus_cases import CASES
 from fieldtwin.checking.modbus_learn import learn
 from fieldtwin.checking.modbus_wire import ModbusWire
@@ -47,15 +48,6 @@ class ModbusOptions:
     connector: Connector | None = None
     clock: Clock | None = None
     go_on: Callable[[], str] = lambda: ""
-
-
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """What the device says of itself, what was said before the first case, and the results."""
-
-    identity: dict[str, str]
-    results: list[DeviceResult]
-    before: tuple[Spoken, ...] = ()
 
 
 def traits_of(endpoint: Endpoint) -> frozenset[str]:
@@ -117,8 +109,3 @@ async def read_identity(wire: ModbusWire) -> dict[str, str]:
         identity["server id"] = shown(answer.pdu[2:]) or answer.pdu[2:].hex(" ").upper()
     await wire.settle()
     return identity
-
-
-def shown(raw: bytes) -> str:
-    """A device's text as it can be shown, at most 80 characters; empty where nothing can."""
-    return "".join(chr(b) for b in raw if 32 <= b < 127).strip()[:80]

@@ -22,7 +22,8 @@ from emulators.modbus.unit import ModbusUnit
 from emulators.virtual.clock import VirtualClock
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.ports import MemoryNet
-from fieldtwin.checking.modbus_session import Checked, ModbusOptions, check_modbus
+from fieldtwin.checking.checked import Checked
+from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
 from gateway.core.connection import ByteConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.nursery import Nursery

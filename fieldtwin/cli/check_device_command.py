@@ -19,8 +19,8 @@ from gateway.core.endpoint import Endpoint
 from gateway.core.errors import NotAllowed, UsageError
 
 if TYPE_CHECKING:
+    from fieldtwin.checking.checked import Checked
     from fieldtwin.checking.device_case import DeviceCase, DeviceResult
-    from fieldtwin.checking.modbus_session import Checked
     from fieldtwin.checking.run import Plan
     from fieldtwin.checking.subject import Subject
 

@@ -21,8 +21,8 @@ from fieldtwin.report.model import Verdict
 from gateway.core.connection import Direction
 
 if TYPE_CHECKING:
+    from fieldtwin.checking.checked import Checked
     from fieldtwin.checking.device_case import Spoken
-    from fieldtwin.checking.modbus_session import Checked
     from fieldtwin.conformance.case import About
     from fieldtwin.conformance.results import CaseResult
 

@@ -1,4 +1,4 @@
-"""`fieldtwin check modbus` on devices that we did not write: pymodbus's and libmodbus's servers get the verdicts that are known."""
+"""`fieldtwin check modbus` on devices that are not ours: pymodbus's and libmodbus's servers get the verdicts that are known."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from strangers import check_all, version_of
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.report.model import Verdict
 
-pytestmark = [pytest.mark.interop, pytest.mark.slow, pytest.mark.timeout(120)]
+pytestmark = [
+    pytest.mark.interop,
+    pytest.mark.slow,
+    pytest.mark.timeout(120),
+    pytest.mark.xdist_group("strange servers"),
+]
 KNOWN = tomllib.loads((Path(__file__).parent / "strangers.toml").read_text())
 WIRES = [(peer, wire) for peer in ("pymodbus", "libmodbus") for wire in KNOWN[peer]]
 _found: dict[tuple[str, str], list[DeviceResult]] = {}

@@ -17,6 +17,7 @@ from canopen_rows import Row, key_of, parse_frame
 from canopen_slave_rig import NODE, RICH
 
 from gateway.core.canframe import CanFrame
+from gateway.core.connection import CanConnection
 
 FILE = Path(__file__).parents[1] / "vectors" / "canopen_localnode.toml"
 DUMMIES = "".join(f"Dummy{n:04}={n // 5 % 2}\n" for n in range(1, 8))
@@ -62,9 +63,9 @@ def can_be_asked(row: Row) -> bool:
     return row.node_id == NODE and not row.options and all(event in EVENTS for event in events)
 
 
-def play_localnode(row: Row) -> str:
-    """What LocalNode does otherwise than the row says, '' when nothing."""
-    sheet = io.StringIO(RICH.replace("VendorNumber=\n", "VendorNumber=0\n").replace("Dummy0005=1\n", DUMMIES))
+def make_localnode(text: str = RICH) -> tuple[canopen.Network, canopen.LocalNode, SilentBus]:
+    """LocalNode with the rig's data sheet, on a bus of its own, PRE-OPERATIONAL."""
+    sheet = io.StringIO(text.replace("VendorNumber=\n", "VendorNumber=0\n").replace("Dummy0005=1\n", DUMMIES))
     sheet.name = "rig.eds"
     network, bus = canopen.Network(), SilentBus()
     network.bus = bus  # type: ignore[assignment]
@@ -72,6 +73,37 @@ def play_localnode(row: Row) -> str:
     network.add_node(node)
     node.nmt.state = "PRE-OPERATIONAL"
     bus.sent.clear()
+    return network, node, bus
+
+
+class LocalNodeOnBus:
+    """LocalNode behind a connection of ours. What it raises is what a thread of python-can would swallow: silence."""
+
+    def __init__(self, connection: CanConnection, text: str = RICH) -> None:
+        self._connection = connection
+        self._network, self._node, self._bus = make_localnode(text)
+        self.raised: list[str] = []
+
+    async def serve(self) -> None:
+        """Until cancelled or lost."""
+        try:
+            while True:
+                frame = await self._connection.recv()
+                if not frame.remote and not frame.extended:
+                    try:
+                        self._network.notify(frame.can_id, bytearray(frame.data), 0.0)
+                    except Exception as e:  # a stranger's fault is what is looked for
+                        self.raised.append(type(e).__qualname__)
+                for text in self._bus.sent:
+                    await self._connection.send(parse_frame(text))
+                self._bus.sent.clear()
+        finally:
+            self._network.bus = None
+
+
+def play_localnode(row: Row) -> str:
+    """What LocalNode does otherwise than the row says, '' when nothing."""
+    network, node, bus = make_localnode()
     try:
         for _, what in row.hear:
             step(network, node, what)

@@ -1,0 +1,58 @@
+"""What many CANopen cases ask: was it aborted with that code, is all well again; and objects that have what a case needs."""
+
+from __future__ import annotations
+
+from fieldtwin.checking.canopen_wire import CanopenWire, Key, Reply, mux, shown
+from fieldtwin.checking.device_case import NotHere
+from fieldtwin.conformance.case import Finding, failed, passed
+from gateway.protocols.canopen.abort_codes import UNKNOWN_SPECIFIER
+
+
+def aborted(reply: Reply, *codes: int) -> str:
+    """Empty if `reply` is an abort with one of `codes`, else what is wrong."""
+    if reply.abort and reply.abort in codes:
+        return ""
+    return f"{reply} instead of abort {' or '.join(f'{code:08X}' for code in codes)}"
+
+
+async def verdict(wire: CanopenWire, wrong: str, good: str = "") -> Finding:
+    """FAILED with what is wrong, or because the node does not go on afterwards; else passed."""
+    if wrong:
+        return failed(wrong)
+    after = await wire.still_good()
+    return failed(f"afterwards: {after}") if after else passed(good)
+
+
+async def must_abort(wire: CanopenWire, request: bytes, *codes: int) -> Finding:
+    """An SDO request that has to be aborted with one of `codes`; then the node goes on."""
+    reply = await wire.ask(request)
+    if reply.data and not reply.abort:
+        await wire.abandon((0x1000, 0))
+    return await verdict(wire, aborted(reply, *codes), str(reply) if reply.abort else "")
+
+
+async def long_object(wire: CanopenWire) -> Key:
+    """An object of two segments at least, of which the first reply was seen. Raises `NotHere`."""
+    if wire.long is None:
+        raise NotHere("no object of more than 7 bytes was found: 1008h, 1009h, 100Ah, and those of the EDS")
+    return wire.long
+
+
+async def begin_upload(wire: CanopenWire, key: Key) -> None:
+    """An upload that will take segments. Raises `NotHere` where it does not come to that."""
+    reply = await wire.ask(b"\x40" + mux(*key))
+    if reply.specifier != 2 or reply.data[0] & 2:
+        raise NotHere(f"{shown(key)} is not uploaded in segments: {reply}")
+
+
+async def present(wire: CanopenWire, key: Key) -> bytes:
+    """The object's value. Raises `NotHere` where there is none."""
+    value = await wire.upload(key)
+    if isinstance(value, Reply):
+        raise NotHere(f"{shown(key)}: {value}")
+    return value
+
+
+def lacks(reply: Reply) -> bool:
+    """Whether an abort says that there is no such service."""
+    return reply.abort in (UNKNOWN_SPECIFIER, 0x0601_0000, 0x0800_0000)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Collection
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -108,6 +109,7 @@ class PacketImport:
             for file in self._files:
                 for path in file.parts:
                     path.unlink(missing_ok=True)
+            self._bad.discard()
             raise
         finally:
             for file in self._files:
@@ -180,7 +182,8 @@ class PacketImport:
     def _header(self, endpoint: str) -> RecordingHeader:
         started = ""
         if self._zero_ns > NS_PER_S:
-            started = datetime.fromtimestamp(self._zero_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+            with suppress(ValueError, OverflowError, OSError):  # a time that no calendar has
+                started = datetime.fromtimestamp(self._zero_ns / NS_PER_S, UTC).isoformat(timespec="milliseconds")
         return RecordingHeader(
             version=1, device=f"imported/{self._out.stem}", kind="exchanges", source="imported", endpoint=endpoint,
             made_by=f"fieldtwin import {self._source.name}", start_utc=started,

@@ -31,6 +31,8 @@ from gateway.protocols.modbus.framings import framing_of
 
 CNV = (".cnv", ".cnv.gz", ".cnv.bz2")
 KINDS = ".pcap, .pcapng, .log (candump), .asc, .blf, .trc, .csv, .cnv, .txt (mbpoll, modpoll), a capture of fieldtwin's"
+_PACKETS = (".pcap", ".pcapng", ".cap", ".pcap.gz", ".pcapng.gz")
+_SUFFIXES = (*_PACKETS, ".log", *CAN_SUFFIXES, ".csv", ".tsv", ".jsonl")
 MAX_LINE = 65_536
 
 
@@ -56,8 +58,10 @@ def kind_of(path: Path) -> str:
         with path.open("rb") as file:
             head = file.read(512)
     except OSError as e:
+        if not name.endswith(_SUFFIXES):
+            raise UsageError(f"cannot import {path.name!r}", expected=KINDS) from e
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
-    if is_packet_file(head) or name.endswith((".pcap", ".pcapng", ".cap", ".pcap.gz", ".pcapng.gz")):
+    if is_packet_file(head) or name.endswith(_PACKETS):
         return "packets"
     if path.suffix.lower() in (".log", *CAN_SUFFIXES):
         return "can"
@@ -220,6 +224,12 @@ class BadFile:
     def __exit__(self, *_: object) -> None:
         if self._file is not None:
             self._file.close()
+
+    def discard(self) -> None:
+        """The recording was none: close and remove it."""
+        self.__exit__()
+        if self._file is not None:
+            self.path.unlink(missing_ok=True)
 
     def keep(self, bad: Bad, endpoint: str = "") -> None:
         """One more of them."""

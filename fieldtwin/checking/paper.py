@@ -1,6 +1,6 @@
-"""A check on paper: played on a device of ours in memory, in virtual time, to see what would be sent. Nothing is opened.
+"""A check on paper, `--dry-run`: played on a device of ours in memory, in virtual time, to see what would be sent.
 
-A real device that answers otherwise leads to other frames in places: what it says decides how a case goes on.
+Nothing is opened. A real device that answers otherwise leads to other frames in places: what it says decides how a case goes on.
 """
 
 from __future__ import annotations
@@ -11,6 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from emulators.canopen.dictionary import load_eds, parse_eds
+from emulators.canopen.node import CanopenNode
+from emulators.canopen.serve import serve_node
 from emulators.endpoints.ports import OnClient
 from emulators.modbus.ascii import AsciiSlave
 from emulators.modbus.bank import MapBank, Span
@@ -22,6 +25,7 @@ from emulators.modbus.unit import ModbusUnit
 from emulators.virtual.clock import VirtualClock
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.ports import MemoryNet
+from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
 from fieldtwin.checking.checked import Checked
 from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
 from gateway.core.connection import ByteConnection
@@ -78,3 +82,58 @@ def _streams(endpoint: Endpoint, units: dict[int, ModbusUnit], clock: VirtualClo
 
     served: Callable[[ByteConnection], Awaitable[None]] = serve
     return served
+
+
+# -- CANopen -----------------------------------------------------------------------------------------------------------
+
+
+def canopen_on_paper(options: CanopenOptions) -> Checked:
+    """The check as it goes with a node as the EDS describes it, or with one that has what the cases ask for."""
+    loop = VirtualLoop()
+
+    async def main() -> Checked:
+        net, clock = MemoryNet(loop), VirtualClock(loop)
+        sheet = load_eds(options.eds) if options.eds is not None else parse_eds(_sheet(options))
+        bus = await net.can_bus(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), options.bitrate or 125_000, paced=False)
+        use = replace(options, endpoint=str(bus.bound), connector=net, clock=clock)
+        try:
+            async with Nursery() as nursery:
+                node = CanopenNode(sheet, options.node)
+                nursery.start(serve_node(await bus.join("node on paper"), node, clock), "node on paper")
+                return await check_canopen(use)
+        finally:
+            await bus.aclose()
+
+    with asyncio.Runner(loop_factory=lambda: loop) as runner:
+        return runner.run(main())
+
+
+def _sheet(options: CanopenOptions) -> str:
+    """The data sheet of a node that has the objects that everybody has, and those that may be written, as numbers."""
+    text = "[DeviceInfo]\nVendorName=paper\n"
+    text += _var("1000", 7, "ro", "0x0") + _var("1001", 5, "ro", "0") + _var("1017", 6, "rw", "0")
+    text += _var("1008", 9, "const", "a node on paper")
+    text += "[1003]\nParameterName=1003\nObjectType=0x8\nSubNumber=2\n"
+    text += _var("1003sub0", 5, "rw", "0") + _var("1003sub1", 7, "ro", "0")
+    text += "[1010]\nParameterName=1010\nObjectType=0x8\nSubNumber=2\n"
+    text += _var("1010sub0", 5, "ro", "1") + _var("1010sub1", 7, "rw", "1")
+    text += "[1018]\nParameterName=1018\nObjectType=0x9\nSubNumber=5\n" + _var("1018sub0", 5, "ro", "4")
+    text += "".join(_var(f"1018sub{sub}", 7, "ro", "0") for sub in range(1, 5))
+    for index in sorted(
+        {index for index, _ in options.may_write} - {0x1000, 0x1001, 0x1003, 0x1008, 0x1010, 0x1017, 0x1018}
+    ):
+        subs = {sub for at, sub in options.may_write if at == index}
+        if subs == {0}:
+            text += _var(f"{index:04X}", 7, "rw", "0")
+        else:
+            text += f"[{index:04X}]\nParameterName={index:04X}\nObjectType=0x9\nSubNumber={max(subs) + 1}\n"
+            text += _var(f"{index:04X}sub0", 5, "ro", str(max(subs)))
+            text += "".join(_var(f"{index:04X}sub{sub:X}", 7, "rw", "0") for sub in range(1, max(subs) + 1))
+    return text
+
+
+def _var(section: str, data_type: int, access: str, default: str) -> str:
+    return (
+        f"[{section}]\nParameterName={section}\nObjectType=0x7\nDataType=0x{data_type:04X}\nAccessType={access}\n"
+        f"DefaultValue={default}\nPDOMapping=0\n"
+    )

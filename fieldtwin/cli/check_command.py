@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fieldtwin.cli.check_device_command import modbus
+from fieldtwin.cli.check_device_command import canopen, modbus
 from fieldtwin.cli.options import Duration, json_option
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
@@ -339,3 +339,4 @@ def _held(texts: tuple[str, ...]) -> dict[tuple[Table, int], int]:
 
 
 command.add_command(modbus)
+command.add_command(canopen)

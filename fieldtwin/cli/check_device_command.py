@@ -31,6 +31,7 @@ MEANS = {
 }
 FILE = click.Path(dir_okay=False, path_type=Path)
 _CELL = re.compile(r"^(holding|coil|input|discrete):(\d{1,5})(?:\+(\d{1,3}))?$")
+_OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -213,6 +214,76 @@ def modbus(
         lambda taps, go_on, say, tell: check_modbus(replace(to_do, taps=taps, go_on=go_on), say, tell),
     )  # fmt: skip
     return check.done(check.subject(checked, plan, began, writes, timeout_s), checked, CASES)
+
+
+@click.command("canopen")
+@click.argument("endpoint", required=False)
+@click.option("--node", type=click.IntRange(1, 127), help="The node id.")
+@click.option(
+    "--eds",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Its data sheet, EDS or DCF: for limits and access.",
+)
+@click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="bit/s, where the bus does not know it.")
+@click.option(
+    "--write", "writes", multiple=True, metavar="INDEX:SUB",
+    help="An object that may be written, such as 2000:00 or 1017:00; what was there is put back. Repeatable.",
+)  # fmt: skip
+@click.option("--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="For each SDO reply.")
+@click.option(
+    "--boot", "boot_s", type=Duration(), default="10s", show_default=True, help="For a boot-up after a reset."
+)
+@shared
+def canopen(
+    endpoint: str | None,
+    node: int | None,
+    eds: Path | None,
+    bitrate: int | None,
+    writes: tuple[str, ...],
+    timeout_s: float,
+    boot_s: float,
+    **options: Any,
+) -> int:
+    """Judge a CANopen node from outside: the rows of the catalogue that a master can ask for.
+
+    \b
+    fieldtwin check canopen can:socketcan/can0 --node 5 --eds inclinometer.eds
+    fieldtwin check canopen can:fieldtwin/127.0.0.1:29536 --node 5 --write 2000:00 --html node5.html
+
+    Uploads only, unless told otherwise. Exit code 0 when cases passed and none failed.
+    """
+    from fieldtwin.checking.canopen_cases import CASES
+    from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
+
+    if options["list_only"]:
+        return _list(CASES, options["as_json"])
+    if not endpoint or node is None:
+        raise UsageError("no node to check", expected="an endpoint such as can:socketcan/can0, and --node")
+    if not Endpoint.parse(endpoint).is_can:
+        raise UsageError("CANopen is spoken on a CAN bus", expected="such as can:socketcan/can0", got=endpoint)
+    may_write = tuple(_object(text) for text in writes)
+    check = Check("canopen", endpoint, node, options)
+    has = ({"object"} if may_write else set()) | ({"eds"} if eds is not None else set())
+    plan = check.plan(CASES, has, bool(writes))
+    to_do = CanopenOptions(endpoint, node, plan, bitrate or 0, timeout_s, 1 / options["rate"], boot_s, eds, may_write)
+    if options["dry_run"]:
+        from fieldtwin.checking.paper import canopen_on_paper
+
+        return check.on_paper(canopen_on_paper(to_do))
+    check.ask(CASES, plan, frozenset({"can"}))
+    began = datetime.now(UTC)
+    checked = played(
+        len([c for c in CASES if c.chosen(plan.only)]), options["log_path"], check.words,
+        lambda taps, go_on, say, tell: check_canopen(replace(to_do, taps=taps, go_on=go_on), say, tell),
+    )  # fmt: skip
+    return check.done(check.subject(checked, plan, began, writes, timeout_s), checked, CASES)
+
+
+def _object(text: str) -> tuple[int, int]:
+    match = _OBJECT.match(text)
+    if not match:
+        raise UsageError("an object", expected="index and subindex in hex, such as 2000:00", got=repr(text))
+    return int(match[1], 16), int(match[2] or "0", 16)
 
 
 def played(

@@ -130,7 +130,7 @@ def print_paper(checked: Checked, *, as_json: bool) -> None:
         _print_sent(_sent(r.spoken))
     talk.print(
         f"{len(played)} cases. The usual read stands before each as well. As a device answers that does all it must; "
-        "another leads to other frames in places.", markup=False,
+        "another leads to other frames in places.", markup=False, soft_wrap=True,
     )  # fmt: skip
 
 

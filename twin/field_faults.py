@@ -5,7 +5,6 @@ A plant has none of this. Whoever asks is `fieldtwin run --faults`, a scenario, 
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any
@@ -17,16 +16,16 @@ from emulators.endpoints.faulty_udp import FaultyDatagrams
 from emulators.endpoints.ports import Datagrams
 from emulators.faults.can_fault import BusFault
 from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active, Aim, Fault, Kind, ValueFault
+from emulators.faults.fault import Active, Aim, ValueFault
 from emulators.faults.frames import Framing
-from emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, parse_fault
+from emulators.faults.schema import FaultSpec, parse_fault
 from emulators.faults.set_value import Form, SetValue
 from emulators.wires.can_faults import Rule
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, CanConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
-from gateway.core.profile import Tag
+from twin.fault_aims import tag_of, target
 from twin.system import System
 
 MOST = 1_000
@@ -84,22 +83,21 @@ class FieldFaults:
         if len(self._active) >= MOST:
             raise UsageError("too many faults at once", expected=f"at most {MOST}")
         fault = spec.make()
-        bus = self._bus_of(spec, fault)
-        addresses, functions = self._addresses(spec)
+        at = target(self._system, spec)
         until_ns = None if spec.until_s is None else self.start_ns + round(spec.until_s * NS_PER_S)
         active = Active(
             spec.id,
             fault,
-            self._aim(spec),
+            at.aim,
             Random(f"{self._seed} {spec.id}"),
             self.start_ns + round(spec.from_s * NS_PER_S),
             until_ns,
-            units=self._units(spec),
-            addresses=addresses,
-            functions=functions,
+            units=at.units,
+            addresses=at.addresses,
+            functions=at.functions,
         )
-        self._put(spec, active, bus)
-        self._active[spec.id] = (spec, active, bus)
+        self._put(spec, active, at.bus)
+        self._active[spec.id] = (spec, active, at.bus)
         return spec.id
 
     def _put(self, spec: FaultSpec, active: Active, bus: str) -> None:
@@ -136,7 +134,7 @@ class FieldFaults:
 
     def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
         """From now on the device holds `value` for `tag`; None: what it says by itself again."""
-        found = self._tag(device, tag)
+        found = tag_of(self._system, device, tag)
         distortions = self._distortions.get(device)
         if distortions is None or found.is_text:
             raise UsageError(f"{device}.{tag} cannot be set", expected="a number of a device that is emulated here")
@@ -156,70 +154,6 @@ class FieldFaults:
             {"id": id, "name": spec.kind.name, "bus": bus, "device": spec.aim.device, "struck": active.struck}
             for id, (spec, active, bus) in self._active.items()
         ]
-
-    # -- aiming ---------------------------------------------------------------------------------------------------------
-
-    def _bus_of(self, spec: FaultSpec, fault: Fault) -> str:
-        aim = spec.aim
-        if aim.device:
-            self._known("device", aim.device, list(self._system.devices))
-            bus = self._system.devices[aim.device].bus
-        elif aim.bus:
-            self._known("bus", aim.bus, list(self._system.buses))
-            bus = aim.bus
-        else:
-            raise UsageError(f"fault {spec.kind.name} aims at nothing", expected="device: NAME, or bus: NAME")
-        if fault.kind is Kind.VALUE:
-            if not aim.device:
-                raise UsageError(f"fault {spec.kind.name} is one of a device", expected="device: NAME")
-            if aim.register_:
-                self._tag(aim.device, aim.register_)
-            return bus
-        is_can = self._system.buses[bus].endpoint.is_can
-        if is_can != (fault.kind is Kind.CAN):
-            raise UsageError(f"fault {spec.kind.name} is for {fault.kind.value}", got=f"bus {bus!r}")
-        return bus
-
-    def _units(self, spec: FaultSpec) -> tuple[int, ...]:
-        if spec.aim.unit is not None:
-            return (spec.aim.unit,)
-        return (self._system.devices[spec.aim.device].address,) if spec.aim.device else ()
-
-    def _aim(self, spec: FaultSpec) -> Aim:
-        """A tag of a CANopen device is its object."""
-        aim = spec.aim
-        if spec.kind.kind is not Kind.CAN or not aim.register_:
-            return aim
-        if not aim.device:
-            raise UsageError("a register is one of a device", expected="device: NAME")
-        at = self._tag(aim.device, aim.register_).object
-        return aim if at is None else aim.model_copy(update={"index": at[0]})
-
-    def _addresses(self, spec: FaultSpec) -> tuple[range | None, frozenset[int]]:
-        """Of Modbus: which addresses are meant, and the functions of their table."""
-        aim = spec.aim
-        if spec.kind.kind is not Kind.BYTES:
-            return None, frozenset()
-        if aim.register_:
-            if not aim.device:
-                raise UsageError("a register is one of a device", expected="device: NAME")
-            at = self._tag(aim.device, aim.register_).registers
-            return range(at.address, at.end), FUNCTIONS_OF[at.table]
-        return (None, frozenset()) if aim.address is None else addressed(aim.address)
-
-    def _tag(self, device: str, tag: str) -> Tag:
-        self._known("device", device, list(self._system.devices))
-        tags = self._system.devices[device].profile.tags
-        self._known(f"tag of {device}", tag, list(tags))
-        return tags[tag]
-
-    @staticmethod
-    def _known(what: str, name: str, known: list[str]) -> None:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-            raise UsageError(
-                f"no {what} {name!r}", expected=", ".join(known), hint=f"did you mean {near[0]!r}?" if near else ""
-            )
 
 
 def framing_of(endpoint: Endpoint) -> Framing:

@@ -9,24 +9,31 @@ from typing import Any
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active, Kind
 from emulators.faults.frames import Framing
-from emulators.faults.schema import addressed, parse_fault
+from emulators.faults.schema import FaultSpec, WrongAim, addressed, parse_fault
 from gateway.core.clock import NS_PER_S
-from gateway.core.errors import UsageError
+
+
+def check_link(spec: FaultSpec) -> None:
+    """Raises `WrongAim` for what needs a system file: devices, registers by name, CAN, values."""
+    aim = spec.aim
+    if spec.kind.kind is not Kind.BYTES:
+        raise WrongAim(
+            "name", f"fault {spec.kind.name} is for {spec.kind.kind.value}", expected="one of a line or socket"
+        )
+    for key, name in (("device", aim.device), ("bus", aim.bus), ("register", aim.register_)):
+        if name:
+            raise WrongAim(key, f"fault {spec.id}: a link knows no names", expected="unit, function, address")
+    if aim.address is not None:
+        addressed(aim.address)
 
 
 def wire_faults(said: Iterable[Mapping[str, Any]], framing: Framing, seed: int, start_ns: int) -> WireFaults:
-    """The faults, all put in; their times count from `start_ns`. Raises `UsageError` for what needs a system file: devices,
-    registers by name, CAN, values."""
+    """The faults, all put in; their times count from `start_ns`. Raises as `check_link`."""
     faults = WireFaults(framing)
     for number, one in enumerate(said, 1):
         spec = parse_fault(dict(one), number=number)
+        check_link(spec)
         aim = spec.aim
-        if spec.kind.kind is not Kind.BYTES:
-            raise UsageError(
-                f"fault {spec.kind.name} is for {spec.kind.kind.value}", expected="one of a line or socket"
-            )
-        if aim.device or aim.bus or aim.register_:
-            raise UsageError(f"fault {spec.id}: a link knows no names", expected="unit, function, address")
         addresses, functions = (None, frozenset[int]()) if aim.address is None else addressed(aim.address)
         until_ns = None if spec.until_s is None else start_ns + round(spec.until_s * NS_PER_S)
         faults.put_in(

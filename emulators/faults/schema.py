@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,16 @@ _NOT_OF = {
     Kind.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until"},
 }
 """What of an aim means nothing to a kind of fault."""
+
+
+class WrongAim(UsageError):
+    """An aim that cannot be meant; `key` is the key of the fault that says it."""
+
+    def __init__(self, key: str, message: str, *, expected: str = "", got: str = "", hint: str = "") -> None:
+        super().__init__(message, expected=expected, got=got, hint=hint)
+        self.key = key
+
+
 _DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|min|h)?$")
 _UNIT_S = {"ms": 0.001, "s": 1.0, "": 1.0, "min": 60.0, "h": 3600.0}
 MOST = 10_000
@@ -91,7 +102,10 @@ def parse_fault(
     except ValidationError as e:
         first = e.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else ""
-        raise wrong(key, f"{key}: {first['msg']}", got=repr(first["input"])[:60]) from e
+        words = re.findall(r"'([^']+)'", str(first.get("ctx", {}).get("expected", "")))
+        near = difflib.get_close_matches(str(first["input"]), words, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else ""
+        raise wrong(key, f"{key}: {first['msg']}", got=repr(first["input"])[:60], hint=hint) from e
 
     def time(key: str, value: str | float | int) -> float:
         try:
@@ -106,8 +120,12 @@ def parse_fault(
     return FaultSpec(str(said.get("id") or f"{name}-{number}"), kind, aim, parameters, from_s, until_s)
 
 
-def load_faults(path: Path) -> tuple[dict[str, Any], ...]:
-    """The faults of a file, checked, as they were said, each with an id. Raises `FileInvalid`."""
+Check = Callable[[FaultSpec], object]
+"""Raises `WrongAim` for a fault that cannot be where it is to be put in."""
+
+
+def load_faults(path: Path, check: Check | None = None) -> tuple[dict[str, Any], ...]:
+    """The faults of a file, checked, as they were said, each with an id. Raises `FileInvalid` at its spot."""
     file = load(path)
     for key in file.data:
         if key != "faults":
@@ -120,10 +138,21 @@ def load_faults(path: Path) -> tuple[dict[str, Any], ...]:
     found: dict[str, dict[str, Any]] = {}
     for n, one in enumerate(said):
         spec = parse_fault(one, file, ("faults", n), n + 1)
+        if check is not None:
+            checked(check, spec, file, ("faults", n))
         if spec.id in found:
             raise file.error(("faults", n, "id"), f"the id {spec.id!r} stands twice")
         found[spec.id] = {**one, "id": spec.id}
     return tuple(found.values())
+
+
+def checked(check: Check, spec: FaultSpec, file: YamlFile, loc: tuple[Key, ...]) -> None:
+    """Raises `FileInvalid` where `check` says that the aim is wrong."""
+    try:
+        check(spec)
+    except WrongAim as e:
+        at = (*loc, e.key) if (*loc, e.key) in file.positions else loc
+        raise file.error(at, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
 
 
 FUNCTIONS_OF = {
@@ -136,12 +165,12 @@ FUNCTIONS_OF = {
 
 
 def addressed(address: str | int) -> tuple[range, frozenset[int]]:
-    """The PDU address that ``0x10`` or ``holding:0x10`` is, and the functions of its table. Raises `UsageError`."""
+    """The PDU address that ``0x10`` or ``holding:0x10`` is, and the functions of its table. Raises `WrongAim`."""
     table, _, number = str(address).rpartition(":")
     try:
         at = int(number, 0)
     except ValueError:
         at = -1
     if not 0 <= at <= 0xFFFF or (table and table not in FUNCTIONS_OF):
-        raise UsageError("an address", expected="a number, or holding:0x10", got=repr(address))
+        raise WrongAim("address", "an address", expected="a number, or holding:0x10", got=repr(address))
     return range(at, at + 1), FUNCTIONS_OF.get(table, frozenset())

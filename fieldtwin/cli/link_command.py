@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from emulators.faults.frames import Framing
-from emulators.faults.on_link import wire_faults
+from emulators.faults.on_link import check_link, wire_faults
 from emulators.faults.schema import load_faults
 from emulators.link import run_link
 from fieldtwin.cli.talk import talk
@@ -47,7 +47,7 @@ def command(near: str, far: str, faults_file: str | None, framing: str, seed: in
     fieldtwin link --faults noisy.yaml /tmp/line1 tcp://plc:4001     the same, with what goes wrong on lines
     """
     ends = _endpoint(near), _endpoint(far)
-    faults = load_faults(Path(faults_file)) if faults_file else ()
+    faults = load_faults(Path(faults_file), check_link) if faults_file else ()
     return asyncio.run(_run(*ends, faults, Framing(framing), seed))
 
 

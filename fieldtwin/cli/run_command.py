@@ -173,17 +173,20 @@ def command(
         commands=parse_periods(commands) if commands is not None else DEFAULT_SCRIPT,
         capture=Path(capture) if capture else None,
         cold=cold,
-        faults=_faults(faults) if faults else (),
+        faults=_faults(faults, system, profiles) if faults else (),
     )
     return asyncio.run(_run(options, as_json))
 
 
-def _faults(path: str) -> tuple[dict[str, Any], ...]:
+def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
     from emulators.faults.schema import load_faults
+    from twin.fault_aims import target
+    from twin.system import load_system
 
     if path == "random":
         raise UsageError("random faults go with --virtual")
-    return load_faults(Path(path))
+    aimed_at = load_system(system, [Path(p) for p in profiles])
+    return load_faults(Path(path), lambda spec: target(aimed_at, spec))
 
 
 class VirtualRequest(NamedTuple):
@@ -215,7 +218,9 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | 
         speed=request.speed,
         commands=parse_periods(request.commands) if request.commands is not None else DEFAULT_SCRIPT,
         trace=Path(request.trace) if request.trace else None,
-        faults=_faults(request.faults) if request.faults not in ("", "random") else (),
+        faults=_faults(request.faults, request.system, request.profiles)
+        if request.faults not in ("", "random")
+        else (),
         random_faults=request.faults == "random",
     )
     if not seeds:

@@ -9,11 +9,12 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from emulators.faults.schema import parse_fault, seconds
+from emulators.faults.schema import checked, parse_fault, seconds
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.expression import Expression
 from gateway.core.errors import UsageError
 from gateway.core.yaml_file import Key, YamlFile, load, validate
+from twin.fault_aims import target
 from twin.system import System, load_system
 
 Time = str | float | int
@@ -176,8 +177,13 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
                 scenario.expression(one.unless, "never", n, "unless")
             never.append(one)
     scenario = Scenario(path, form, file, system, scenario.needs, always, tuple(never))
+    faults: list[str] = []
     for n, step in enumerate(form.steps):
         _check_step(scenario, step, n)
+        if step.fault is not None:
+            faults.append(str(step.fault.get("id", f"step {n + 1}")))
+        if step.clear is not None:
+            _known(file, ("steps", n, "clear"), "fault of a step before", step.clear, faults)
     return scenario
 
 
@@ -204,10 +210,7 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
     try:
         if step.fault is not None:
             spec = parse_fault(step.fault, file, (*loc, "fault"), n + 1)
-            for word, name in (("device", spec.aim.device), ("bus", spec.aim.bus)):
-                known = list(scenario.system.devices if word == "device" else scenario.system.buses)
-                if name:
-                    _known(file, (*loc, "fault", word), word, name, known)
+            checked(lambda one: target(scenario.system, one), spec, file, (*loc, "fault"))
         if step.wait is not None:
             scenario.expression(step.wait.until, *loc, "wait", "until")
             seconds(step.wait.within)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,8 @@ from emulators.faults.registry import FAULTS
 from emulators.faults.schema import load_faults, parse_fault, seconds
 from fieldtwin.cli.faults_command import command
 from gateway.core.errors import FileInvalid, UsageError
+from twin.fault_aims import target
+from twin.system import load_system
 
 
 @pytest.mark.parametrize(
@@ -100,3 +103,34 @@ def test_they_are_listed() -> None:
     refused = CliRunner().invoke(command, ["dely"])
     assert isinstance(refused.exception, UsageError)
     assert refused.exception.hint == "did you mean 'delay'?"
+
+
+@pytest.mark.parametrize(
+    ("said", "told", "column"),
+    [
+        ("{name: silence, device: ctb}", "did you mean 'ctd'", 21),
+        ("{name: silence, bus: lam}", "did you mean 'lan'", 21),
+        ("{name: silence, device: ctd, bus: lan}", "ctd is on another bus; expected line1; got lan", 34),
+        ("{name: silence, device: ctd, register: presure}", "did you mean 'pressure'", 34),
+        ("{name: silence, bus: lan, register: pressure}", "a register is one of a device", 31),
+        ("{name: silence}", "aims at nothing", 6),
+        ("{name: corrupt-crc, device: inclinometer}", "for serial lines and sockets; got bus 'can0'", 6),
+        ("{name: bus-off, device: ctd}", "for CAN buses", 6),
+        ("{name: stuck, bus: lan}", "unknown key 'bus' in fault stuck", 19),
+        ("{name: stuck, device: ctd, register: serial}", "ctd.serial is no number", 32),
+        ("{name: drop, device: ctd, address: 'holdng:3'}", "holding:0x10", 31),
+        ("{name: drop, device: ctd, direction: replly}", "did you mean 'reply'", 31),
+        ("{name: drop, device: ctd, unti: 5s}", "did you mean 'until'", 31),
+        ("{name: drop, device: ctd, until: soon}", "5s, 250ms, 2min or 24h", 31),
+    ],
+)
+def test_what_a_system_cannot_suffer_is_refused_where_it_stands(
+    tmp_path: Path, said: str, told: str, column: int
+) -> None:
+    system = load_system("observatory")
+    path = tmp_path / "f.yaml"
+    path.write_text(f"faults:\n  - {said}\n")
+    with pytest.raises(FileInvalid, match=re.escape(told)) as e:
+        load_faults(path, lambda spec: target(system, spec))
+    assert e.value.line == 2
+    assert abs(e.value.column - column) <= 5

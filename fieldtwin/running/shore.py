@@ -121,7 +121,7 @@ class Shore:
         start_ns = self._clock.monotonic_ns()
         while not self._halted:
             now_ns = self._clock.monotonic_ns()
-            while commands and now_ns - start_ns >= commands[0].at_s * NS_PER_S:
+            while commands and now_ns - start_ns >= round(commands[0].at_s * NS_PER_S):  # else less than 1 ns may be left
                 self.send(commands.popleft().period_s)
             for response in self._inbox.drain():
                 self.responses_received += 1

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+
 SHORT = ["--prototype", "--virtual", "--for", "20s", "--json"]
 
 
@@ -74,3 +76,12 @@ def test_what_makes_no_sense_is_refused(words: list[str], told: str) -> None:
     result = CliRunner().invoke(command, ["observatory", *words])
     assert isinstance(result.exception, UsageError)
     assert told in str(result.exception)
+
+
+def test_a_command_that_is_due_between_two_instants_is_sent() -> None:
+    """0.1 x 3 s is a little more than 0.3 s: less than a nanosecond was waited for without end."""
+    made = VirtualRun(VirtualOptions("observatory", 3.0, commands=(1, 2, 0, -1)))
+    made.run()
+    assert made.errors == []
+    assert made.shore is not None
+    assert made.shore.commands_sent == [1, 2, 0, -1]

@@ -46,7 +46,7 @@ class Abort(IntEnum):
     NO_DATA = 0x08000024
 
 
-_MEANING = {
+MEANINGS = {
     Abort.TOGGLE: "toggle bit not alternated",
     Abort.TIMEOUT: "SDO protocol timed out",
     Abort.COMMAND: "command specifier not valid or unknown",
@@ -83,7 +83,7 @@ _MEANING = {
 
 def abort(index: int, subindex: int, code: Abort) -> SdoAborted:
     """The error that refuses access to an object, for ``raise abort(...)``."""
-    return SdoAborted(index, subindex, int(code), _MEANING[code], where="emulated node")
+    return SdoAborted(index, subindex, int(code), MEANINGS[code], where="emulated node")
 
 
 def abort_frame(error: SdoAborted) -> bytes:

@@ -10,6 +10,20 @@ from emulators.faults.fault import Outcome, Parameters, WireFault, passed
 from emulators.faults.frames import Frame
 from emulators.faults.remake import remade
 
+CODES = {
+    1: "illegal function",
+    2: "illegal data address",
+    3: "illegal data value",
+    4: "server device failure",
+    5: "acknowledge: it takes longer",
+    6: "server device busy",
+    7: "negative acknowledge (older devices)",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target device failed to respond",
+}
+"""APP V1.1b3, 7. Others are the vendor's own."""
+
 
 class Form(Parameters):
     code: int = Field(default=4, ge=1, le=255)
@@ -19,6 +33,7 @@ class ExceptionReply(WireFault):
     name = "exception"
     summary = "the reply is exception `code` (APP V1.1b3, 7)"
     form = Form
+    codes = CODES
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
         if not frame.pdu:

@@ -7,7 +7,7 @@ out. It never opens, waits or reads a clock.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from random import Random
@@ -116,6 +116,8 @@ class Fault(ABC):
     form: ClassVar[type[Parameters]] = Nothing
     ways: ClassVar[frozenset[Way]] = frozenset((Way.REPLY,))
     """Which way it strikes where its aim does not say."""
+    codes: ClassVar[Mapping[int, str]] = {}
+    """What the standard knows for its parameter `code`."""
 
     def __init__(self, parameters: Parameters) -> None:
         self.parameters: Any = parameters

@@ -6,6 +6,7 @@ from random import Random
 
 from pydantic import Field
 
+from emulators.canopen.aborts import MEANINGS
 from emulators.faults.can_fault import SDO_REPLY, CanFault, CanPiece
 from emulators.faults.fault import Parameters
 from gateway.core.canframe import CanFrame
@@ -19,6 +20,7 @@ class SdoAbort(CanFault):
     name = "sdo-abort"
     summary = "the node answers SDO requests with abort `code` (CiA 301, 7.2.4.3.17)"
     form = Form
+    codes = {int(code): text for code, text in MEANINGS.items()}  # noqa: RUF012  the class says so
 
     def __init__(self, parameters: Parameters) -> None:
         super().__init__(parameters)

@@ -18,7 +18,7 @@ from fieldtwin.cli.talk import data
 @click.argument("names", nargs=-1)
 @json_option
 def command(names: tuple[str, ...], as_json: bool) -> int:
-    """List the faults, or say all of NAMES.
+    """List the faults, or say all of NAMES: of `exception` and `sdo-abort` the codes that the standards know as well.
 
     A fault file is `faults: [{name: silence, device: ctd, from: 5s, until: 12s}]`, for `fieldtwin run --prototype --faults
     FILE` and `fieldtwin link --faults FILE`. What every fault takes: id, bus or device, unit, function, address or register,
@@ -38,7 +38,7 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
         table.add_column()
         for d in described:
             if d["on"] == on:
-                table.add_row(d["name"], _told(d))
+                table.add_row(d["name"], _told(d, codes=bool(names)))
         data.print(table)
         data.print()
     return 0
@@ -56,12 +56,18 @@ def _described(kind: type[Fault]) -> dict[str, Any]:
         "summary": kind.summary,
         "direction": ways,
         "parameters": own,
+        **({"codes": {_code(code): text for code, text in kind.codes.items()}} if kind.codes else {}),
     }
 
 
-def _told(described: dict[str, Any]) -> str:
+def _told(described: dict[str, Any], *, codes: bool) -> str:
     own = ", ".join(f"{name}: {_number(p['default'])}" for name, p in described["parameters"].items())
-    return f"{described['summary']}" + (f" [dim]({own})[/dim]" if own else "")
+    known = "".join(f"\n{code}  {text}" for code, text in described.get("codes", {}).items()) if codes else ""
+    return f"{described['summary']}" + (f" [dim]({own})[/dim]" if own else "") + known
+
+
+def _code(code: int) -> str:
+    return f"0x{code:08X}" if code > 0xFF else str(code)
 
 
 def _number(value: float | str) -> str:

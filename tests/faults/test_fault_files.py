@@ -100,6 +100,8 @@ def test_they_are_listed() -> None:
         "exclusiveMinimum": 0,
         "maximum": 600_000,
     }
+    (abort,) = json.loads(CliRunner().invoke(command, ["sdo-abort", "--json"]).stdout)
+    assert abort["codes"]["0x06020000"] == "object does not exist"
     refused = CliRunner().invoke(command, ["dely"])
     assert isinstance(refused.exception, UsageError)
     assert refused.exception.hint == "did you mean 'delay'?"

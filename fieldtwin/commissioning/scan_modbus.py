@@ -14,6 +14,7 @@ from fieldtwin.commissioning import settings as plan
 from fieldtwin.commissioning.alike import SPREAD, Alike, likeness, spread_over
 from fieldtwin.commissioning.listening import Audition, LineVerdict, dwell_over, judge, siblings, worth_hearing
 from fieldtwin.commissioning.live import bytes_at
+from fieldtwin.commissioning.progress import Progress
 from fieldtwin.commissioning.settings import Pace, Step
 from fieldtwin.commissioning.sweep import Send, UnitAnswer, UnitSweep
 from fieldtwin.commissioning.traffic import Heard, LineEar
@@ -76,17 +77,6 @@ class ModbusScan:
     @property
     def sent(self) -> bool:
         return self.asked > 0
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """Where a scan is: a phase in words, and seconds of it by the estimate (`total_s` 0: not known)."""
-
-    phase: str
-    done_s: float
-    total_s: float
-    detail: str = ""
-    found: int = 0
 
 
 class ModbusScanner:

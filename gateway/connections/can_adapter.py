@@ -30,7 +30,7 @@ SEND_TIMEOUT_S = 2.0
 _OWN = frozenset({"bitrate", "listen"})
 """Parameters of the endpoint that are read here; others are the driver's (``?app_name=CANalyzer``)."""
 
-_RATELESS = frozenset({"virtual", "udp_multicast"})
+RATELESS = frozenset({"virtual", "udp_multicast"})
 """Interfaces without a bit rate."""
 
 
@@ -162,7 +162,7 @@ def _bitrate(endpoint: Endpoint, asked: int) -> int:
     if said and asked and said != asked:
         raise UsageError(f"{endpoint}: two bit rates", expected=f"{asked} bit/s", got=f"{said} bit/s")
     rate = said or asked
-    if not rate and endpoint.interface not in _RATELESS:
+    if not rate and endpoint.interface not in RATELESS:
         raise UsageError(
             f"{endpoint}: an adapter needs the bit rate of its bus",
             expected="?bitrate=250000 behind the channel",
@@ -177,7 +177,7 @@ def _words(endpoint: Endpoint, rate: int) -> dict[str, Any]:
         known = sorted(set(can.VALID_INTERFACES) | {"socketcan", "fieldtwin"})
         raise UsageError(f"{endpoint}: unknown kind of CAN interface {endpoint.interface!r}", expected=", ".join(known))
     words: dict[str, Any] = {k: _typed(v) for k, v in endpoint.params if k not in _OWN}
-    if rate and endpoint.interface not in _RATELESS:
+    if rate and endpoint.interface not in RATELESS:
         words["bitrate"] = rate
     listen = endpoint.param("listen", "0")
     if listen not in ("0", "1"):

@@ -19,7 +19,9 @@ _RTM_NEWLINK, _RTM_GETLINK = 16, 18
 _NLM_F_REQUEST = 1
 _IFLA_LINKINFO = 18
 _IFLA_INFO_KIND, _IFLA_INFO_DATA = 1, 2
-_IFLA_CAN_BITTIMING = 1
+_IFLA_CAN_BITTIMING, _IFLA_CAN_STATE, _IFLA_CAN_CTRLMODE, _IFLA_CAN_BERR_COUNTER = 1, 4, 5, 8
+_CTRLMODE_LISTENONLY = 0x02
+_STATES = ("error-active", "error-warning", "error-passive", "bus-off", "stopped", "sleeping")
 _ARPHRD_CAN = 280
 _IFF_UP = 1
 _TIMEOUT_S = 1.0
@@ -36,6 +38,13 @@ class CanLink:
     is_up: bool
     kind: str
     bitrate: int
+    listen_only: bool = False
+    """The controller does not even acknowledge."""
+    state: str = ""
+    """The controller's: ``error-active``, ``error-passive``, ``bus-off``...; empty where it has none."""
+    tx_errors: int = 0
+    rx_errors: int = 0
+    """The controller's error counters (ISO 11898-1, 12.1.4), 0 where the driver does not tell them."""
 
 
 def query_link(name: str) -> CanLink:
@@ -59,9 +68,24 @@ def read_link(answer: bytes) -> CanLink:
     _, link_type, _, flags, _ = _LINK.unpack_from(answer, _MESSAGE.size)
     info = dict(_attributes(dict(_attributes(answer[_MESSAGE.size + _LINK.size : length])).get(_IFLA_LINKINFO, b"")))
     kind = info.get(_IFLA_INFO_KIND, b"").rstrip(b"\0").decode("ascii", "replace")
-    timing = dict(_attributes(info.get(_IFLA_INFO_DATA, b""))).get(_IFLA_CAN_BITTIMING, b"") if "can" in kind else b""
-    bitrate = int.from_bytes(timing[:4], "little" if struct.pack("=H", 1)[0] else "big")  # can_bittiming.bitrate
-    return CanLink(link_type == _ARPHRD_CAN, bool(flags & _IFF_UP), kind, bitrate)
+    data = dict(_attributes(info.get(_IFLA_INFO_DATA, b""))) if "can" in kind else {}
+    state = _number(data.get(_IFLA_CAN_STATE, b""), 4)
+    has_state = _IFLA_CAN_STATE in data and state < len(_STATES)
+    counters = data.get(_IFLA_CAN_BERR_COUNTER, b"")
+    return CanLink(
+        link_type == _ARPHRD_CAN,
+        bool(flags & _IFF_UP),
+        kind,
+        _number(data.get(_IFLA_CAN_BITTIMING, b""), 4),  # can_bittiming.bitrate
+        listen_only=bool(_number(data.get(_IFLA_CAN_CTRLMODE, b"")[4:], 4) & _CTRLMODE_LISTENONLY),
+        state=_STATES[state] if has_state else "",
+        tx_errors=_number(counters, 2),
+        rx_errors=_number(counters[2:], 2),
+    )
+
+
+def _number(data: bytes, size: int) -> int:
+    return int.from_bytes(data[:size], "little" if struct.pack("=H", 1)[0] else "big")
 
 
 def _attributes(data: bytes) -> Iterator[tuple[int, bytes]]:

@@ -1,0 +1,127 @@
+"""What a CAN bus carries, by listening alone: which nodes beat, who speaks SDO, what else there is. Pure.
+
+Identifiers are read by the predefined connection set of CiA 301, 7.3.3. Frames that we sent are not to be fed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+from gateway.protocols.canopen.nmt import NmtState
+
+_STUFF = 1.1
+"""Bits on the wire per bit of a frame, with stuff bits of usual data."""
+
+
+@dataclass(slots=True)
+class NodeHeard:
+    """A node id in the traffic. `state` from its heartbeat; `period_s` between two of them; `pdos` by the predefined
+    identifiers, which a node need not keep."""
+
+    state: NmtState | None = None
+    heartbeats: int = 0
+    boot_ups: int = 0
+    period_s: float = 0.0
+    emergencies: int = 0
+    sdo_replies: int = 0
+    pdos: int = 0
+    last_ns: int = 0
+
+    @property
+    def certain(self) -> bool:
+        """Whether the node is there, and not only its identifiers."""
+        return bool(self.heartbeats or self.boot_ups or self.sdo_replies or self.emergencies)
+
+
+@dataclass(slots=True)
+class BusHeard:
+    """The sum of what came."""
+
+    frames: int = 0
+    errors: int = 0
+    extended: int = 0
+    bits: float = 0.0
+    nodes: dict[int, NodeHeard] = field(default_factory=dict)
+    sdo_masters: dict[int, int] = field(default_factory=dict)
+    """Node -> when another master last sent it an SDO request (ns)."""
+    nmt_commands: int = 0
+    commands: int = 0
+    """RPDOs, by the predefined identifiers."""
+    syncs: int = 0
+    times: int = 0
+    lss_requests: int = 0
+    others: int = 0
+    """Frames that are none of CANopen's."""
+
+    @property
+    def has_master(self) -> bool:
+        """Whether somebody commands here."""
+        return bool(self.sdo_masters or self.nmt_commands or self.lss_requests or self.commands)
+
+    def load(self, seconds: float, bitrate: int) -> float:
+        """The share of the bus that the frames took; 0 where the bit rate is not known."""
+        return self.bits / (seconds * bitrate) if seconds > 0 and bitrate else 0.0
+
+
+class BusEar:
+    """Feed it every frame that is received."""
+
+    def __init__(self) -> None:
+        self.heard = BusHeard()
+
+    def feed(self, frame: CanFrame, t_ns: int) -> None:
+        """A frame that came at `t_ns`."""
+        heard = self.heard
+        if frame.error:
+            heard.errors += 1
+            return
+        heard.frames += 1
+        heard.bits += (67 if frame.extended else 47) + 8 * len(frame.data) * _STUFF
+        if frame.extended:
+            heard.extended += 1
+            return
+        function, node = frame.can_id & 0x780, frame.can_id & 0x7F
+        if frame.can_id == 0:
+            heard.nmt_commands += 1
+        elif frame.can_id == 0x80:
+            heard.syncs += 1
+        elif frame.can_id == 0x100:
+            heard.times += 1
+        elif frame.can_id == 0x7E5:
+            heard.lss_requests += 1
+        elif frame.can_id == 0x7E4:
+            pass
+        elif node == 0:
+            heard.others += 1
+        elif function == 0x600:
+            heard.sdo_masters[node] = t_ns
+        elif function in (0x200, 0x300, 0x400, 0x500):
+            heard.commands += 1
+        elif function in (0x080, 0x580, 0x700) or 0x180 <= function <= 0x500:
+            self._of_node(function, node, frame, t_ns)
+        else:
+            heard.others += 1
+
+    def _of_node(self, function: int, number: int, frame: CanFrame, t_ns: int) -> None:
+        if function == 0x700 and (frame.remote or len(frame.data) != 1):
+            return
+        node = self.heard.nodes.setdefault(number, NodeHeard())
+        match function:
+            case 0x700 if frame.data[0] == 0:
+                node.boot_ups += 1
+                node.state = NmtState.INITIALISING
+            case 0x700:
+                state = frame.data[0] & 0x7F
+                if node.heartbeats and node.last_ns:
+                    node.period_s = (t_ns - node.last_ns) / NS_PER_S
+                node.heartbeats += 1
+                node.last_ns = t_ns
+                node.state = NmtState(state) if state in [s.value for s in NmtState] else node.state
+            case 0x080:
+                node.emergencies += 1
+            case 0x580:
+                node.sdo_replies += 1
+            case _:
+                node.pdos += 1

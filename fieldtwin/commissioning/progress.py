@@ -1,0 +1,16 @@
+"""Where a long verb is, for whoever shows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """A phase in words, and seconds of it by the estimate (`total_s` 0: not known)."""
+
+    phase: str
+    done_s: float
+    total_s: float
+    detail: str = ""
+    found: int = 0

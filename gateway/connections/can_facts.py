@@ -1,0 +1,63 @@
+"""What can be known of a CAN endpoint without joining its bus. Opens nothing, sends nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import Unreachable
+
+
+@dataclass(frozen=True, slots=True)
+class CanFacts:
+    """`bitrate` in bit/s is what the medium runs at, 0 where that is not known. `needs_bitrate`: it must be told one
+    (an adapter). `listen_only`: it is set so that nothing can be sent. `can_listen_only`: ``?listen=1`` works there.
+    `state`, `tx_errors` and `rx_errors` are the controller's, where the driver tells them."""
+
+    interface: str
+    bitrate: int = 0
+    needs_bitrate: bool = False
+    listen_only: bool = False
+    can_listen_only: bool = False
+    state: str = ""
+    tx_errors: int = 0
+    rx_errors: int = 0
+
+
+def can_facts(endpoint: Endpoint) -> CanFacts:
+    """Ask the kernel, or read the endpoint. Raises `Unreachable` for a kernel interface that is not there."""
+    interface = endpoint.interface
+    if interface == "fieldtwin":
+        return CanFacts(interface)
+    if interface == "socketcan":
+        return _of_kernel(endpoint)
+    from gateway.connections.can_adapter import RATELESS, can_listen_only
+
+    said = endpoint.param("bitrate", "")
+    return CanFacts(
+        interface,
+        bitrate=int(said) if said.isascii() and said.isdigit() else 0,
+        needs_bitrate=interface not in RATELESS,
+        listen_only=endpoint.param("listen") == "1",
+        can_listen_only=can_listen_only(endpoint),
+    )
+
+
+def _of_kernel(endpoint: Endpoint) -> CanFacts:
+    from gateway.connections.can_link import query_link
+
+    try:
+        link = query_link(endpoint.path)
+    except (OSError, AttributeError) as e:  # AttributeError: an operating system without netlink
+        text = getattr(e, "strerror", None) or str(e)
+        raise Unreachable(
+            f"no such CAN interface: {text}", where=str(endpoint), hint="ip -brief link show type can"
+        ) from e
+    return CanFacts(
+        "socketcan",
+        bitrate=link.bitrate,
+        listen_only=link.listen_only,
+        state=link.state,
+        tx_errors=link.tx_errors,
+        rx_errors=link.rx_errors,
+    )

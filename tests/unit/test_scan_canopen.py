@@ -113,6 +113,7 @@ def test_nodes_without_an_id_are_found_by_fastscan_and_left_waiting() -> None:
         async with can_bus(unnamed((1, 2, 3, 7)), unnamed((1, 2, 3, 9))) as connector:
             found = await scan(connector, nodes=(1, 2))
             assert [a.serial for a in found.unconfigured] == [7, 9]
+            await asyncio.sleep(0.1)  # our last frame leaves
             again = await scan(connector, nodes=())
             assert [a.serial for a in again.unconfigured] == [7, 9], "they wait again, and can be found again"
 

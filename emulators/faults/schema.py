@@ -59,6 +59,11 @@ class FaultSpec:
         return self.kind(self.kind.form.model_validate(self.parameters))
 
 
+def aims_of(kind: type[Fault]) -> list[str]:
+    """The keys of an aim that mean something to a fault."""
+    return [key for key in _AIM_KEYS if key not in _NOT_OF[kind.kind]]
+
+
 def seconds(value: str | float | int) -> float:
     """``5s``, ``250ms``, ``2min``, ``24h``, or seconds. Raises `UsageError`."""
     if isinstance(value, int | float):
@@ -89,7 +94,7 @@ def parse_fault(
     except UsageError as e:
         raise wrong("name", e.message, expected=e.expected, hint=e.hint) from e
     own = tuple(kind.form.model_fields)
-    known = ("id", "name", *(key for key in _AIM_KEYS if key not in _NOT_OF[kind.kind]), *own)
+    known = ("id", "name", *aims_of(kind), *own)
     for key in said:
         if key not in known:
             near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)

@@ -22,7 +22,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from gateway.core.yaml_file import YamlFile, load, validate
 
 
-class _Entry(BaseModel):
+class WaiverForm(BaseModel):
+    """One of them, as it is written."""
+
     model_config = ConfigDict(extra="forbid")
 
     id: Annotated[str, Field(min_length=1)]
@@ -30,10 +32,12 @@ class _Entry(BaseModel):
     expires: date
 
 
-class _File(BaseModel):
+class WaiversForm(BaseModel):
+    """A file of waivers."""
+
     model_config = ConfigDict(extra="forbid")
 
-    waivers: list[_Entry]
+    waivers: list[WaiverForm]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +74,7 @@ def load_waivers(path: Path, known: Collection[str]) -> Waivers:
 
 def read_waivers(file: YamlFile, known: Collection[str]) -> Waivers:
     """As `load_waivers`, of a file that was read."""
-    entries = validate(file, _File).waivers
+    entries = validate(file, WaiversForm).waivers
     seen: set[str] = set()
     for at, entry in enumerate(entries):
         if entry.id not in known:

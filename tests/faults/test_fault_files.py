@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from emulators.faults.frames import Framing
+from emulators.faults.json_schema import fault_defs
 from emulators.faults.on_link import wire_faults
 from emulators.faults.registry import FAULTS
 from emulators.faults.schema import load_faults, parse_fault, seconds
@@ -136,3 +137,16 @@ def test_what_a_system_cannot_suffer_is_refused_where_it_stands(
         load_faults(path, lambda spec: target(system, spec))
     assert e.value.line == 2
     assert abs(e.value.column - column) <= 5
+
+
+def test_the_schema_knows_each_fault_as_it_is_read() -> None:
+    (one,) = [f for f in fault_defs()["Fault"]["oneOf"] if f["title"] == "odd-sdo"]
+    assert one["properties"]["size_by"] == {"default": 0, "maximum": 1000, "minimum": -1000, "type": "integer"}
+    assert "function" not in one["properties"]
+    for described in fault_defs()["Fault"]["oneOf"]:
+        for key in described["properties"]:
+            values = {"name": described["title"], "from": 1, "until": 2, "direction": "both", "bus": "b", "device": "d"}
+            value = values.get(key, described["properties"][key].get("default", 1))
+            if key in ("id", "register", "device", "bus"):
+                value = "x"
+            parse_fault({"name": described["title"], key: value})

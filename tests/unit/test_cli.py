@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -267,12 +268,14 @@ def test_every_command_explains_itself(invoke: Invoke, command: str) -> None:
     assert out.startswith("Usage: fieldtwin " + command)
 
 
-@pytest.mark.parametrize("kind", ["system", "prototype", "profile"])
+@pytest.mark.parametrize("kind", ["system", "prototype", "profile", "faults", "scenario", "waivers"])
 def test_schemas_are_json_and_refuse_unknown_keys(invoke: Invoke, kind: str) -> None:
     code, out, err = invoke("schema", kind)
     assert (code, err) == (0, "")
     schema = json.loads(out)
     assert schema["additionalProperties"] is False
+    refs = set(re.findall(r'"#/\$defs/([^"]+)"', out))
+    assert refs <= set(schema.get("$defs", {}))
 
 
 def test_doctor_speaks_json(invoke: Invoke) -> None:

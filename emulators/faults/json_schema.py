@@ -1,0 +1,68 @@
+"""Fault files as JSON schema, for editors: one shape for each fault, told apart by its name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from emulators.faults.fault import Aim, Fault
+from emulators.faults.registry import FAULTS
+from emulators.faults.schema import MOST, aims_of
+
+_ABOUT = {
+    "bus": "on all that is on a bus",
+    "device": "on a device",
+    "unit": "Modbus: the unit id; default: the device's",
+    "function": "Modbus: the function code, without the bit of an exception",
+    "address": "Modbus: a PDU address, or holding:0x10",
+    "register": "a tag of the device",
+    "cob_id": "CAN: the identifier",
+    "index": "CANopen: the object that an SDO frame names",
+    "direction": "request (to the device), reply, or both",
+    "nth": "the n-th frame that matches, from 1",
+    "every": "each n-th frame that matches",
+    "from": "since when: 5s, 250ms, 2min, 24h of the run",
+    "until": "until when; default: for good",
+    "probability": "of each frame that matches",
+}
+
+
+def fault_defs() -> dict[str, Any]:
+    """The `$defs` that a schema with faults in it needs: `Fault`, any of them, and what an aim may say."""
+    aims = Aim.model_json_schema()["properties"]
+    return {
+        "Fault": {"title": "Fault", "oneOf": [_one(kind) for kind in FAULTS.values()]},
+        **{f"aim_{key}": {**_untitled(aims[key]), "description": about} for key, about in _ABOUT.items()},
+    }
+
+
+def fault_file_schema() -> dict[str, Any]:
+    """A file of faults."""
+    faults = {"type": "array", "minItems": 1, "maxItems": MOST, "items": {"$ref": "#/$defs/Fault"}}
+    return {
+        "title": "Fault file",
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["faults"],
+        "properties": {"faults": faults},
+        "$defs": fault_defs(),
+    }
+
+
+def _one(kind: type[Fault]) -> dict[str, Any]:
+    own = kind.form.model_json_schema().get("properties", {})
+    return {
+        "title": kind.name,
+        "type": "object",
+        "additionalProperties": False,
+        "required": ["name"],
+        "properties": {
+            "name": {"const": kind.name, "description": kind.summary},
+            "id": {"type": "string"},
+            **{key: {"$ref": f"#/$defs/aim_{key}"} for key in aims_of(kind)},
+            **{key: _untitled(parameter) for key, parameter in own.items()},
+        },
+    }
+
+
+def _untitled(schema: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in schema.items() if key != "title"}

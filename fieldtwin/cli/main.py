@@ -29,8 +29,11 @@ COMMANDS = {
     "read": ("fieldtwin.cli.read_command", "Read values of one device, by name or address."),
     "write": ("fieldtwin.cli.write_command", "Write values of one device: asked for, read back, put back."),
     "dump": ("fieldtwin.cli.dump_command", "Read all that a device holds: values, holes, limits, latency."),
+    "report": ("fieldtwin.cli.report_command", "A site acceptance document from dumps, comparisons and checks."),
+    "record": ("fieldtwin.cli.record_command", "Record a device, a line between two ports, or a CAN bus."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
     "test": ("fieldtwin.cli.test_command", "Run scenarios against a prototype, and judge it."),
+    "with": ("fieldtwin.cli.with_command", "Run any command against the emulated field; end with its exit status."),
     "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),
     "template": (
         "fieldtwin.cli.template_command",

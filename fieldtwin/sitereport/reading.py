@@ -1,0 +1,147 @@
+"""Files into pieces: whose file is this, and what does it say. Every kind of file is read in a function of its own.
+
+Whatever a file holds ends as text in a document: nothing in it is trusted to be what it should be.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.sitereport.document import Deviation, Device, Document, Piece, Source, Table, Weight
+from fieldtwin.sitereport.reading_dump import dump_piece
+from gateway.core.errors import FileInvalid, UsageError
+
+MOST_BYTES = 1 << 28
+"""Of one JSON file; dumps are read line by line."""
+MOST_ROWS = 200
+"""Of a table: more are for a file, not for paper."""
+SUFFIXES = (".json", ".jsonl")
+
+
+def read_site(
+    paths: Iterable[Path], *, site: str, by: str, prepared: str, customer: str = "", remarks: str = ""
+) -> tuple[Document, list[str]]:
+    """The document of all files, and of folders those of the kinds that it takes; what else was in these folders, and left out.
+
+    Raises `FileInvalid` for a file that was named and is none of them, `UsageError` where there is nothing.
+    """
+    pieces: list[tuple[Path, Piece]] = []
+    left_out: list[str] = []
+    for path in paths:
+        if not path.is_dir():
+            pieces.append((path, read_piece(path)))
+            continue
+        for file in sorted(p for p in path.rglob("*") if p.suffix in SUFFIXES and p.is_file()):
+            try:
+                pieces.append((file, read_piece(file)))
+            except FileInvalid:
+                left_out.append(str(file))
+    if not pieces:
+        raise UsageError(
+            "nothing to report", expected="dumps, and the JSON of check, diff or compare", got="none of them"
+        )
+    devices: dict[tuple[str, str, int], Device] = {}
+    for _, piece in sorted(pieces, key=lambda each: (each[1].protocol, each[1].endpoint, each[1].address)):
+        key = (piece.protocol, piece.endpoint, piece.address)
+        devices.setdefault(key, Device(len(devices) + 1, *_key(piece))).pieces.append(piece)
+    for device in devices.values():
+        device.pieces.sort(key=lambda piece: piece.when)
+    sources = [_source(path, piece) for path, piece in pieces]
+    return Document(site, by, prepared, list(devices.values()), sources, remarks, customer), left_out
+
+
+def _key(piece: Piece) -> tuple[str, int, str]:
+    return piece.protocol, piece.address, piece.endpoint
+
+
+def _source(path: Path, piece: Piece) -> Source:
+    digest = hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while chunk := file.read(1 << 20):
+                digest.update(chunk)
+        size = path.stat().st_size
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    return Source(path.name, size, digest.hexdigest(), piece.kind, piece.when, piece.by, piece.command)
+
+
+def read_piece(path: Path) -> Piece:
+    """One file. Raises `FileInvalid` where it is none that belongs into a document."""
+    try:
+        with path.open("rb") as file:
+            head = file.readline(1 << 20)
+            if b'"fieldtwin_dump"' in head:
+                return dump_piece(path)
+            raw = head + file.read(MOST_BYTES)
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    try:
+        data = json.loads(raw)
+    except (ValueError, RecursionError) as e:
+        raise FileInvalid("not JSON", path=str(path), got=str(e)[:60]) from e
+    kind = data.get("kind") if isinstance(data, dict) else None
+    if kind not in READERS:
+        known = ", ".join(f"the JSON of `{name}`" for name in READERS)
+        raise FileInvalid("no such file is taken", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
+    try:
+        return READERS[kind](data)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as e:
+        raise FileInvalid(f"not what `{kind}` writes", path=str(path), got=f"{type(e).__name__} {e}"[:80]) from e
+
+
+# -- checks --------------------------------------------------------------------------------------------------------------
+
+
+def check_piece(data: dict[str, Any]) -> Piece:
+    """The JSON of `fieldtwin check modbus|canopen`."""
+    about, cases, counts = data["about"], data["cases"], data["counts"]
+    weights: dict[str, Weight] = {"failed": "deviation", "error": "deviation", "inconclusive": "open"}
+    deviations = []
+    for case in cases:
+        weight: Weight | None = "waived" if case["waived"] else weights.get(case["verdict"])
+        if weight is not None:
+            deviations.append(_case(case, weight))
+    words = ("passed", "failed", "inconclusive", "skipped")
+    skipped = [c for c in cases if c["verdict"] == "skipped" and not c["waived"]]
+    here = [c for c in skipped if c["reason"] != "not on this wire"]
+    bad = any(d.weight == "deviation" for d in deviations)
+    facts = [
+        ("played", f"cases up to danger {about['at_most']}"),
+        ("wrote to", ", ".join(map(str, about["wrote"])) or "nothing"),
+        ("reply timeout", f"{about['timeout_s']} s"),
+        ("took", f"{about['took_s']} s"),
+        ("with", f"fieldtwin {about['fieldtwin']} on {about['host']}"),
+    ]
+    passed = [c for c in cases if c["verdict"] == "passed"]
+    tables = (
+        _table(
+            "Passed",
+            ("case", "what", "source", "seen"),
+            [(c["id"], c["title"], c["clause"], c["reason"]) for c in passed],
+        ),
+        _table("Not checked", ("case", "what", "why"), [(c["id"], c["title"], c["reason"]) for c in here]),
+    )
+    return Piece(
+        "check", str(about["protocol"]), int(about["address"]), str(about["endpoint"]), str(about["started"]),
+        str(about["by"]), "failed" if bad else "passed" if counts.get("passed") else "inconclusive",
+        ", ".join(f"{counts[w] - (len(skipped) - len(here) if w == 'skipped' else 0)} {w}" for w in words if counts.get(w)),
+        {str(k): str(v) for k, v in about["identity"].items()}, tuple(facts), tuple(deviations), tables, str(about["command"]),
+    )  # fmt: skip
+
+
+def _case(case: dict[str, Any], weight: Weight) -> Deviation:
+    what, expected, found, where, source = (str(case[key]) for key in ("title", "expected", "reason", "id", "clause"))
+    return Deviation(weight, what, expected, found, where, source)
+
+
+def _table(title: str, columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> Table:
+    shown = tuple(tuple(str(text) for text in row) for row in rows[:MOST_ROWS])
+    return Table(title, columns, shown, max(0, len(rows) - MOST_ROWS))
+
+
+READERS: dict[str, Callable[[dict[str, Any]], Piece]] = {"fieldtwin check": check_piece}

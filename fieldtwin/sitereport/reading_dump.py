@@ -1,0 +1,87 @@
+"""A dump as a piece of a document: what was read, what refused, how fast it answered, and who the device is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.checking.checked import shown
+from fieldtwin.commissioning.dump_file import Dump, load_dump
+from fieldtwin.sitereport.document import SERIAL, Deviation, Piece, Table
+
+IDENTITY = {(0x1008, 0): "name", (0x1009, 0): "hardware", (0x100A, 0): "software"}
+NUMBERS = {
+    (0x1000, 0): "device type", (0x1018, 1): "vendor id", (0x1018, 2): "product code", (0x1018, 3): "revision",
+    (0x1018, 4): SERIAL,
+}  # fmt: skip
+
+
+def dump_piece(path: Path) -> Piece:
+    """Raises `FileInvalid` as `load_dump`."""
+    dump = load_dump(path)
+    header = dump.header
+    cells = sum(len(each.cells) for each in dump.passes)
+    silent = sum(1 for found in dump.maps.values() if found.get("given_up"))
+    deviations = (
+        []
+        if dump.ended
+        else [Deviation("open", "the dump did not end", "a whole dump", "it was broken off", path.name)]
+    )
+    if silent:
+        deviations.append(
+            Deviation("open", "no answer in places", "an answer to each read", f"{silent} tables given up", path.name)
+        )
+    facts = [
+        ("ranges", ", ".join(map(str, header["ranges"])) or "all that the profile or EDS names"),
+        ("profile", str(header.get("profile") or "none")),
+        ("times through", str(len(dump.passes))),
+        ("values", str(cells)),
+    ]
+    return Piece(
+        "dump", dump.protocol, int(header.get("address", 0)), str(header.get("endpoint", "")), str(header.get("started", "")),
+        str(header.get("by", "")), "whole" if dump.ended else "broken off", f"{cells} values in {len(dump.passes)} times through",
+        identity(dump), tuple(facts), tuple(deviations), _tables(dump), str(header.get("command", "")),
+    )  # fmt: skip
+
+
+def identity(dump: Dump) -> dict[str, str]:
+    """What a CANopen node says of itself in its objects; a Modbus device is asked by checks."""
+    said: dict[str, str] = {}
+    for each in dump.passes:
+        for key, name in NUMBERS.items():
+            if (raw := each.cells.get(key)) is not None:
+                number = int.from_bytes(raw, "little")
+                said[name] = f"{number:08X}h" if name == "device type" else f"{number} ({number:08X}h)"
+        for key, name in IDENTITY.items():
+            if (raw := each.cells.get(key)) is not None and (text := shown(raw)):
+                said[name] = text
+    return said
+
+
+def _tables(dump: Dump) -> tuple[Table, ...]:
+    maps = tuple(
+        (name, _spans(found.get("readable")), _spans(found.get("holes")), str(found.get("max_read", "")))
+        for name, found in sorted(dump.maps.items())
+    )
+    latency = tuple((name, *_latency(found)) for name, found in sorted(dump.latency.items()))
+    return (
+        Table("What can be read", ("table", "readable", "holes", "longest read"), maps),
+        Table("How fast it answers", ("function", "requests", "median", "95 %", "slowest"), latency),
+    )
+
+
+def _spans(texts: Any, most: int = 8) -> str:
+    if not isinstance(texts, list) or not texts:
+        return "none"
+    return ", ".join(map(str, texts[:most])) + (f" and {len(texts) - most} more" if len(texts) > most else "")
+
+
+def _latency(found: Any) -> tuple[str, str, str, str]:
+    if not isinstance(found, dict):
+        return "", "", "", ""
+
+    def ms(name: str) -> str:
+        value = found.get(name)
+        return f"{value / 1000:.1f} ms" if isinstance(value, int | float) else ""
+
+    return str(found.get("count", "")), ms("p50_us"), ms("p95_us"), ms("most_us")

@@ -6,6 +6,7 @@ formats themselves are in `fieldtwin.formats`.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -19,8 +20,9 @@ from fieldtwin.formats.packet_file import is_packet_file
 from fieldtwin.formats.pcap import read_capture
 from fieldtwin.formats.poll_text import IS_POLL_TEXT, read_polls
 from fieldtwin.recording.draft import Drafts
+from fieldtwin.recording.framing_guess import guess_framing
 from fieldtwin.recording.pairing import Bad, PairCounters, Pairer, pairer
-from fieldtwin.recording.rotating import RotatingFile
+from fieldtwin.recording.rotating import RotatingFile, parts_of
 from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
@@ -110,7 +112,9 @@ def import_polls(path: Path, out: Path) -> TextSummary:
     return summary
 
 
-def import_capture(path: Path, out: Path, framing: str = "", url: str = "") -> TextSummary:
+def import_capture(
+    path: Path, out: Path, framing: str = "", url: str = "", header: RecordingHeader | None = None
+) -> TextSummary:
     """A capture or tap of ours (`fieldtwin run --capture`, `record --tap`, a log of what a verb sent) as a recording.
 
     Of several endpoints `url` says which; `framing` (rtu, ascii, mbap) where it is not the endpoint's. Raises `FileInvalid`,
@@ -121,26 +125,48 @@ def import_capture(path: Path, out: Path, framing: str = "", url: str = "") -> T
         there = ", ".join(map(str, seen)) or "nothing"
         raise UsageError(f"{path.name} holds {there}", expected="one of them", hint="--endpoint URL")
     endpoint = seen[0]
-    items = (c for c in read_capture(path) if c.endpoint == endpoint)
+    items = (c for c in _captured(path) if c.endpoint == endpoint)
     if endpoint.is_can:
         frames = ((c.t_ns, "can0", c.item) for c in items if isinstance(c.item, CanFrame))
         return _write_log(frames, out, TextSummary())
-    return _pair_capture(items, path, out, endpoint, framing or framing_of(endpoint))
+    head = header or _header(path, out, str(endpoint))
+    return _pair_capture(items, path, out, head, framing or _framing(path, endpoint))
+
+
+def _captured(path: Path) -> Iterator[Captured]:
+    """What is in all parts of a capture."""
+    for part in parts_of(path):
+        yield from read_capture(part)
+
+
+def _framing(path: Path, endpoint: Endpoint) -> str:
+    """What is spoken there, as the bytes say, or the endpoint."""
+    if endpoint.scheme in ("udp", "tls"):
+        return framing_of(endpoint)
+    chunks = (
+        (c.direction is Direction.SENT, c.item)
+        for c in _captured(path)
+        if c.endpoint == endpoint and isinstance(c.item, bytes)
+    )
+    with contextlib.closing(chunks):
+        return guess_framing(chunks) or framing_of(endpoint)
 
 
 def endpoints_of(path: Path) -> list[Endpoint]:
     """The endpoints of a capture, in the order in which they are met; 64 at most."""
     found: dict[Endpoint, None] = {}
-    for captured in read_capture(path):
+    for captured in _captured(path):
         if len(found) < 64:
             found.setdefault(captured.endpoint)
     return list(found)
 
 
-def _pair_capture(items: Iterable[Captured], path: Path, out: Path, endpoint: Endpoint, framing: str) -> TextSummary:
+def _pair_capture(
+    items: Iterable[Captured], path: Path, out: Path, header: RecordingHeader, framing: str
+) -> TextSummary:
     summary, drafts = TextSummary(out), Drafts()
     wire: Pairer | None = None
-    with _New(out, encode_header(_header(path, out, str(endpoint)))) as file, BadFile(out, str(endpoint)) as bad:
+    with _New(out, encode_header(header)) as file, BadFile(out, header.endpoint) as bad:
         for captured in items:
             if wire is None:
                 wire = pairer(framing, captured.t_ns, bad.keep)

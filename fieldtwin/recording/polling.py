@@ -1,0 +1,257 @@
+"""Recording a live device by asking it: the tags of a profile, or what another recording asked, round by round.
+
+Nothing is written. A round begins on a grid of its period; one that is missed is skipped and counted, never made up for. A
+connection that is lost is opened again, after growing pauses. It must never know a file or a screen: exchanges go to a sink.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from fieldtwin.commissioning.live import canopen_at, frames_at
+from fieldtwin.commissioning.point import CanopenPoint
+from fieldtwin.commissioning.reading import Target
+from fieldtwin.recording.asking import Asker, asker_at, changes
+from fieldtwin.recording.sinks import CanLogSink
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import Connector
+from gateway.core.errors import ConnectionLost, Unreachable, UsageError
+from gateway.core.profile import READ_FUNCTION, DeviceProfile
+from gateway.core.recording import Exchange
+from gateway.devices.read_plan import GroupPlan, Learnt, Read
+from gateway.wallclock import WallClock
+
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
+MAX_REQUESTS = 10_000
+"""Different requests that are repeated from another recording."""
+
+Sink = Callable[[Exchange], None]
+
+
+@dataclass(slots=True)
+class PollCounters:
+    """What was done so far."""
+
+    rounds: int = 0
+    missed: int = 0
+    exchanges: int = 0
+    unanswered: int = 0
+    refused: int = 0
+    lost: int = 0
+
+
+class Round(Protocol):
+    """What is asked in each round."""
+
+    async def __call__(self, asker: Asker, sink: Sink) -> None: ...
+
+
+class ProfileRound:
+    """All readable tags of a profile, in the fewest reads; what is refused is recorded, and then read in parts."""
+
+    def __init__(self, profile: DeviceProfile, unit: int, groups: Iterable[str] = ()) -> None:
+        self._unit = unit
+        learnt = Learnt()
+        there = dict.fromkeys(t.poll for t in profile.tags.values() if t.readable)
+        wanted = list(groups) or list(there)
+        if unknown := [g for g in wanted if g not in there]:
+            raise UsageError(f"no group {unknown[0]!r} in {profile.name}", expected=", ".join(there))
+        self._plans = [GroupPlan(profile, group, learnt) for group in wanted]
+
+    async def __call__(self, asker: Asker, sink: Sink) -> None:
+        for plan in self._plans:
+            waiting = list(plan.reads)
+            while waiting:
+                waiting[:1] = await self._read(plan, waiting[0], asker, sink)
+            plan.pass_ended()
+
+    async def _read(self, plan: GroupPlan, read: Read, asker: Asker, sink: Sink) -> tuple[Read, ...]:
+        """What is to be read instead."""
+        at = read.range
+        exchange = await asker.ask(
+            self._unit, bytes((READ_FUNCTION[at.table],)) + at.address.to_bytes(2) + at.count.to_bytes(2)
+        )
+        if exchange is None:
+            return ()
+        sink(exchange)
+        if not exchange.reply:
+            return ()
+        if exchange.reply[0] & 0x80:
+            code = exchange.reply[1]
+            return plan.refused(read, code) if code in (2, 3) else ()
+        plan.taken(read)
+        return ()
+
+
+class SameRequests:
+    """What another recording asked, each different request once a round, in its order; `left_out` are those that may change the
+    device, or that cannot be sent."""
+
+    def __init__(self, exchanges: Iterable[Exchange], unit: int | None = None) -> None:
+        self.requests: dict[tuple[int, bytes], None] = {}
+        self.left_out = 0
+        for exchange in exchanges:
+            key = (exchange.unit if unit is None else unit, exchange.request)
+            if changes(exchange.request) or (key not in self.requests and len(self.requests) >= MAX_REQUESTS):
+                self.left_out += 1
+            else:
+                self.requests[key] = None
+
+    async def __call__(self, asker: Asker, sink: Sink) -> None:
+        for unit, pdu in self.requests:
+            exchange = await asker.ask(unit, pdu)
+            if exchange is not None:
+                sink(exchange)
+
+
+async def record_polls(
+    target: Target,
+    one_round: Round,
+    sink: Sink,
+    *,
+    every_s: float,
+    counters: PollCounters,
+    stop: asyncio.Event,
+    rounds: int = 0,
+    spacing_s: float = 0.0,
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> None:
+    """Poll until `stop` is set, or `rounds` are done (0: no limit). Raises `Unreachable` only where nobody was there at first."""
+    clock = clock or WallClock()
+    zero_ns = clock.monotonic_ns()
+
+    def counted(exchange: Exchange) -> None:
+        counters.exchanges += 1
+        counters.unanswered += exchange.reply is None
+        counters.refused += bool(exchange.reply and exchange.reply[0] & 0x80)
+        sink(exchange)
+
+    async def on_the_grid() -> None:
+        async with asker_at(
+            target.url, timeout_s=target.timeout_s, echo=target.echo, spacing_s=spacing_s, zero_ns=zero_ns,
+            connector=connector, clock=clock,
+        ) as asker:  # fmt: skip
+            await _rounds(lambda: one_round(asker, counted), clock, every_s, counters, stop, rounds)
+
+    await _reopened(on_the_grid, counters, stop)
+
+
+async def record_node(
+    target: Target,
+    sink: CanLogSink,
+    *,
+    every_s: float,
+    counters: PollCounters,
+    stop: asyncio.Event,
+    rounds: int = 0,
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> None:
+    """As `record_polls`, for a CANopen node: each readable tag of its profile by SDO; `sink` sees the frames."""
+    clock, profile = clock or WallClock(), target.profile
+    if profile is None:
+        raise UsageError("a node is polled by its profile", hint="--profile")
+    tags = [t for t in profile.tags.values() if t.readable]
+
+    async def on_the_grid() -> None:
+        async with canopen_at(
+            target.url, target.bitrate, sdo_timeout_s=target.timeout_s, taps=[sink], connector=connector, clock=clock
+        ) as master:
+            point = CanopenPoint(master, target.url, target.address)
+
+            async def one_round() -> None:
+                answers = await point.read(tags)
+                counters.exchanges += len(answers)
+                counters.unanswered += sum(bool(a.problem) for a in answers.values())
+                sink.check()
+
+            await _rounds(one_round, clock, every_s, counters, stop, rounds)
+
+    await _reopened(on_the_grid, counters, stop)
+
+
+async def _rounds(
+    one_round: Callable[[], Awaitable[None]],
+    clock: Clock,
+    every_s: float,
+    counters: PollCounters,
+    stop: asyncio.Event,
+    most: int,
+) -> None:
+    every_ns, due_ns = max(round(every_s * NS_PER_S), 1), clock.monotonic_ns()
+    while not stop.is_set() and (not most or counters.rounds < most):
+        await one_round()
+        counters.rounds += 1
+        due_ns += every_ns
+        late = (clock.monotonic_ns() - due_ns) // every_ns
+        if late > 0:
+            counters.missed += late
+            due_ns += late * every_ns
+        if not most or counters.rounds < most:
+            await _pause(stop, (due_ns - clock.monotonic_ns()) / NS_PER_S)
+
+
+async def _reopened(work: Callable[[], Awaitable[None]], counters: PollCounters, stop: asyncio.Event) -> None:
+    """`work`, again when its connection is lost."""
+    pause_s = FIRST_PAUSE_S
+    while True:
+        done = counters.rounds
+        try:
+            await work()
+            return
+        except ConnectionLost:
+            counters.lost += 1
+        except Unreachable:
+            if not counters.rounds:
+                raise
+        if stop.is_set():
+            return
+        pause_s = FIRST_PAUSE_S if counters.rounds > done else min(2 * pause_s, LONGEST_PAUSE_S)
+        await _pause(stop, pause_s)
+
+
+async def _pause(stop: asyncio.Event, seconds: float) -> None:
+    if seconds > 0:
+        waiting = asyncio.ensure_future(stop.wait())
+        try:
+            await asyncio.wait([waiting], timeout=seconds)
+        finally:
+            waiting.cancel()
+            await asyncio.gather(waiting, return_exceptions=True)
+
+
+async def follow_bus(
+    target: Target,
+    sink: CanLogSink,
+    *,
+    stop: asyncio.Event,
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> int:
+    """Every frame of a CAN bus into `sink` until `stop`; nothing is sent. How many frames were lost here for want of speed.
+
+    Raises `Unreachable` where there is no bus, `ConnectionLost` when it is gone.
+    """
+    clock = clock or WallClock()
+    async with frames_at(target.url, target.bitrate, taps=[sink], connector=connector, clock=clock) as connection:
+        stopping: asyncio.Future[Any] = asyncio.ensure_future(stop.wait())
+        receiving: asyncio.Future[Any] | None = None
+        try:
+            while not stop.is_set():
+                receiving = asyncio.ensure_future(connection.recv())
+                await asyncio.wait([stopping, receiving], return_when=asyncio.FIRST_COMPLETED)
+                if receiving.done():
+                    receiving.result()
+                    while connection.inbound.data_stream:
+                        await connection.recv()
+                sink.check()
+        finally:
+            waiting = [stopping, *([receiving] if receiving is not None else [])]
+            for task in waiting:
+                task.cancel()
+            await asyncio.gather(*waiting, return_exceptions=True)
+        return connection.overruns

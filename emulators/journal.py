@@ -7,6 +7,7 @@ fall off and are counted; whoever checks fetches often enough.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 CAPACITY = 200_000
@@ -33,6 +34,7 @@ class HeldJournal:
         self._raws: deque[bytes] = deque(maxlen=capacity)
         self._times: deque[int] = deque(maxlen=capacity)
         self._last: dict[str, bytes] = {}
+        self._watched: dict[str, Callable[[bytes, int], None]] = {}
         self.number = 0
         """Of the latest entry; they count from 1."""
 
@@ -52,10 +54,21 @@ class HeldJournal:
         if self._last.get(tag) == raw:
             return
         self._last[tag] = raw
+        if tag in self._watched:
+            self._watched[tag](raw, now_ns)
         self.number += 1
         self._tags.append(tag)
         self._raws.append(raw)
         self._times.append(now_ns)
+
+    def watch(self, tag: str, changed: Callable[[bytes, int], None]) -> None:
+        """Call ``changed(raw, t_ns)`` each time that `tag` becomes something else, and now where it is something already.
+
+        One watcher a tag. It may not write to the device.
+        """
+        self._watched[tag] = changed
+        if tag in self._last:
+            changed(self._last[tag], 0)
 
     def since(self, number: int) -> list[Held]:
         """The entries after entry `number`, as far as they are kept."""

@@ -12,6 +12,7 @@ from array import array
 from bisect import bisect_right
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Protocol
 
 from emulators.context import UsedUp, WhenUsedUp
 from gateway.core.clock import NS_PER_S
@@ -106,7 +107,33 @@ class SignalTrack:
         return here if fraction == 0.0 else here + (column[row + 1] - here) * fraction
 
 
-class SignalPlayer:
+class Signals(Protocol):
+    """What a device plays: values by name that follow from the emulator's time. A recording, or a simulation."""
+
+    names: tuple[str, ...]
+    path: str
+    start_ns: int
+
+    def __len__(self) -> int: ...
+
+    def position_s(self, now_ns: int) -> float:
+        """Where `now_ns` is, in the signals' own seconds."""
+        ...
+
+    def values(self, now_ns: int) -> dict[str, float]:
+        """All signals now, of one instant."""
+        ...
+
+    def values_at(self, position_s: float) -> dict[str, float]:
+        """All signals at a place that `position_s` told; of a simulation, no earlier than it was asked for before."""
+        ...
+
+    def at(self, now_ns: int, name: str) -> float:
+        """One of them now; NaN where there is no value. Raises `FileInvalid` for a name that there is not."""
+        ...
+
+
+class SignalPlayer(Signals):
     """A track played from `start_ns` on, `speed` times as fast as recorded. Reading never changes it.
 
     After the last row: `HOLD` stays on it; `LOOP` goes on from the first row, the two being the same instant (a recording
@@ -119,6 +146,8 @@ class SignalPlayer:
         if not (speed > 0 and math.isfinite(speed)):
             raise UsageError("a recording cannot be played at that speed", expected="more than 0", got=str(speed))
         self.track = track
+        self.names = track.names
+        self.path = track.path
         self.start_ns = start_ns
         self.speed = speed
         self.at_end = at_end
@@ -146,3 +175,10 @@ class SignalPlayer:
     def values(self, now_ns: int) -> dict[str, float]:
         """All signals now, of one instant."""
         return self.track.values(self.position_s(now_ns))
+
+    def values_at(self, position_s: float) -> dict[str, float]:
+        """All signals at a time of the recording."""
+        return self.track.values(position_s)
+
+    def __len__(self) -> int:
+        return len(self.track)

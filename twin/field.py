@@ -29,10 +29,11 @@ from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.register_device import StatedRegisters, add_own_functions
 from emulators.models.sampled_sensor import SampledSensor
+from emulators.models.simulated_registers import SimulatedRegisters
 from emulators.recorded_device import RecordedDevice, load_replay
 from emulators.replay.can_log import SUFFIX, CanLog
 from emulators.replay.replay import ExchangeReplay
-from emulators.signals import SignalPlayer, SignalTrack
+from emulators.signals import SignalPlayer, Signals, SignalTrack
 from emulators.stated import parts_of
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
@@ -43,6 +44,7 @@ from gateway.core.profile import DeviceProfile
 from gateway.devices.config import DeviceConfig
 from twin.field_faults import FieldFaults
 from twin.prototype_file import EmulatedBus, EmulatedDevice, Prototype
+from twin.simulations import Simulations
 from twin.system import System
 
 
@@ -111,9 +113,13 @@ class FieldSide:
     async def open(self) -> None:
         """Build and start listening. Raises `EndpointBusy`, `Unreachable` or `FileInvalid`; then nothing stays open."""
         try:
+            self._simulations = Simulations(
+                self.prototype.file, self.prototype.form, self.system, self._clock.monotonic_ns()
+            )
             for bus in self.prototype.buses.values():
                 if bus.listen is not None:
                     await self._open_bus(bus, bus.listen)
+            self._simulations.connect({name: device.journal for name, device in self.devices.items()})
             for device in self.devices.values():
                 device.journal.keep(share_of(len(self.devices)))
         except BaseException:
@@ -254,13 +260,13 @@ class FieldSide:
             modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
             modem.journal = pair.near.journal
             return unit
-        if emulated.form.model == "profile":
+        if emulated.form.model == "profile" or (emulated.form.simulation and emulated.profile.sampled is None):
             return self._stated_unit(config, emulated)
         if emulated.profile.sampled is None:
             return self._recorded_unit(config, emulated)
-        player = self._player(emulated)
+        player = self._signals(emulated)
         bank = SampledSensor(emulated.profile, player, emulated.form.identity)
-        unit = self._emulated_unit(config, bank, player.track)
+        unit = self._emulated_unit(config, bank, player)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = bank.journal
         self.faults.on_values(config.name, bank.distortions)
@@ -269,8 +275,12 @@ class FieldSide:
     def _stated_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit:
         """A device of which nothing is recorded: its profile, and what the prototype file says that its tags hold."""
         values = {**emulated.form.values, **emulated.form.identity}
+        now_ns = self._clock.monotonic_ns()
         try:
-            bank = StatedRegisters(emulated.profile, values, self._clock.monotonic_ns())
+            if emulated.form.simulation is None:
+                bank = StatedRegisters(emulated.profile, values, now_ns)
+            else:
+                bank = SimulatedRegisters(emulated.profile, values, self._signals(emulated), now_ns)
         except FileInvalid as e:
             raise FileInvalid(
                 f"{config.name!r}: {e.message}", path=str(self.prototype.path), expected=e.expected, got=e.got
@@ -323,16 +333,19 @@ class FieldSide:
         self.faults.on_values(config.name, made.distortions)
         return made.node
 
-    def _node_recording(self, emulated: EmulatedDevice) -> SignalPlayer | CanLog | None:
+    def _node_recording(self, emulated: EmulatedDevice) -> Signals | CanLog | None:
         if emulated.recording is None:
-            return None
+            return None if emulated.form.simulation is None else self._signals(emulated)
         if emulated.recording.suffix != SUFFIX:
-            return self._player(emulated)
+            return self._signals(emulated)
         return CanLog(emulated.recording, emulated.form.speed, WhenUsedUp.parse(emulated.form.at_end))
 
-    def _player(self, emulated: EmulatedDevice) -> SignalPlayer:
-        assert emulated.recording is not None
+    def _signals(self, emulated: EmulatedDevice) -> Signals:
+        """What the device plays: a simulation, or its recording from now on."""
         form = emulated.form
+        if form.simulation is not None:
+            return self._simulations.signals_of(emulated.name, form, emulated.profile)
+        assert emulated.recording is not None
         if emulated.recording not in self._tracks:
             self._tracks[emulated.recording] = SignalTrack.load(emulated.recording)
         return SignalPlayer(
@@ -352,7 +365,7 @@ class FieldSide:
             "devices": {
                 name: {
                     "profile": d.emulated.profile.name,
-                    "recording": str(d.emulated.recording or d.emulated.form.model),
+                    "recording": str(d.emulated.recording or d.emulated.form.simulation or d.emulated.form.model),
                     "plays": d.plays,
                     "commands": sorted(d.command_list),
                     "executed": d.executed(),

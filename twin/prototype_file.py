@@ -13,6 +13,7 @@ from gateway.core.profile import DeviceProfile, load_profile
 from gateway.core.recording import shown
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.data_files import find, find_recording
+from twin.simulations import check_plays, check_simulations
 from twin.system import System
 from twin.system_schema import EmulatedForm, PrototypeForm
 
@@ -38,6 +39,8 @@ class EmulatedDevice:
     @property
     def plays(self) -> str:
         """What stands in for the device, as a person reads it: what is synthetic is never shown as measured."""
+        if self.form.simulation is not None:
+            return f"the simulation {self.form.simulation}"
         if self.recording is None:
             return f"the model {self.form.model}"
         return f"{self.recording.name} (log of a CAN bus)" if self.recording.suffix == SUFFIX else shown(self.recording)
@@ -52,6 +55,7 @@ class Prototype:
     buses: dict[str, EmulatedBus]
     devices: dict[str, EmulatedDevice]
     file: YamlFile
+    form: PrototypeForm
 
     def with_listen(self, bus: str, listen: Endpoint) -> Prototype:
         """The same, with the emulators of `bus` listening elsewhere."""
@@ -60,7 +64,7 @@ class Prototype:
     def with_recording(self, device: str, path: Path, speed: float | None = None) -> Prototype:
         """The same, with `device` playing another recording."""
         old = self.devices[device]
-        form = old.form.model_copy(update={"recording": str(path), **({"speed": speed} if speed else {})})
+        form = old.form.model_copy(update={"recording": str(path), "simulation": None, "plays": {}, **({"speed": speed} if speed else {})})
         return replace(self, devices={**self.devices, device: replace(old, form=form, recording=path)})
 
     def with_speed(self, speed: float) -> Prototype:
@@ -94,16 +98,17 @@ def load_prototype(system: System, path: Path | None = None) -> Prototype:
             raise file.error(
                 ("devices", name), f"the system has no device {name!r}", expected=", ".join(system.devices)
             )
+    check_simulations(file, form, system)
     buses = {name: _bus(file, system, form, name) for name in system.buses}
     devices = {
-        name: _device(file, system, name, form.devices[name])
+        name: _device(file, system, name, form)
         for name in system.devices
         if name in form.devices and buses[system.devices[name].bus].listen is not None
     }
     missing = [n for n, d in system.devices.items() if buses[d.bus].listen is not None and n not in devices]
     if missing:
         raise file.error(("devices",), f"nothing stands in for {', '.join(missing)}", expected="an entry each")
-    return Prototype(path, form.seed, buses, devices, file)
+    return Prototype(path, form.seed, buses, devices, file, form)
 
 
 def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> EmulatedBus:
@@ -131,8 +136,8 @@ def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> Emul
     return EmulatedBus(name, listen, entry.pace)
 
 
-def _device(file: YamlFile, system: System, name: str, form: EmulatedForm) -> EmulatedDevice:
-    config = system.devices[name]
+def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> EmulatedDevice:
+    config, form = system.devices[name], whole.devices[name]
     loc = ("devices", name)
     profile = config.profile
     if form.profile is not None:
@@ -140,8 +145,13 @@ def _device(file: YamlFile, system: System, name: str, form: EmulatedForm) -> Em
             profile = load_profile(find("devices", form.profile, beside=file_path(file)))
         except UsageError as e:
             raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
-    if (form.recording is None) == (form.model is None):
-        raise file.error(loc, f"what stands in for {name!r}", expected="either `recording: FILE` or `model: NAME`")
+    if [form.recording, form.model, form.simulation].count(None) != 2:
+        raise file.error(
+            loc,
+            f"what stands in for {name!r}",
+            expected="one of `recording: FILE`, `simulation: NAME` and `model: NAME`",
+        )
+    check_plays(file, whole, name, profile)
     if form.model == "mailbox" and (profile.inbox is None or form.far is None):
         raise file.error(
             loc, f"the mailbox model for {name!r}", expected="a profile with a mailbox, and `far: ENDPOINT`"
@@ -170,8 +180,9 @@ def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, prof
     """What is said of being busy is said of a Modbus device, and what of registers, of one without a recording."""
     if form.busy is not None and profile.protocol != "modbus":
         raise file.error((*loc, "busy"), "nothing of this protocol", expected="a Modbus device")
-    if form.values and (form.model != "profile" or profile.protocol != "modbus"):
-        raise file.error((*loc, "values"), "values of registers", expected="`model: profile`, of a Modbus device")
+    if form.values and ((form.model != "profile" and form.simulation is None) or profile.protocol != "modbus"):
+        expected = "`model: profile` or a simulation, of a Modbus device"
+        raise file.error((*loc, "values"), "values of registers", expected=expected)
     for tag in form.values:
         if tag not in profile.tags:
             raise file.error(

@@ -263,10 +263,28 @@ class BusyForm(Strict):
     for_ms: Milliseconds
 
 
+class SimulationForm(Strict):
+    """Values that are computed, step by step: by formulas, or by a class in Python."""
+
+    step_ms: float = Field(default=100.0, ge=0.1, le=60_000)
+    formulas: dict[Name, str] = Field(default={}, description="name -> formula of t, dt, inputs and each other")
+    python: str | None = Field(
+        default=None, description="FILE.py:CLASS, beside this file; it has step(t_s, dt_s, inputs)"
+    )
+    start: dict[Name, float] = Field(default={}, description="name -> its value before the first step")
+    inputs: dict[Name, TagName] = Field(default={}, description="name -> DEVICE.TAG, as the device holds it")
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
 class EmulatedForm(Strict):
-    """What stands in for a device: a recording (time-keyed signals), or a model."""
+    """What stands in for a device: a recording (time-keyed signals), a simulation, or a model."""
 
     recording: str | None = None
+    simulation: str | None = Field(default=None, description="one of `simulations:`; the device plays values of it")
+    plays: dict[Name, Name] = Field(
+        default={}, description="tag -> name in the simulation; without, those of equal name"
+    )
     model: Literal["mailbox", "profile"] | None = None
     profile: str | None = Field(default=None, description="the emulated device's own profile, where it differs")
     speed: float = Field(default=1.0, gt=0, le=10_000)
@@ -290,4 +308,5 @@ class PrototypeForm(Strict):
     unmapped: Literal["refuse"] = "refuse"
     seed: int = 1
     buses: dict[Name, BusMappingForm | Literal["plant"]]
+    simulations: dict[Name, SimulationForm] = {}
     devices: dict[Name, EmulatedForm]

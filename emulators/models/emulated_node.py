@@ -18,7 +18,7 @@ from emulators.models.distorted_objects import DistortedObjects
 from emulators.models.played_objects import HeldObjects, PlayedObjects
 from emulators.replay.can_log import CanLog
 from emulators.replay.objects import recorded_objects
-from emulators.signals import SignalPlayer
+from emulators.signals import Signals
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.profile import DeviceProfile
 
@@ -35,7 +35,7 @@ class EmulatedNode:
 def emulated_node(
     profile: DeviceProfile,
     node_id: int,
-    recording: SignalPlayer | CanLog | None,
+    recording: Signals | CanLog | None,
     now_ns: int,
     identity: Mapping[str, str] | None = None,
 ) -> EmulatedNode:
@@ -54,7 +54,7 @@ def emulated_node(
     own = _factory(profile, dictionary, identity or {})
     model = model_for(dictionary)
     context = NodeContext(model=model, held=held, factory=own)
-    if isinstance(recording, SignalPlayer):
+    if recording is not None and not isinstance(recording, CanLog):
         played = PlayedObjects(tags, dictionary, recording)
         distortions = played.distortions
         node = CanopenNode(dictionary, node_id, replace(context, source=played))

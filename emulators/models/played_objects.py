@@ -9,7 +9,7 @@ from emulators.canopen.codec import encode, integer_range
 from emulators.canopen.dictionary import Dictionary
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
-from emulators.signals import SignalPlayer
+from emulators.signals import Signals
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import Tag
 
@@ -23,12 +23,12 @@ class PlayedObjects:
     object values of them. Raises `FileInvalid` for a tag whose object the EDS does not have, and where no signal has a tag.
     """
 
-    def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: SignalPlayer) -> None:
+    def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: Signals) -> None:
         self.distortions = Distortions()
         self._player = player
         self._objects: list[tuple[Tag, Key, int]] = []
         for tag in tags:
-            if tag.object is None or tag.name not in player.track.names:
+            if tag.object is None or tag.name not in player.names:
                 continue
             entry = dictionary.entry(*tag.object)
             if entry is None:
@@ -38,9 +38,9 @@ class PlayedObjects:
         if not self._objects:
             raise FileInvalid(
                 "the recording plays nothing of this device",
-                path=player.track.path,
+                path=player.path,
                 expected="signals under names of its tags",
-                got=", ".join(player.track.names),
+                got=", ".join(player.names),
             )
 
     def __call__(self, now_ns: int) -> dict[Key, bytes]:

@@ -15,7 +15,7 @@ from emulators.codec import decode, encode
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
-from emulators.signals import SignalPlayer
+from emulators.signals import Signals
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import DeviceProfile, Tag
@@ -31,7 +31,7 @@ OWN = ("status", "instrument_time")
 class SampledSensor(RegisterBank):
     """The register bank of a sampling sensor. `identity` gives text tags their values (a serial number)."""
 
-    def __init__(self, profile: DeviceProfile, player: SignalPlayer, identity: Mapping[str, str]) -> None:
+    def __init__(self, profile: DeviceProfile, player: Signals, identity: Mapping[str, str]) -> None:
         if profile.sampled is None:
             raise FileInvalid("the profile says nothing about sampling", path=profile.path, expected="`sampled:`")
         self.journal = HeldJournal()
@@ -121,7 +121,7 @@ class SampledSensor(RegisterBank):
     def _sample(self, t_ns: int) -> None:
         """One sample: the signals at the instrument's time, which is the recording's, to the millisecond."""
         time_ms = round(self._player.position_s(t_ns) * 1000)
-        values = self._player.track.values(time_ms / 1000)
+        values = self._player.values_at(time_ms / 1000)
         self.samples += 1
         for tag in self._signals:
             value = values[tag.name]

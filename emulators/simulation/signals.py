@@ -1,0 +1,42 @@
+"""What a device plays of a simulation: its tags' values, as if a recording held them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from emulators.signals import Signals
+from emulators.simulation.simulation import Simulation
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import FileInvalid
+
+
+class SimulatedSignals(Signals):
+    """`plays`: signal -> name in the simulation. A signal that is not simulated is not there. `path` is shown in messages."""
+
+    def __init__(self, simulation: Simulation, plays: Mapping[str, str], path: str) -> None:
+        self.names = tuple(plays)
+        self.path = path
+        self.start_ns = simulation.start_ns
+        self._simulation = simulation
+        self._plays = dict(plays)
+
+    def __len__(self) -> int:
+        """Nothing is used up: a simulation has no rows."""
+        return 0
+
+    def position_s(self, now_ns: int) -> float:
+        return (now_ns - self.start_ns) / NS_PER_S
+
+    def values(self, now_ns: int) -> dict[str, float]:
+        values = self._simulation.values(now_ns)
+        return {signal: values[name] for signal, name in self._plays.items()}
+
+    def values_at(self, position_s: float) -> dict[str, float]:
+        return self.values(self.start_ns + round(position_s * NS_PER_S))
+
+    def at(self, now_ns: int, name: str) -> float:
+        if name not in self._plays:
+            raise FileInvalid(
+                "the simulation has no such signal", path=self.path, expected=", ".join(self.names), got=name
+            )
+        return self._simulation.values(now_ns)[self._plays[name]]

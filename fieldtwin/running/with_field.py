@@ -1,0 +1,181 @@
+"""Somebody else's program against the emulated field: started with the ports in its environment, waited for, its status kept.
+
+What the program does is its own affair: it has the terminal, its output is not touched, and Ctrl-C is for it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import re
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec import structs
+
+from fieldtwin.running.children import Child
+from fieldtwin.running.field_contact import FieldContact, contact_here
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.wallclock import WallClock
+from twin.field_process import FieldConfig, resolve
+from twin.instance import Instance
+from twin.system import System, load_system
+
+FIELD_LINGER_S = 0.5
+END_WITHIN_S = 5.0
+"""After SIGTERM to us the program has so long to end before it is killed."""
+OURS = ("RUN", "PROFILES", "TOKEN", "TRACEBACK", "JSON", "SYSTEM", "CONTROL", "FIELD")
+"""FIELDTWIN_ names that mean something else already: a bus of such a name has the longer variables only."""
+
+Tell = Callable[[dict[str, str]], None]
+
+
+def environment(contact: FieldContact, system: System, control: Path) -> dict[str, str]:
+    """What the program finds the field by (docs/scenarios.md has the table)."""
+    env = {"FIELDTWIN_SYSTEM": str(system.path.resolve()), "FIELDTWIN_CONTROL": str(control)}
+    for name, bus in system.buses.items():
+        endpoint = contact.mapping.get(bus.endpoint)
+        if endpoint is not None:
+            env |= _of_endpoint(_word(name), endpoint)
+    for name, device in system.devices.items():
+        kind = "NODE" if system.buses[device.bus].endpoint.is_can else "UNIT"
+        env[f"FIELDTWIN_{_word(name)}_{kind}"] = str(device.address)
+    for device_name, endpoint in contact.far.items():
+        env |= _of_endpoint(f"{_word(device_name)}_FAR", endpoint)
+    return env
+
+
+def _word(name: str) -> str:
+    return re.sub(r"[^A-Z0-9]", "_", name.upper())
+
+
+def _of_endpoint(word: str, endpoint: Endpoint) -> dict[str, str]:
+    """FIELDTWIN_`word` and its kin: the short form is a path, HOST:PORT, or a CAN channel."""
+    parts = {"URL": str(endpoint)}
+    if endpoint.is_serial:
+        short = endpoint.path
+        settings = endpoint.serial
+        parts |= {"TTY": short, "BAUDRATE": str(settings.baudrate), "FRAME": settings.frame}
+    elif endpoint.is_can:
+        short = endpoint.path
+        parts |= {"INTERFACE": endpoint.interface, "CHANNEL": short}
+    else:
+        host, port = endpoint.address
+        short = f"{host}:{port}"
+    if not endpoint.is_serial and (not endpoint.is_can or endpoint.interface == "fieldtwin"):
+        host, port = endpoint.address
+        parts |= {"HOST": host, "PORT": str(port)}
+    env = {f"FIELDTWIN_{word}_{part}": value for part, value in parts.items()}
+    return env if word in OURS else {f"FIELDTWIN_{word}": short, **env}
+
+
+async def run_with(
+    config: FieldConfig, argv: Sequence[str], *, instance: str = "", faults: Sequence[dict[str, Any]] = (), tell: Tell
+) -> int:
+    """Bring the field side of `config` up (its `run_dir` is chosen here), run `argv`, take all down; the exit status of `argv`,
+    128 and the signal's number where a signal ended it. `tell` is given the environment before `argv` starts.
+
+    Raises `UsageError` for a program that there is not, before anything starts; `ChildFailed` when the field side ended
+    meanwhile and the program had nothing to object.
+    """
+    program = shutil.which(argv[0])
+    if program is None:
+        raise UsageError(f"cannot start {argv[0]!r}: no such program", hint="is it on the PATH, and executable?")
+    resolve(config)  # what can be wrong in the files is wrong before anything starts
+    system = load_system(config.system, [Path(p) for p in config.profiles])
+    name = instance or f"with-{os.getpid()}"
+    with Instance(name) as home:
+        try:
+            return await _inside(
+                home, structs.replace(config, run_dir=str(home.dir)), system, [program, *argv[1:]], faults, tell
+            )
+        finally:
+            if not instance:  # nobody else knows its name
+                shutil.rmtree(home.dir, ignore_errors=True)
+
+
+async def _inside(
+    home: Instance,
+    config: FieldConfig,
+    system: System,
+    argv: list[str],
+    faults: Sequence[dict[str, Any]],
+    tell: Tell,
+) -> int:
+    path = home.path("field.json")
+    path.write_bytes(msgspec.json.encode(config))
+    path.chmod(0o600)
+    child = Child("field", "twin.field_process", path, home.dir, FIELD_LINGER_S)
+    try:
+        contact = await contact_here(await child.connect(), system, home.dir)
+        try:
+            env = environment(contact, system, child.socket)
+            start_ns = WallClock().monotonic_ns()
+            for fault in faults:
+                await contact.client.call("fault", fault=fault, start_ns=start_ns)
+            tell(env)
+            status = await _run_program(argv, env)
+        finally:
+            await contact.aclose()
+        failed = child.failure()
+        if failed is not None and status == 0:
+            raise failed
+        return status
+    finally:
+        await child.end()
+
+
+async def _run_program(argv: list[str], env: Mapping[str, str]) -> int:
+    loop = asyncio.get_running_loop()
+    terminated = asyncio.Event()
+    try:
+        process = await asyncio.create_subprocess_exec(*argv, env={**os.environ, **env})
+    except OSError as e:
+        raise UsageError(f"cannot start {argv[0]!r}: {e.strerror or e}") from e
+
+    def pass_on(number: int) -> None:
+        with suppress(ProcessLookupError):
+            process.send_signal(number)
+
+    def interrupted() -> None:
+        if not _has_terminal():  # else the terminal told the program, too
+            pass_on(signal.SIGINT)
+
+    def to_end() -> None:
+        pass_on(signal.SIGTERM)
+        terminated.set()
+
+    loop.add_signal_handler(signal.SIGINT, interrupted)
+    loop.add_signal_handler(signal.SIGTERM, to_end)
+    try:
+        ended = asyncio.ensure_future(process.wait())
+        told = asyncio.ensure_future(terminated.wait())
+        try:
+            await asyncio.wait([ended, told], return_when=asyncio.FIRST_COMPLETED)
+            if not ended.done():
+                await asyncio.wait([ended], timeout=END_WITHIN_S)
+            if not ended.done():
+                pass_on(signal.SIGKILL)
+            code = await ended
+        finally:
+            told.cancel()
+            await asyncio.gather(told, return_exceptions=True)
+    finally:
+        loop.remove_signal_handler(signal.SIGINT)
+        loop.remove_signal_handler(signal.SIGTERM)
+    return code if code >= 0 else 128 - code
+
+
+def _has_terminal() -> bool:
+    """Whether Ctrl-C in our terminal reaches the program as well: both are in the terminal's foreground group."""
+    try:
+        return os.isatty(sys.stdin.fileno()) and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except (OSError, ValueError, AttributeError):
+        return False

@@ -232,12 +232,15 @@ def _tags(session: RunSession) -> Table:
     table.add_column("unit", no_wrap=True)
     table.add_column("quality", no_wrap=True)
     table.add_column("age", justify="right", no_wrap=True)
+    secrets = {
+        f"{d.name}.{t.name}" for d in session.system.devices.values() for t in d.profile.tags.values() if t.secret
+    }
     units = {f"{d.name}.{t.name}": t.unit for d in session.system.devices.values() for t in d.profile.tags.values()}
     for name, tag in list((session.gateway_status or {}).get("tags", {}).items())[:MAX_TAGS]:
         quality = tag["quality"] + (f" ({tag['reason']})" if tag["reason"] != "none" else "")
         table.add_row(
             name,
-            value_text(tag["value"]),
+            "(secret)" if name in secrets else value_text(tag["value"]),
             units.get(name, ""),
             Text(quality, COLOUR.get(tag["quality"], "")),
             age_text(tag["age_s"]),

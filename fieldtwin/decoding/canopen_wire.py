@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from fieldtwin.decoding.exchange import Exchange, Span
+from fieldtwin.decoding.exchange import SECRET, Exchange, Span
 from fieldtwin.decoding.lss_watch import LssWatch
 from fieldtwin.decoding.node_map import NodeMap, Pdo
 from fieldtwin.decoding.sdo_watch import SdoWatch, Seen, Transfer
@@ -94,12 +94,15 @@ class CanopenWire:
         return text, [
             Exchange(
                 t_ns, t_ns, self.bus, self._device(node), node, 0, service, spans, tags=tags or {}, request=data,
-                problem=problem, text=text, value=value,
+                problem=problem, text=text, value=value, secrets=self._secrets(node, spans),
             )
         ]  # fmt: skip
 
     def _device(self, node: int) -> str:
         return self._nodes[node].name if node in self._nodes else ""
+
+    def _secrets(self, node: int, spans: tuple[Span, ...]) -> frozenset[str]:
+        return self._nodes[node].tags.secrets(spans) if node in self._nodes else frozenset()
 
     def _called(self, node: int) -> str:
         return self._device(node) or f"node {node}"
@@ -135,7 +138,9 @@ class CanopenWire:
         try:
             values = pdo.mapping.unpack(data)
         except FieldtwinError:
-            text = f"{head} {data.hex(' ')}, {pdo.mapping.length} bytes were mapped"
+            mapped = [Span("read", "object", e.index, 1, e.subindex) for e in pdo.mapping.entries]
+            said = SECRET if node.tags.secrets(mapped) else data.hex(" ")
+            text = f"{head} {said}, {pdo.mapping.length} bytes were mapped"
             return self._message(t_ns, pdo.node, pdo.name, text, data, problem="malformed")
         access = "read" if pdo.sends else "write"
         tags: dict[str, Scalar | None] = {}
@@ -144,7 +149,9 @@ class CanopenWire:
             spans.append(Span("read" if access == "read" else "write", "object", entry.index, 1, entry.subindex))
             found, value = node.value(entry.index, entry.subindex, raw, t_ns)
             tags |= found
-            if not found:
+            if not found and node.tags.secrets(spans[-1:]):
+                others.append(f"{node.named(entry.index, entry.subindex)} {SECRET}")
+            elif not found:
                 others.append(f"{node.named(entry.index, entry.subindex)} {show_value(value)}")
         said = ", ".join(filter(None, [node.tags.show(tags), *others]))
         return self._message(t_ns, pdo.node, pdo.name, f"{head} {said}", data, spans=tuple(spans), tags=tags)
@@ -162,7 +169,9 @@ class CanopenWire:
             return f"{self._called(node)}: {done[-1].reply_text}", done
         if watch.open is not None and watch.open.request is data and not reply:
             return self._asked(node, watch.open), done
-        return f"{self._called(node)}: {seen.text}", done
+        opened = watch.open  # of its segments nothing is said but that they came, and of a secret's not even which
+        hidden = opened is not None and self._secrets(node, (_span(opened),))
+        return f"{self._called(node)}: {seen.text}" + (f" {SECRET}" if hidden else ""), done
 
     def _asked(self, node: int, transfer: Transfer) -> str:
         """The request of a transfer, with the name of the object and what is written at once."""
@@ -193,13 +202,13 @@ class CanopenWire:
         else:
             reply_text = f"{named} = {self._said(node, transfer)}" if transfer.upload else f"{named}: written"
         known = value is not None and not (failed and transfer.upload)
+        span = _span(transfer)
         return Exchange(
-            transfer.t_ns, t_ns, self.bus, self._device(node), node, 0, transfer.service,
-            (Span("read" if transfer.upload else "write", "object", transfer.index, 1, transfer.subindex),),
+            transfer.t_ns, t_ns, self.bus, self._device(node), node, 0, transfer.service, (span,),
             tags=tags if known else dict.fromkeys(tags), abort=transfer.abort,
             latency_ns=None if problem == "no reply" else t_ns - transfer.t_ns, request=transfer.request,
             reply=transfer.reply, problem=problem, text=text, reply_text=reply_text,
-            value=value if known else None,
+            value=value if known else None, secrets=self._secrets(node, (span,)),
         )  # fmt: skip
 
     def _value(self, node: int, transfer: Transfer, t_ns: int) -> tuple[dict[str, Scalar | None], Scalar | None]:
@@ -214,3 +223,7 @@ class CanopenWire:
 
     def _find_pdos(self) -> None:
         self._pdos = {cob: pdo for node in self._nodes.values() for cob, pdo in node.pdos.items()}
+
+
+def _span(transfer: Transfer) -> Span:
+    return Span("read" if transfer.upload else "write", "object", transfer.index, 1, transfer.subindex)

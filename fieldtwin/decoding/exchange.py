@@ -11,6 +11,9 @@ from typing import Any, Literal
 from gateway.core.profile import RegisterRange, Table
 from gateway.core.values import Scalar
 
+SECRET = "(secret)"
+"""What is shown of a tag that nobody is to see."""
+
 Access = Literal["read", "write"]
 
 
@@ -73,6 +76,8 @@ class Exchange:
     text: str = ""
     reply_text: str = ""
     value: Scalar | None = None
+    secrets: frozenset[str] = frozenset()
+    """Tags of it that nobody is to see; with "" among them, no raw word of it either. Checks still know the values."""
 
     @property
     def access(self) -> str:
@@ -99,16 +104,16 @@ class Exchange:
         return any(s.access == "read" for s in self.spans) and (not tag or tag in self.tags)
 
     def describe(self) -> dict[str, Any]:
-        """As plain data, for JSON."""
+        """As plain data, for JSON. Of secrets there is no value."""
         return {
             "device": self.device,
             "unit": self.unit,
             "function": self.function,
             "service": self.service,
             "spans": [f"{s.access} {s}" for s in self.spans],
-            "registers": list(self.registers),
-            "tags": self.tags,
-            "value": self.value,
+            "registers": [] if self.secrets else list(self.registers),
+            "tags": {name: SECRET if name in self.secrets else value for name, value in self.tags.items()},
+            "value": SECRET if self.secrets and self.value is not None else self.value,
             "exception": self.exception,
             "abort": self.abort,
             "latency_ms": None if self.latency_ns is None else self.latency_ns / 1e6,

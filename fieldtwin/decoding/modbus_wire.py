@@ -10,10 +10,10 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fieldtwin.decoding.exchange import Exchange, Span
+from fieldtwin.decoding.exchange import SECRET, Exchange, Span
 from fieldtwin.decoding.modbus_frames import Expected, Frame, splitter
 from fieldtwin.decoding.modbus_pdu import Asked, parse_reply, parse_request, words
-from fieldtwin.decoding.tags import SECRET, TagMap
+from fieldtwin.decoding.tags import TagMap
 from gateway.core.values import Scalar
 
 MAX_OPEN = 64
@@ -247,6 +247,7 @@ class ModbusWire:
             problem=problem or asked.problem,
             text=opened.text,
             reply_text=reply_text,
+            secrets=opened.tags.secrets(asked.spans) if opened.tags is not None else frozenset(),
         )
 
 

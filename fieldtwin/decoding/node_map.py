@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fieldtwin.decoding.exchange import SECRET, Span
 from fieldtwin.decoding.tags import TagMap, show_value
 from gateway.core.errors import FieldtwinError
 from gateway.core.values import Scalar
@@ -99,6 +100,8 @@ class NodeMap:
                 return f"{word & 0x7FF:03X}h" + (" (off)" if word & PDO_INVALID else "")
             if index in _MAPPINGS and subindex:
                 return str(PdoEntry.from_word(word))
+        if self.tags.secrets((Span("read", "object", index, 1, subindex),)):
+            return SECRET
         tags, value = self.value(index, subindex, data, t_ns)
         if not tags:
             return show_value(value) if not isinstance(value, str) or value != data.hex() else data.hex(" ")

@@ -6,15 +6,13 @@ Values are the driver's (gateway.devices.codec): a report says what the gateway 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from fieldtwin.decoding.exchange import Span
+from fieldtwin.decoding.exchange import SECRET, Span
 from gateway.core.profile import Box, DeviceProfile, Tag
 from gateway.core.values import Scalar, TagValue
 from gateway.devices.codec import apply_scale, decode, decode_little
-
-SECRET = "(secret)"
-"""What is shown of a tag that nobody is to see."""
 
 _KEPT_PLANS = 1024
 """Different spans of a device whose tags are remembered: a scan of all addresses may not fill the memory."""
@@ -50,11 +48,14 @@ class TagMap:
 
     def secret(self, span: Span) -> bool:
         """Whether any part of `span` is nobody's business."""
-        return any(
-            tag.secret and tag.at and tag.at.table == span.table
-            and tag.at.address < span.address + span.count and span.address < tag.at.end
-            for tag in self._secrets
-        )  # fmt: skip
+        return any(_touches(tag, span) for tag in self._secrets)
+
+    def secrets(self, spans: Iterable[Span]) -> frozenset[str]:
+        """`Exchange.secrets` of an exchange that touches `spans`."""
+        if not self._secrets:
+            return frozenset()
+        found = {tag.name for span in spans for tag in self._secrets if _touches(tag, span)}
+        return frozenset(found | {""}) if found else frozenset()
 
     def of_registers(self, span: Span, data: bytes, t_ns: int) -> dict[str, Scalar | None]:
         """Values by name from the register bytes of `span`, as on the wire; bits as one byte each (0 or 1).
@@ -119,6 +120,15 @@ class TagMap:
             tuple((name, at.address - span.address, at.count) for name, at in blocks),
             tuple((b, b.at.address - span.address) for b in boxes),
         )
+
+
+def _touches(tag: Tag, span: Span) -> bool:
+    if span.table == "object":
+        return tag.object == (span.address, span.subindex)
+    at = tag.at
+    return (
+        at is not None and at.table == span.table and at.address < span.address + span.count and span.address < at.end
+    )
 
 
 _OBJECT_BYTES = {

@@ -7,13 +7,12 @@ One pass over the events for all windows of a scenario; each keeps at most `MOST
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from fieldtwin.decoding.decoder import Decoder
-from fieldtwin.decoding.exchange import Exchange
-from fieldtwin.decoding.tags import SECRET
+from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.report.coverage import Collector
 from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult
 from fieldtwin.scenarios.trace import Event, Kind
@@ -115,6 +114,7 @@ class Study:
         self._scenario = scenario
         devices = report.system.devices.values() if report.system else ()
         self._secrets = {f"{d.name}.{t.name}" for d in devices for t in d.profile.tags.values() if t.secret}
+        self._hiding = {d.bus for d in devices if any(t.secret for t in d.profile.tags.values())}
         self._now: dict[Kind, dict[str, Step]] = {Kind.TAG: {}, Kind.STATE: {}}
         self._on: dict[str, FaultBar] = {}
         self._off: list[FaultBar] = []
@@ -161,7 +161,11 @@ class Study:
                 decoded = self._decoder.decode(event)
                 done = decoded.exchanges
                 line = FrameLine(
-                    event.t_ns, event.where, data.get("dir") == "sent", _raw(event, decoded.text), decoded.text
+                    event.t_ns,
+                    event.where,
+                    data.get("dir") == "sent",
+                    _raw(event, decoded.text, self._hiding),
+                    decoded.text,
                 )
                 for window in inside:
                     _keep(window, line)
@@ -245,10 +249,11 @@ def _keep(window: Window, line: FrameLine) -> None:
         window.after.append(line)
 
 
-def _raw(event: Event, text: str) -> str:
-    """The bytes as they are written, a CAN identifier before them; nothing of a frame whose words hide something."""
+def _raw(event: Event, text: str, hiding: Collection[str]) -> str:
+    """The bytes as they are written, a CAN identifier before them; nothing of a frame whose words hide something, nor of a
+    part of one on a bus where something is hidden."""
     data = event.data
-    if SECRET in text:
+    if SECRET in text or (not text and event.where in hiding):
         return SECRET
     raw = " ".join(data.get("bytes", "")[i : i + 2] for i in range(0, len(data.get("bytes", "")), 2))
     return f"{data['id']:03X} # {raw}" if isinstance(data.get("id"), int) else raw

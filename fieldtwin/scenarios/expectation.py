@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from emulators.faults.schema import seconds
-from fieldtwin.decoding.exchange import Exchange
-from fieldtwin.scenarios.bench import Bench
+from fieldtwin.decoding.exchange import SECRET, Exchange
+from fieldtwin.scenarios.bench import Bench, Reading
 from fieldtwin.scenarios.form import Bounds, Expect
 from gateway.devices.codec import decode, decode_little
 from twin.system import System
@@ -49,6 +49,19 @@ async def judge_tag(expect: Expect, watched: Watched) -> Said:
             return f"{expect.tag}: {low:g} to {high:g} updates/s", f"{rate:.3g} in {took_s:g} s"
     if reading is None:
         return f"{expect.tag}", "never published"
+    said = await _judge_value(expect, watched, reading)
+    return said if said is None or not is_secret(watched.system, expect.tag) else (f"{expect.tag}", SECRET)
+
+
+def is_secret(system: System, name: str) -> bool:
+    """Whether nobody is to see the value of DEVICE.TAG."""
+    device, _, tag = name.partition(".")
+    found = system.devices[device].profile.tags.get(tag) if device in system.devices else None
+    return found is not None and found.secret
+
+
+async def _judge_value(expect: Expect, watched: Watched, reading: Reading) -> Said:
+    assert expect.tag is not None
     if expect.quality is not None and reading.quality != expect.quality:
         return f"{expect.tag} {expect.quality}", f"{reading.quality} ({reading.reason})"
     if expect.value is not None and not _near(reading.value, expect.value, expect.tolerance):

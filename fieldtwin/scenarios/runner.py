@@ -13,10 +13,10 @@ from typing import Any
 
 from emulators.faults.schema import seconds
 from fieldtwin.decoding.decoder import Decoder
-from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.scenarios.bench import Bench, Can
-from fieldtwin.scenarios.expectation import Watched, judge_tag, judge_wire
+from fieldtwin.scenarios.expectation import Watched, is_secret, judge_tag, judge_wire
 from fieldtwin.scenarios.expression import Expression
 from fieldtwin.scenarios.form import Expect, Scenario, Step, WireForm, word_of
 from fieldtwin.scenarios.trace import Event, Kind
@@ -289,12 +289,10 @@ class Runner:
     def _seen(self, names: Iterable[str]) -> str:
         told = []
         for name in dict.fromkeys(names):
-            reading = self.bench.reading(name)
-            shown = (
-                "never published"
-                if reading is None
-                else f"{reading.value!r} {reading.quality}, {reading.age_s:.3f} s old"
-            )
+            reading, shown = self.bench.reading(name), "never published"
+            if reading is not None:
+                value = SECRET if is_secret(self.scenario.system, name) else repr(reading.value)
+                shown = f"{value} {reading.quality}, {reading.age_s:.3f} s old"
             told.append(f"{name}: {shown}")
         return "; ".join(told)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -241,3 +243,34 @@ def test_a_segment_that_was_lost_comes_again() -> None:
     done = watch.request(bytes.fromhex("A1 00000000000000"), 8).done
     assert done is not None
     assert bytes(done.data) == b"abcdefghijklmnopqrstu"
+
+
+def test_secrets_have_no_value_in_words_nor_in_json() -> None:
+    system = observatory()
+    tags = system.devices["inclinometer"].profile.tags
+    hidden = {name: replace(tag, secret=name in ("serial", "slope_lateral")) for name, tag in tags.items()}
+    profile = replace(system.devices["inclinometer"].profile, tags=hidden)
+    device = replace(system.devices["inclinometer"], profile=profile)
+    system = replace(system, devices={**system.devices, "inclinometer": device})
+    decoder, told = Decoder(system), []
+    frames = ["605#4018100400000000", "585#43181004ED030000", "605#2318100477000000", "185#9E013599", "185#9E01FF"]
+    found: list[Exchange] = []
+    for ms, frame in enumerate(frames):
+        decoded = decoder.decode(can(ms, frame))
+        told.append(decoded.text)
+        found += decoded.exchanges
+    assert told == [
+        "inclinometer: SDO upload 1018h:04 serial",
+        "inclinometer: 1018h:04 serial = (secret)",
+        "inclinometer: SDO download 1018h:04 serial = (secret)",
+        "inclinometer: TPDO1 slope_long 4.14 deg, slope_lateral (secret)",
+        "inclinometer: TPDO1 (secret), 4 bytes were mapped",
+    ]
+    shown = json.dumps([e.describe() for e in found])
+    assert "1005" not in shown
+    assert str(found[1].tags["slope_lateral"]) not in shown
+    assert found[0].value == 1005  # a check still knows
+    segment = [can(10, "605#4018100400000000"), can(11, "585#4118100408000000"), can(12, "605#6000000000000000")]
+    assert [decoder.decode(e).text.endswith("(secret)") for e in (*segment, can(13, "585#0041424344454647"))][1:] == [
+        True
+    ] * 3

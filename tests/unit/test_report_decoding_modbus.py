@@ -286,4 +286,11 @@ def test_secrets_have_no_value_in_words() -> None:
     words = wire.feed(True, with_crc(bytes.fromhex("01 10 000E 0002 04 447A0000")), 0)[0]
     assert words == ["meter: write registers 40015 (holding:14) x 2: password (secret)"]
     wire.feed(True, with_crc(bytes.fromhex("01 03 000F 0001")), 1)
-    assert wire.feed(False, with_crc(bytes.fromhex("01 03 02 0000")), 2)[0] == ["meter: (secret)"]  # half of it
+    texts, (half,) = wire.feed(False, with_crc(bytes.fromhex("01 03 02 1234")), 2)  # half of it
+    assert texts == ["meter: (secret)"]
+    wire.feed(True, with_crc(bytes.fromhex("01 10 000E 0002 04 447A0000")), 3)
+    (written,) = wire.feed(False, with_crc(bytes.fromhex("01 10 000E 0002")), 4)[1]
+    assert written.tags == {"password": 1000.0}  # a scenario can check it
+    for exchange in (half, written):
+        told = exchange.describe()
+        assert (told["registers"], set(told["tags"].values()) <= {"(secret)"}) == ([], True)

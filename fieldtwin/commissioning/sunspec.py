@@ -1,0 +1,33 @@
+"""The SunSpec header and its chain of models (SunSpec Device Information Model, 6.1 to 6.3). Pure text and numbers.
+
+A map begins with the characters ``SunS`` at 40000, 50000 or 0 as sent; then models follow one another, each with its number
+and its length in registers, up to number FFFFh. Model 1 names the maker.
+"""
+
+from __future__ import annotations
+
+BASES = (40000, 50000, 0)
+HEADER = b"SunS"
+END = 0xFFFF
+MOST_MODELS = 64
+COMMON, COMMON_REGISTERS = 1, 66
+_FIELDS = {"manufacturer": (2, 16), "model": (18, 16), "version": (42, 8), "serial": (50, 16)}
+"""Of model 1: from its number on, offset and length in registers."""
+
+
+def text_of(data: bytes) -> str:
+    """Characters up to the first zero."""
+    return data.split(b"\0")[0].decode("ascii", "replace").strip()
+
+
+def common(data: bytes) -> dict[str, str]:
+    """The names in model 1, whose registers `data` are from its number on; as far as they go."""
+    return {name: text_of(data[2 * at : 2 * (at + size)]) for name, (at, size) in _FIELDS.items()}
+
+
+def next_model(data: bytes, address: int) -> tuple[int, int, int] | None:
+    """The model whose number and length stand in `data`, read at `address`: number, address, length. None at the end."""
+    number, size = int.from_bytes(data[:2], "big"), int.from_bytes(data[2:4], "big")
+    if number in (0, END) or address + 2 + size > 0x10000:
+        return None
+    return number, address, size

@@ -1,0 +1,150 @@
+"""`identify` of Modbus units: the right profile first, and never sure of a wrong one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from commissioning_rig import Wired, bank, loop, run_virtually, unit
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from emulators.modbus.bank import Span
+from emulators.modbus.identification import Identification
+from emulators.modbus.unit import ModbusUnit, UnitParts
+from emulators.recorded_device import load_replay
+from emulators.replay.unit import ReplayUnit
+from fieldtwin.commissioning.identify_modbus import ModbusIdentity, identify_modbus
+from fieldtwin.commissioning.matching import Candidate, ModbusClues, Sureness, judge_modbus, summary
+from fieldtwin.commissioning.sunspec import next_model
+from gateway.core.profile import DeviceProfile, load_profile
+
+URL = "tcp://192.0.2.1:502"
+SHIPPED = [load_profile(path) for path in sorted(Path("profiles/devices").glob("*.yaml"))]
+RECORDED = ["aqualabo-c4e", "delta-vfd-e", "eastron-sdm630", "renogy-rover", "sunspec-inverter-103"]
+MADE_UP = """
+device: acme/thermo
+source: made up
+protocol: modbus
+numbering: sent
+identification: {0: ACME, 1: T-1000, 2: "1.0"}
+server_id: "01020304ff"
+tags:
+  temperature: {at: "holding:0", type: int16}
+"""
+
+
+async def identify(device: ModbusUnit, number: int, profiles: list[DeviceProfile]) -> ModbusIdentity:
+    wire = Wired(device, number)
+    found = await identify_modbus(URL, number, profiles, connector=wire, clock=loop(), timeout_s=0.2)
+    assert all(pdu[0] in (1, 2, 3, 4, 0x11, 0x2B) for pdu in wire.requests), "only reads"
+    return found
+
+
+def levels(found: ModbusIdentity) -> dict[str, Sureness]:
+    return {c.profile: c.sureness for c in found.candidates}
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_a_shipped_device_is_matched_with_its_own_profile_first(name: str) -> None:
+    """A replayed device tells no identity of its own, so nothing may be certain."""
+
+    async def main() -> None:
+        profile = next(p for p in SHIPPED if Path(p.path).stem == name)
+        replay, number = load_replay(profile, Path(f"recordings/{name}.jsonl"))
+        found = await identify(ReplayUnit(replay, number, name), number, SHIPPED)
+        best = found.candidates[0]
+        told = levels(found)
+        assert found.answers
+        assert told[profile.name] is best.sureness, (best, found.candidates)
+        assert told[profile.name] is not Sureness.RULED_OUT
+        assert found.certain is None
+        assert best.reasons
+
+    run_virtually(main())
+
+
+def test_what_a_unit_says_of_itself_is_certain_and_another_ones_words_rule_out(tmp_path: Path) -> None:
+    path = tmp_path / "thermo.yaml"
+    path.write_text(MADE_UP)
+    thermo = load_profile(path)
+
+    async def main() -> None:
+        spans = [Span("holding", 0, 4)]
+        said = UnitParts(identification=Identification({0: b"ACME", 1: b"T-1000", 2: b"2.1"}))
+        same = await identify(ModbusUnit(bank(spans), **said), 1, [*SHIPPED, thermo])
+        assert same.certain == "acme/thermo"
+        assert same.clues.objects == {0: "ACME", 1: "T-1000", 2: "2.1"}
+        assert "certain" in same.summary
+        other = UnitParts(identification=Identification({0: b"ACME", 1: b"T-2000", 2: b"2.1"}))
+        sister = await identify(ModbusUnit(bank(spans), **other), 1, [thermo])
+        assert levels(sister) == {"acme/thermo": Sureness.RULED_OUT}
+        assert "product code is 'T-2000'" in sister.candidates[0].against[0]
+        server = await identify(ModbusUnit(bank(spans), server_id=bytes.fromhex("01020304ff")), 1, [thermo])
+        assert levels(server) == {"acme/thermo": Sureness.LIKELY}
+        mute = await identify(ModbusUnit(bank(spans)), 1, [thermo])
+        assert levels(mute)["acme/thermo"] is Sureness.RULED_OUT, "an integer that can be read says nothing"
+
+    run_virtually(main())
+
+
+def test_sunspec_is_read_model_by_model() -> None:
+    async def main() -> None:
+        words = {40000: [0x5375, 0x6E53, 1, 66], 40070: [103, 50], 40122: [0xFFFF, 0]}
+        name = [int.from_bytes(b"Sunny\0"[i : i + 2], "big") for i in range(0, 6, 2)]
+        device = unit(bank([Span("holding", 40000, 200)], {"holding": {**words, 40004: name}}))
+        found = await identify(device, 1, SHIPPED)
+        spec = found.clues.sunspec
+        assert spec is not None
+        assert (spec.base, spec.models, spec.manufacturer) == (40000, ((1, 40002, 66), (103, 40070, 50)), "Sunny")
+        assert found.certain == "sunspec/inverter-103"
+        other = unit(bank([Span("holding", 40000, 200)], {"holding": {**words, 40070: [101, 50], 40004: name}}))
+        single_phase = await identify(other, 1, SHIPPED)
+        assert levels(single_phase)["sunspec/inverter-103"] is Sureness.RULED_OUT
+
+    run_virtually(main())
+
+
+@given(st.lists(st.integers(0, 0xFFFF), min_size=1, max_size=40), st.booleans())
+@settings(max_examples=25, deadline=None)
+def test_any_registers_never_make_certain(pattern: list[int], zeros: bool) -> None:
+    async def main() -> None:
+        words = [0] * 65 if zeros else (pattern * 65)[:65]
+        spans = [Span(t, a, 0x1000) for t in ("holding", "input") for a in (0, 0x2000, 39936)]  # type: ignore[arg-type]
+        values = {t: {a + i * 65: words for a in (0, 0x2000, 39936) for i in range(63)} for t in ("holding", "input")}
+        found = await identify(unit(bank(spans, values)), 1, SHIPPED)
+        sure = [c for c in found.candidates if c.sureness is Sureness.CERTAIN]
+        assert not sure or found.clues.sunspec is not None
+        if zeros:
+            assert all(c.sureness < Sureness.LIKELY for c in found.candidates)
+
+    run_virtually(main())
+
+
+def test_silence_is_told_as_silence() -> None:
+    async def main() -> None:
+        wire = Wired(unit(bank([Span("holding", 0, 1)])), 9)
+        found = await identify_modbus(URL, 1, SHIPPED, connector=wire, clock=loop(), timeout_s=0.1)
+        assert not found.answers
+        assert found.summary == "unit 1 does not answer"
+        assert found.candidates == []
+
+    run_virtually(main())
+
+
+def test_two_that_fit_equally_are_no_answer() -> None:
+    two = [Candidate(name, Sureness.LIKELY, ("x",)) for name in ("a/b", "c/d")]
+    assert summary(two) == "2 profiles fit equally well (likely): a/b, c/d"
+    assert summary([Candidate("a/b", Sureness.RULED_OUT, ())]) == "no known profile fits"
+
+
+@given(st.binary(max_size=6), st.integers(0, 0xFFFF))
+def test_a_chain_of_models_ends(data: bytes, address: int) -> None:
+    model = next_model(data, address)
+    assert model is None or model[1] + 2 + model[2] <= 0x10000
+
+
+def test_nothing_read_is_nothing_known() -> None:
+    for profile in SHIPPED:
+        if profile.protocol == "modbus":
+            assert judge_modbus(profile, ModbusClues(), {}).sureness is Sureness.RULED_OUT

@@ -1,0 +1,459 @@
+"""Threads, sans-IO: whatever a network loses, repeats and turns round, and whoever dies when, both logs are equal in the end."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import random
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from gateway.core.clock import NS_PER_MS, NS_PER_S
+from gateway.core.errors import Desync
+from gateway.store.event import Event, Kind, merged, without
+from twin.thread_core import WINDOW, Effect, Incoming, Keep, NoteLost, Open, Outgoing
+from twin.thread_frames import (
+    Ack,
+    Ask,
+    Data,
+    Frame,
+    FrameCodec,
+    Hello,
+    Lost,
+    Refused,
+    Schema,
+    tag_of,
+    varint,
+    zigzag,
+)
+
+SCHEMA = Schema(("ctd.pressure", "ctd.temperature", "relay"))
+ORIGIN = "plant:5f3a91c2"
+TAG = tag_of(ORIGIN, SCHEMA.id)
+
+
+# -- frames ---------------------------------------------------------------------------------------------------------------
+
+VALUES = (
+    st.none()
+    | st.integers(-(1 << 63), (1 << 63) - 1)
+    | st.floats(allow_nan=False)
+    | st.text(max_size=80)
+    | st.binary(max_size=80)
+)
+EVENTS = st.builds(
+    Event, st.just(0), st.integers(0, 1 << 42), st.integers(0, 6), st.sampled_from([*SCHEMA.names, "another.tag"]), VALUES,
+    st.integers(0, 4), st.integers(0, 14),
+)  # fmt: skip
+
+
+def numbered(events: list[Event], first: int = 1) -> tuple[Event, ...]:
+    return tuple(e._replace(sequence=n) for n, e in enumerate(events, first))
+
+
+def there(codec: FrameCodec, other: FrameCodec, frame: Frame) -> Frame | None:
+    """A frame over a link: every datagram within the MTU."""
+    got: Frame | None = None
+    for datagram in codec.encode(frame):
+        assert len(datagram) <= codec.mtu
+        got = other.decode(datagram)
+    return got
+
+
+@given(
+    events=st.lists(EVENTS, min_size=1, max_size=20), first=st.integers(1, 1 << 40), mtu=st.sampled_from([32, 64, 1400])
+)
+@settings(max_examples=80)
+def test_what_was_logged_arrives_bit_by_bit_in_frames_of_any_size(events: list[Event], first: int, mtu: int) -> None:
+    one, two = FrameCodec([SCHEMA], mtu), FrameCodec([SCHEMA], mtu)
+    there(one, two, Hello("p:1", SCHEMA.id, 1, 9, True))
+    tag = tag_of("p:1", SCHEMA.id)
+    left, got = numbered(events, first), []
+    while left:
+        count = one.fit(tag, left)
+        frame = there(one, two, Data(tag, left[:count]))
+        assert isinstance(frame, Data)
+        got += frame.events
+        left = left[count:]
+    assert got == list(numbered(events, first))
+    assert [type(e.value) for e in got] == [type(e.value) for e in events]
+    assert [math.copysign(1, e.value) for e in got if e.value == 0] == [
+        math.copysign(1, e.value) for e in events if e.value == 0
+    ]
+
+
+RUN = st.integers(1, 99)
+
+
+@given(
+    frame=st.builds(Ack, st.just(TAG), st.integers(0, 1 << 50), st.lists(st.tuples(RUN, RUN), max_size=5).map(tuple))
+    | st.builds(Lost, st.just(TAG), st.integers(1, 99), st.integers(1, 1 << 40))
+    | st.builds(Refused, st.just(TAG), st.binary(min_size=4, max_size=4))
+    | st.just(Ask(TAG))
+    | st.builds(Hello, st.just(ORIGIN), st.just(SCHEMA.id), st.integers(1, 50), st.integers(50, 1 << 40), st.booleans())
+)  # fmt: skip
+def test_small_frames_come_back_as_they_went(frame: Frame) -> None:
+    assert there(FrameCodec([SCHEMA], 64), FrameCodec([SCHEMA], 64), frame) == frame
+
+
+@given(data=st.binary(max_size=80))
+@example(data=b"\x12" + TAG + b"\x01" + b"\xff" * 12)
+@example(data=b"\x13" + TAG + b"\x01\x02\x01")
+def test_no_bytes_break_the_reader(data: bytes) -> None:
+    codec = FrameCodec([SCHEMA], 64)
+    codec.learn(TAG, SCHEMA.id)
+    for text in (data, b"\x12" + TAG + data, b"\x13" + TAG + data, b"\x11" + TAG + data):
+        try:
+            codec.decode(text)
+        except Desync:
+            pass
+
+
+def test_a_sample_takes_so_few_bytes_that_six_go_into_a_modems_frame() -> None:
+    """Values of a float32 sensor, a second apart: 64 bytes hold five or more, with number and absolute time."""
+    codec = FrameCodec([SCHEMA], 64)
+    codec.learn(TAG, SCHEMA.id)
+    events = numbered(
+        [Event(0, 1_790_000_000_000 + 1000 * n, 0, SCHEMA.names[n % 2], n / 8) for n in range(20)], 100_000
+    )
+    assert codec.fit(TAG, events) == 6
+    (one,) = codec.encode(Data(TAG, events[:1]))
+    (two,) = codec.encode(Data(TAG, events[:2]))
+    assert len(two) - len(one) == 8
+
+
+@given(st.integers(0, (1 << 63) - 1))
+def test_numbers_are_short_when_they_are_small(number: int) -> None:
+    assert len(varint(number)) == max(1, math.ceil(number.bit_length() / 7))
+    assert len(zigzag(-number)) <= len(varint(2 * number + 1))
+
+
+# -- a network, and two sides ---------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Store:
+    """What survives: logs by origin."""
+
+    logs: dict[str, dict[int, Event]] = field(default_factory=dict)
+    lost: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
+
+    def append(self, origin: str, event: Event) -> int:
+        log = self.logs.setdefault(origin, {})
+        number = max(log, default=0) + 1
+        log[number] = event._replace(sequence=number)
+        return number
+
+    def gaps(self, origin: str) -> tuple[int, list[tuple[int, int]]]:
+        log = self.logs.get(origin, {})
+        last = max([*log, *(b for _, b in self.lost.get(origin, []))], default=0)
+        return last, without([(1, last)] if last else [], [*((n, n) for n in log), *self.lost.get(origin, [])])
+
+
+class Side:
+    """A twin's end of a thread over a store; `die` forgets everything but the store."""
+
+    def __init__(self, name: str, store: Store, mtu: int, ack_delay_ms: int, now_ns: int) -> None:
+        self.name, self.store, self.mtu, self.ack_delay_ms = name, store, mtu, ack_delay_ms
+        self.origin = f"{name}:1"
+        self.restart(now_ns)
+
+    def restart(self, now_ns: int) -> None:
+        self.codec = FrameCodec([SCHEMA], self.mtu)
+        log = self.store.logs.get(self.origin, {})
+        first, last = min(log, default=1), max(log, default=0)
+        self.out = Outgoing(self.origin, SCHEMA.id, first, last, prototype=True, fit=self.codec.fit)
+        self.into = Incoming(self.codec.knows, self.ack_delay_ms * NS_PER_MS)
+        self.out.connected(now_ns)
+        self.pending: list[Effect] = []
+        """What the store was asked to do and has not done: gone when the side dies."""
+
+    def log(self, event: Event) -> None:
+        self.out.appended(self.store.append(self.origin, event))
+
+    def take(self, datagram: bytes, now_ns: int, dies: bool = False) -> None:
+        frame = self.codec.decode(datagram)
+        if isinstance(frame, Ack) and frame.tag == self.out.tag:
+            self.out.on_ack(frame, now_ns)
+        elif isinstance(frame, Ask) and frame.tag == self.out.tag:
+            self.out.on_ask(now_ns)
+        elif isinstance(frame, Refused):
+            self.out.on_refused(now_ns)
+        elif isinstance(frame, Hello | Data | Lost):
+            effects = self.into.receive(frame, now_ns)
+            if dies:  # between what came and what is kept
+                self.restart(now_ns)
+                return
+            self.pending += effects
+
+    def do(self, effects: list[Effect], now_ns: int) -> None:
+        for effect in effects:
+            if isinstance(effect, Open):
+                self.do(self.into.opened(effect.origin, *self.store.gaps(effect.origin), now_ns), now_ns)
+            elif isinstance(effect, Keep):
+                log = self.store.logs.setdefault(effect.origin, {})
+                for event in effect.events:
+                    assert event.sequence not in log, "each is kept once"
+                    log[event.sequence] = event
+                self.into.kept(effect.origin, effect.events, now_ns)
+            elif isinstance(effect, NoteLost):
+                log = self.store.logs.get(effect.origin, {})
+                ranges = without([(effect.first, effect.last)], [(n, n) for n in log])
+                self.store.lost[effect.origin] = merged([*self.store.lost.get(effect.origin, []), *ranges])
+                self.into.noted(effect.origin, effect.first, effect.last, now_ns)
+
+    def frames(self, now_ns: int, slow: bool) -> list[bytes]:
+        """Everything that is to be sent now. A slow store has not done yet what it was asked to."""
+        out: list[bytes] = []
+        if not slow:
+            self.do(self.pending, now_ns)
+            self.pending = []
+        for _ in range(400):
+            if (wanted := self.out.wanted()) is not None:
+                log = self.store.logs.get(self.origin, {})
+                first, count = wanted
+                self.out.load(first, [log[n] for n in sorted(log) if n >= first][:count])
+            frame = self.into.next_frame(now_ns) or self.out.next_frame(now_ns)
+            if frame is None:
+                break
+            out += self.codec.encode(frame)
+        return out
+
+    def wake_ns(self, now_ns: int) -> int:
+        times = [t for t in (self.out.wake_ns(now_ns), self.into.wake_ns(now_ns)) if t is not None]
+        return max(now_ns + NS_PER_MS, min(times, default=now_ns + 5 * NS_PER_S))
+
+
+@dataclass
+class Net:
+    """Virtual time between two sides: loss, duplicates and delays by a seed, and whatever else happens at its time."""
+
+    seed: int
+    loss: float = 0.0
+    repeat: float = 0.0
+    delay_ms: int = 40
+    mtu: int = 64
+    slow: float = 0.0
+    """How often a store has not done yet what it was asked to."""
+    ack_delay_ms: int = 20
+    now_ns: int = 1
+    sent: int = 0
+
+    def __post_init__(self) -> None:
+        self.random = random.Random(self.seed)
+        self.sides = [Side(name, Store(), self.mtu, self.ack_delay_ms, self.now_ns) for name in ("plant", "shore")]
+        self.queue: list[tuple[int, int, int, bytes]] = []
+        self.cut = False
+
+    def equal(self) -> bool:
+        a, b = self.sides
+        return all(
+            x.store.logs.get(x.origin, {}) == y.store.logs.get(x.origin, {}) and x.out.waiting == 0
+            for x, y in ((a, b), (b, a))
+        )
+
+    def _post(self) -> None:
+        for number, side in enumerate(self.sides):
+            for datagram in side.frames(self.now_ns, slow=self.random.random() < self.slow):
+                self.sent += 1
+                copies = 2 if self.random.random() < self.repeat else 1
+                for _ in range(copies):
+                    if self.cut or self.random.random() < self.loss:
+                        continue
+                    at = self.now_ns + self.random.randint(1, max(1, self.delay_ms * NS_PER_MS))
+                    heapq.heappush(self.queue, (at, self.random.getrandbits(60), 1 - number, datagram))
+
+    def step(self, until_ns: int, deaths: float = 0.0) -> None:
+        """To the next thing that happens, `until_ns` at most."""
+        self._post()
+        times = [side.wake_ns(self.now_ns) for side in self.sides] + [until_ns]
+        if self.queue:
+            times.append(self.queue[0][0])
+        self.now_ns = max(self.now_ns + 1, min(times))
+        while self.queue and self.queue[0][0] <= self.now_ns:
+            _, _, number, datagram = heapq.heappop(self.queue)
+            self.sides[number].take(datagram, self.now_ns, dies=self.random.random() < deaths)
+
+    def run(self, seconds: float, deaths: float = 0.0) -> None:
+        until_ns = self.now_ns + int(seconds * NS_PER_S)
+        while self.now_ns < until_ns:
+            self.step(until_ns, deaths)
+
+    def until_equal(self, within_s: float) -> float:
+        began_ns = self.now_ns
+        while not self.equal():
+            self.step(self.now_ns + NS_PER_S)
+            assert self.now_ns - began_ns < within_s * NS_PER_S, "not equal in time"
+        return (self.now_ns - began_ns) / NS_PER_S
+
+
+def value(n: int) -> Event:
+    return Event(0, n, Kind.VALUE, SCHEMA.names[n % 2], n / 8)
+
+
+@given(
+    seed=st.integers(0, 1 << 30), loss=st.sampled_from([0.0, 0.2, 0.4]), repeat=st.sampled_from([0.0, 0.3]),
+    delay_ms=st.sampled_from([1, 100, 3000]), deaths=st.sampled_from([0.0, 0.02]), mtu=st.sampled_from([64, 1400]),
+    events=st.lists(EVENTS, max_size=120),
+)  # fmt: skip
+@settings(max_examples=40, deadline=None)
+def test_whatever_happens_on_the_way_both_logs_are_equal_in_the_end(
+    seed: int, loss: float, repeat: float, delay_ms: int, deaths: float, mtu: int, events: list[Event]
+) -> None:
+    net = Net(seed, loss, repeat, delay_ms, mtu)
+    for event in events:
+        net.sides[net.random.randrange(2)].log(event)
+        if net.random.random() < 0.3:
+            net.run(net.random.random(), deaths)
+        if deaths and net.random.random() < 0.05:
+            net.sides[net.random.randrange(2)].restart(net.now_ns)
+    net.until_equal(within_s=3600)
+    assert sum(len(side.store.logs.get(side.origin, {})) for side in net.sides) == len(events)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_long_logs_through_loss_reordering_repeats_and_deaths_are_equal_in_the_end(seed: int) -> None:
+    """20 % loss and more; either side dies between what came and what is kept, and at any other instant."""
+    chosen = random.Random(seed)
+    net = Net(
+        seed,
+        chosen.choice([0.2, 0.4]),
+        chosen.choice([0, 0.3]),
+        chosen.choice([1, 100, 100, 3000]),
+        chosen.choice([64, 1400]),
+    )
+    net.slow, deaths = 0.7, chosen.choice([0.0, 0.1, 0.1])
+    for side in net.sides:
+        side.ack_delay_ms = chosen.choice([0, 0, 500])
+        side.restart(net.now_ns)
+    for n in range(chosen.randrange(100, 400)):
+        net.sides[chosen.randrange(2)].log(value(n))
+        if chosen.random() < 0.3:
+            net.run(chosen.random(), deaths)
+    net.until_equal(within_s=3600)
+
+
+def test_one_lost_frame_is_sent_again_as_soon_as_it_is_missed() -> None:
+    """An ACK that tells of a gap is enough; nobody waits for a timeout."""
+    net = Net(1, delay_ms=2)
+    plant, shore = net.sides
+    plant.log(value(0))
+    net.until_equal(within_s=10)
+    for n in range(1, 40):
+        plant.log(value(n))
+    first, *rest = plant.frames(net.now_ns, slow=False)
+    for datagram in rest:
+        shore.take(datagram, net.now_ns)
+    assert net.until_equal(within_s=10) < 0.15
+    assert first
+
+
+def test_a_new_link_that_has_heard_no_hello_asks_for_one() -> None:
+    net = Net(2)
+    plant, shore = net.sides
+    plant.log(value(0))
+    net.until_equal(within_s=10)
+    shore.codec = FrameCodec([SCHEMA], 64)
+    plant.log(value(1))
+    net.until_equal(within_s=30)
+
+
+def test_after_an_hours_outage_nothing_is_missing_and_the_hour_is_backfilled_fast() -> None:
+    net = Net(1, loss=0.2, mtu=1400)
+    net.run(5)
+    net.cut = True
+    for n in range(3600 * 4):
+        net.sides[0].log(value(n))
+        if n % 400 == 0:
+            net.run(100)
+    net.cut = False
+    assert net.until_equal(within_s=300) < 200, "back-off ends within a minute; then it is a matter of the carrier"
+    assert len(net.sides[1].store.logs["plant:1"]) == 14_400
+
+
+def test_memory_is_bounded_however_long_the_outage() -> None:
+    net = Net(2)
+    net.run(2)
+    net.cut = True
+    for n in range(3 * WINDOW):
+        net.sides[0].log(value(n))
+    net.run(50)
+    assert len(net.sides[0].out._window) <= WINDOW
+
+
+def test_a_perfect_link_sends_nothing_twice_and_falls_silent() -> None:
+    net = Net(3, delay_ms=5)
+    for n in range(600):
+        net.sides[0].log(value(n))
+    net.until_equal(within_s=10)
+    net.run(1)
+    sent = net.sent
+    net.run(3600)
+    assert (net.sent, net.sides[0].out.resent, net.sides[1].into.duplicates) == (sent, 0, 0)
+    assert sent < 600 / 6 + 60
+
+
+def test_what_the_log_has_no_more_is_told_and_no_gap() -> None:
+    net = Net(4, loss=0.3)
+    plant = net.sides[0]
+    for n in range(50):
+        plant.log(value(n))
+    net.until_equal(within_s=600)
+    net.cut = True
+    for n in range(50, 150):
+        plant.log(value(n))
+    net.run(10)
+    log = plant.store.logs["plant:1"]
+    for n in range(1, 121):
+        log.pop(n)
+    plant.restart(net.now_ns)
+    net.cut = False
+    net.run(300)
+    shore = net.sides[1].store
+    assert sorted(shore.logs["plant:1"]) == [*range(1, 51), *range(121, 151)]
+    assert shore.lost["plant:1"] == [(51, 120)]
+    assert plant.out.waiting == 0
+    plant.log(value(1))
+    net.run(30)
+    assert 151 in shore.logs["plant:1"]
+
+
+def test_an_unknown_schema_is_told_on_both_sides_and_nothing_is_lost_until_it_is_known() -> None:
+    net = Net(5)
+    plant, shore = net.sides
+    shore.codec = FrameCodec([], 64)
+    shore.into = Incoming(shore.codec.knows, 0)
+    for n in range(20):
+        plant.log(value(n))
+    net.run(30)
+    assert plant.out.refused
+    assert shore.into.unknown_schema == SCHEMA.id
+    assert plant.out.waiting == 20
+    shore.restart(net.now_ns)
+    net.until_equal(within_s=200)
+    assert not plant.out.refused
+
+
+def test_a_store_that_went_back_in_time_is_noticed() -> None:
+    """Numbers that were told may never be given to other events; whoever restored an old backup has to hear of it."""
+    net = Net(6)
+    plant, shore = net.sides
+    for n in range(10):
+        plant.log(value(n))
+    net.until_equal(within_s=10)
+    for n in range(6, 11):
+        plant.store.logs["plant:1"].pop(n)
+    plant.restart(net.now_ns)
+    net.run(30)
+    assert plant.out.contradicted
+    assert len(shore.store.logs["plant:1"]) == 10
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_large_events_go_in_pieces_through_loss(seed: int) -> None:
+    net = Net(seed, loss=0.2, repeat=0.1, delay_ms=300)
+    net.sides[1].log(Event(0, 5, Kind.REFUSAL, "execute", "no " * 300))
+    net.until_equal(within_s=2000)

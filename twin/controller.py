@@ -1,7 +1,7 @@
 """The gateway's process: ``python -m twin.controller CONFIG.json``. The same for a plant and for its prototype.
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
-mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, stop.
+mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, stop.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from gateway.wallclock import WallClock, run
 from twin.mapping import MappedConnector, mapping_from_json
 from twin.physical import EmbeddedControlSystem, attached
 from twin.system import load_system
+from twin.watching import TagWatch
 
 FLUSH_EVERY_NS = NS_PER_S // 2
 PUBLISHED_AT_ONCE = 20_000
@@ -88,6 +89,7 @@ class GatewayProcess:
                 drivers = [d for d in self._gateway.drivers.values() if isinstance(d, RegisterDriver)]
                 self._learnt = LearntFile(run_dir / kept, drivers, system.buses)
                 self._learnt.load()
+                self._watching = TagWatch(self._gateway.tags, self._clock)
                 await self._serve(run_dir / "gateway.sock")
         finally:
             log.close()
@@ -98,7 +100,13 @@ class GatewayProcess:
 
     async def _serve(self, socket: Path) -> None:
         server = ControlServer(
-            {"ready": self._ready, "get": self._get, "published": self._published, "stop": self._request_stop}
+            {
+                "ready": self._ready,
+                "get": self._get,
+                "published": self._published,
+                "watch": self._watch,
+                "stop": self._request_stop,
+            }
         )
         await server.listen_unix(socket)
         loop = asyncio.get_running_loop()
@@ -151,6 +159,10 @@ class GatewayProcess:
         newer = tags.journal_since(since)[:PUBLISHED_AT_ONCE]
         entries = [(p.number, p.tag, p.raw.hex(), p.t_ns, _plain(p.value)) for p in newer]
         return {"entries": entries, "published": tags.published, "dropped": tags.journal_dropped}
+
+    async def _watch(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Changes of tags since the last question, and some tags now (`twin.watching`)."""
+        return self._watching.answer(args)
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""

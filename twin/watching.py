@@ -1,0 +1,73 @@
+"""Who follows a gateway's tags from outside: every change since the last question, and some tags as they are now.
+
+Nothing is kept until somebody asks for the first time; from then on the latest `MOST` changes, the older ones counted.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from gateway.core.clock import Clock
+from gateway.core.errors import UsageError
+from gateway.core.values import TagValue
+from gateway.runtime.tags import TagTable
+
+MOST = 50_000
+AT_ONCE = 10_000
+"""What a line of the control channel takes."""
+Change = tuple[int, int, str, Any, str, str]
+"""Number (from 1), monotonic ns, tag, value (bytes as hex), quality, reason."""
+
+
+class TagWatch:
+    """Changes of a `TagTable`, numbered. ``answer({"since": 0, "names": [...]})`` is the control channel's `watch`."""
+
+    def __init__(self, tags: TagTable, clock: Clock) -> None:
+        self._tags = tags
+        self._clock = clock
+        self._changes: deque[Change] = deque(maxlen=MOST)
+        self._number = 0
+
+    def answer(self, args: dict[str, Any]) -> dict[str, Any]:
+        """``now_ns``; ``changes`` after number `since`, the oldest first, `AT_ONCE` at most; ``dropped``, how many of them are
+        not kept any more; ``last``, the newest number; ``tags``: of each of `names` value, quality, reason, source time (ns).
+
+        Raises `UsageError` for a tag that there is not.
+        """
+        if self._tags.on_put is None:
+            self._tags.on_put = self._changed
+        since, names = args.get("since", 0), args.get("names", [])
+        if type(since) is not int or not isinstance(names, list):
+            raise UsageError("what to watch", expected='{"since": NUMBER, "names": [TAG...]}')
+        now_ns = self._clock.monotonic_ns()
+        known = set(self._tags.names)
+        for name in names:
+            if name not in known:
+                raise UsageError(f"no tag {name!r}")
+        oldest = self._changes[0][0] if self._changes else self._number + 1
+        return {
+            "now_ns": now_ns,
+            "last": self._number,
+            "changes": self._after(since),
+            "dropped": max(0, oldest - since - 1),
+            "tags": {name: _shown(self._tags.current(name, now_ns)) for name in names},
+        }
+
+    def _after(self, since: int) -> list[Change]:
+        newer: list[Change] = []
+        for change in reversed(self._changes):
+            if change[0] <= since:
+                break
+            newer.append(change)
+        return newer[::-1][:AT_ONCE]
+
+    def _changed(self, name: str, value: TagValue) -> None:
+        self._number += 1
+        shown, quality, reason, _ = _shown(value)
+        self._changes.append((self._number, self._clock.monotonic_ns(), name, shown, quality, reason))
+
+
+def _shown(value: TagValue) -> tuple[Any, str, str, int]:
+    raw = value.value.hex() if isinstance(value.value, bytes) else value.value
+    return raw, str(value.quality), str(value.reason), value.t_ns

@@ -46,8 +46,8 @@ async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> 
 
 
 async def _number(wire: CanopenWire) -> tuple[Key, bytes]:
-    """The first given object that is a number of up to 4 bytes. Raises `NotHere`."""
-    for key in wire.may_write:
+    """The first given object that is a number of up to 4 bytes, 1017h if there is no other. Raises `NotHere`."""
+    for key in sorted(wire.may_write, key=lambda key: key == (0x1017, 0)):
         entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
         if (entry is not None and entry.type_code in ANY_LENGTH) or key == (0x1017, 0):
             continue

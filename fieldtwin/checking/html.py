@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldtwin.checking.device_case import DeviceResult, Spoken
+from fieldtwin.checking.run import OTHER_WIRE
 from fieldtwin.checking.subject import Subject
 from fieldtwin.conformance.results import summary
 from fieldtwin.report.html import pill
@@ -116,14 +117,18 @@ def wire_table(spoken: Sequence[Spoken]) -> Markup:
         for s in spoken[:MOST_LINES]
     ]
     more = len(spoken) - MOST_LINES
-    table = el("table", rows, cls="frames")
+    table = el("table", rows, cls="frames", style="width:auto")
     return el("div", table, el("p", f"and {more} more", cls="small") if more > 0 else "", cls="wide")
 
 
 def _table(results: Sequence[DeviceResult]) -> Markup:
+    elsewhere = [r for r in results if r.reason == OTHER_WIRE]
+    results = [r for r in results if r.reason != OTHER_WIRE]
     columns = ("case", "verdict", "danger", "sent", "expected", "source", "found")
     head = el("tr", [el("th", name) for name in columns])
-    return el("div", el("table", el("thead", head), el("tbody", [_row(r) for r in results])), cls="wide")
+    table = el("table", el("thead", head), el("tbody", [_row(r) for r in results]))
+    ids = ", ".join(r.case.id for r in elsewhere)
+    return el("div", table, el("p", f"For other wires: {ids}.", cls="small") if elsewhere else "", cls="wide")
 
 
 def _row(result: DeviceResult) -> Markup:

@@ -70,8 +70,9 @@ async def _among(wire: ModbusWire, before: bytes, after: bytes) -> Finding:
     heard = await wire.hear()
     if not answers_good(wire, heard, 1):
         return failed(f"{heard} instead of an answer")
-    again = await wire.still_good()
-    return failed(f"the request afterwards: {again}") if again else passed()
+    await wire.pause(LONG_PAUSE_S)
+    again = await wire.still_good(at_once=True)
+    return failed(f"the request 0.1 s afterwards: {again}") if again else passed()
 
 
 async def leading_zero(wire: ModbusWire) -> Finding:
@@ -157,8 +158,8 @@ async def stranger_function(wire: ModbusWire) -> Finding:
     heard = await wire.hear()
     if not heard.nothing:
         return failed(f"{heard} instead of silence")
-    after = await wire.still_good()
-    return failed(f"the request afterwards: {after}") if after else passed()
+    after = await wire.still_good(at_once=True)
+    return failed(f"the request right afterwards: {after}") if after else passed()
 
 
 async def wrong_baud_rate(wire: ModbusWire) -> Finding:

@@ -221,11 +221,11 @@ async def listen_only(wire: ModbusWire) -> Finding:
     if echo.first is None or echo.first.refusal:
         raise NotHere(f"it has no function 08: {echo}")
     entered = await wire.ask(b"\x08\x00\x04\x00\x00", due=False)
-    if entered.first is not None and entered.first.refusal:
-        raise NotHere(f"it has no listen-only mode: {entered}")
     meanwhile = await wire.ask(wire.good, due=False)
-    left = await wire.ask(b"\x08\x00\x01\x00\x00", due=False)
+    left = await wire.ask(b"\x08\x00\x01\x00\x00", due=False)  # whatever it said: it may have gone into the mode
     after = await wire.still_good()
+    if entered.first is not None and entered.first.refusal and not after:
+        raise NotHere(f"it has no listen-only mode: {entered}")
     if not entered.nothing:
         return failed(f"{entered} instead of silence to 08/04")
     if not meanwhile.nothing:

@@ -52,7 +52,7 @@ def shared(function: F) -> F:
         click.option("--by", help="Who checks; stands in the reports.  [default: the name you are logged in by]"),
         click.option("--html", type=FILE, help="Write a report with every byte."),
         click.option("--junit", type=FILE, help="Write the verdicts as JUnit XML."),
-        click.option("--out", type=FILE, help="Write the JSON to a file, for `fieldtwin report`."),
+        click.option("-o", "--out", type=FILE, help="Write the JSON to a file, for `fieldtwin report`."),
         click.option("--log", "log_path", type=FILE, help="Append all that is sent and heard, as JSON lines."),
         click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
         json_option,
@@ -70,11 +70,15 @@ class Check:
         self.words = "fieldtwin " + shlex.join(sys.argv[1:])
 
     def plan(self, cases: Sequence[DeviceCase[Any]], has: set[str], writes: bool) -> Plan:
-        """What may be played."""
+        """What may be played. Reads the waivers too: a wrong file is said before anything is sent."""
         from fieldtwin.checking.run import Plan
         from fieldtwin.cli.check_command import only_of
         from fieldtwin.conformance.case import Danger
+        from fieldtwin.conformance.waivers import Waivers, load_waivers
 
+        path = self.options["waivers_path"]
+        known = {case.id for case in cases} | {case.row for case in cases}
+        self.waivers = load_waivers(path, known) if path else Waivers()
         allow = self.options["allow"] or ("write" if writes else "read")
         if writes and Danger(allow).rank < Danger.WRITE.rank:
             raise UsageError("--write with cases that only read", expected="--allow write or disrupt", got=allow)
@@ -100,20 +104,16 @@ class Check:
             raise NotAllowed("cases that do more than reading are confirmed", expected="--yes, or a terminal to ask on")
         click.confirm("Play them?", abort=True, err=True)
 
-    def done(self, subject: Subject, checked: Checked, cases: Sequence[DeviceCase[Any]]) -> int:
+    def done(self, subject: Subject, checked: Checked) -> int:
         """Waive, write the files, show the table. The exit code."""
         from fieldtwin.checking.results import as_json, as_report
         from fieldtwin.checking.run import OTHER_WIRE
         from fieldtwin.cli.check_view import print_results
         from fieldtwin.cli.talk import talk
         from fieldtwin.conformance.results import exit_code, waive
-        from fieldtwin.conformance.waivers import Waivers, load_waivers
 
-        path = self.options["waivers_path"]
-        known = {case.id for case in cases} | {case.row for case in cases}
-        waivers = load_waivers(path, known) if path else Waivers()
         today = datetime.fromisoformat(subject.started).date()
-        results: list[DeviceResult] = [waive(result, waivers, today) for result in checked.results]  # type: ignore[misc]
+        results: list[DeviceResult] = [waive(result, self.waivers, today) for result in checked.results]  # type: ignore[misc]
         document = as_json(subject, results)
         if self.options["out"] is not None:
             _write(self.options["out"], json.dumps(document, indent=2) + "\n")
@@ -213,7 +213,7 @@ def modbus(
         len([c for c in CASES if c.chosen(plan.only)]), options["log_path"], check.words,
         lambda taps, go_on, say, tell: check_modbus(replace(to_do, taps=taps, go_on=go_on), say, tell),
     )  # fmt: skip
-    return check.done(check.subject(checked, plan, began, writes, timeout_s), checked, CASES)
+    return check.done(check.subject(checked, plan, began, writes, timeout_s), checked)
 
 
 @click.command("canopen")
@@ -276,7 +276,7 @@ def canopen(
         len([c for c in CASES if c.chosen(plan.only)]), options["log_path"], check.words,
         lambda taps, go_on, say, tell: check_canopen(replace(to_do, taps=taps, go_on=go_on), say, tell),
     )  # fmt: skip
-    return check.done(check.subject(checked, plan, began, writes, timeout_s), checked, CASES)
+    return check.done(check.subject(checked, plan, began, writes, timeout_s), checked)
 
 
 def _object(text: str) -> tuple[int, int]:

@@ -97,8 +97,9 @@ class Device:
 
     @property
     def serial(self) -> str:
-        """What the user says, else what the device says; empty where nobody does."""
-        return self.serial_said or self.identity.get(SERIAL, "")
+        """What the user says, else what the device says; empty where nobody does. A CANopen node says 0 for none."""
+        said = self.identity.get(SERIAL, "")
+        return self.serial_said or ("" if said.split(" ")[0] == "0" else said)
 
     @property
     def type(self) -> str:

@@ -139,7 +139,7 @@ def _deviations(document: Document) -> Markup:
         for number, (device, _, deviation) in enumerate(found[:MOST_DEVIATIONS], 1)
     ]
     columns = ("no.", "device", "what", "expected", "found", "weight", "decision")
-    table = _grid(columns, rows, (5, 9, 22, 19, 25, 9, 11))
+    table = _grid(columns, rows, (5, 9, 22, 18, 24, 10, 12))
     more = len(found) - MOST_DEVIATIONS
     said = "Decision: A accepted, C to be corrected, N not applicable; initials and date."
     return el(

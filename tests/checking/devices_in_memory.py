@@ -37,9 +37,14 @@ def make_unit() -> ModbusUnit:
 
 
 def on_modbus(
-    url: str, use: Callable[[MemoryNet, str, VirtualClock], Awaitable[T]], unit: ModbusUnit | None = None, at: int = 1
+    url: str,
+    use: Callable[[MemoryNet, str, VirtualClock], Awaitable[T]],
+    unit: ModbusUnit | None = None,
+    at: int = 1,
+    serve: Callable[[ByteConnection], Awaitable[None]] | None = None,
 ) -> T:
-    """What `use` comes to with a device served at `url` in memory. `use` gets the net, the url and the clock."""
+    """What `use` comes to with a device served at `url` in memory. `use` gets the net, the url and the clock. `serve`: another
+    device altogether."""
     loop = VirtualLoop()
 
     async def main() -> T:
@@ -47,7 +52,9 @@ def on_modbus(
         units = {at: unit or make_unit()}
 
         async def stream(end: ByteConnection) -> None:
-            if endpoint.scheme == "rtu+tcp":
+            if serve is not None:
+                await serve(end)
+            elif endpoint.scheme == "rtu+tcp":
                 await serve_rtu(end, RtuSlave(units), clock)
             else:
                 await serve_mbap(end, MbapSlave(units), clock)
@@ -55,6 +62,9 @@ def on_modbus(
         async with Nursery() as nursery:
             if endpoint.is_serial:
                 end, _ = await net.serial(Path(endpoint.path), endpoint, endpoint.serial)
+                if serve is not None:
+                    nursery.start(serve(end), "device")
+                    return await use(net, url, clock)
                 slave = AsciiSlave(units) if endpoint.scheme == "ascii" else RtuSlave(units)
                 nursery.start(serve_rtu(end, slave, clock), "device")
                 return await use(net, url, clock)

@@ -31,6 +31,8 @@ COMMANDS = {
     "dump": ("fieldtwin.cli.dump_command", "Read all that a device holds: values, holes, limits, latency."),
     "report": ("fieldtwin.cli.report_command", "A site acceptance document from dumps, comparisons and checks."),
     "record": ("fieldtwin.cli.record_command", "Record a device, a line between two ports, or a CAN bus."),
+    "infer": ("fieldtwin.cli.infer_command", "Guess a profile from dumps taken over time, and say how sure it is."),
+    "compare": ("fieldtwin.cli.compare_command", "Hold a device, or a recording, against a recording."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
     "test": ("fieldtwin.cli.test_command", "Run scenarios against a prototype, and judge it."),
     "with": ("fieldtwin.cli.with_command", "Run any command against the emulated field; end with its exit status."),

@@ -1,0 +1,202 @@
+"""How surprising a series of register words is if it were a value of this type and order, in nats (natural bits).
+
+The right reading of a device's registers is the one that makes them least surprising: a float in the right word order moves a
+little, in the wrong one it leaps over decades. Costs are minus log probabilities, so the costs of neighbours add up and readings
+can be weighed against each other. Pure arithmetic; knows no dump and no profile.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from statistics import median
+
+from gateway.core.profile import REGISTERS_OF
+from gateway.devices.codec import reorder
+
+IMPOSSIBLE = math.inf
+"""A reading that no device means: not a number, a magnitude beyond all physics."""
+MOST_TEXT_REGISTERS = 24
+
+TYPE_COST = {
+    "uint16": 1.0, "int16": 1.4, "uint32": 2.0, "int32": 2.6, "float32": 1.5, "float64": 3.0, "uint64": 4.0, "int64": 5.0,
+    "bcd16": 5.0, "string": 3.0,
+}  # fmt: skip
+ORDER_COST = {"ABCD": 0.3, "CDAB": 1.0, "BADC": 3.0, "DCBA": 2.5}
+"""How rare each is among devices."""
+NUMBERS = tuple(kind for kind in TYPE_COST if kind != "string")
+ZERO_COST = 0.7
+"""A register that is always 0, as most that mean nothing are."""
+
+_FORMATS = {
+    "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q", "uint64": ">Q", "float32": ">f",
+    "float64": ">d",
+}  # fmt: skip
+_MANTISSA_BITS = {"float32": 23, "float64": 52}
+_LN2 = math.log(2)
+WILD_COST = 9.0
+"""A number by itself that leaps over its whole range: so looks the lower half of something longer."""
+LARGE, LARGE_COST = 1 << 28, 4.0
+"""A whole number so large is a counter. One that wavers would be a measurement to nine digits: so looks a float."""
+_LEAST_STEP_COST = 0.05
+_TEMPER = 0.7
+"""Steps are taken for this much of what they say: they are not independent of each other."""
+
+
+def orders_of(kind: str) -> tuple[str, ...]:
+    """The orders that make a difference for this type."""
+    if kind == "string":
+        return ("ABCD", "BADC")
+    return ("ABCD", "BADC") if REGISTERS_OF[kind] == 1 else ("ABCD", "CDAB", "BADC", "DCBA")
+
+
+def decode_series(words: Sequence[Sequence[int]], kind: str, order: str) -> list[float] | None:
+    """The raw numbers of each pass's words; None where one is none (a BCD digit above 9)."""
+    numbers: list[float] = []
+    for row in words:
+        data = reorder(b"".join(w.to_bytes(2) for w in row), order)
+        if kind == "bcd16":
+            digits = data.hex()
+            if not digits.isdigit():
+                return None
+            numbers.append(int(digits))
+        else:
+            numbers.append(struct.unpack(_FORMATS[kind], data)[0])
+    return numbers
+
+
+def cost(words: Sequence[Sequence[int]], kind: str, order: str, orders: Mapping[str, float] = ORDER_COST) -> float:
+    """The cost of `words` (one row a pass) as a series of this type; the rarity of type and order included."""
+    if kind == "string":
+        return _text_cost(words, order) + TYPE_COST[kind] + ORDER_COST[order]
+    numbers = decode_series(words, kind, order)
+    if numbers is None:
+        return IMPOSSIBLE
+    if not any(map(any, words)):
+        return ZERO_COST if kind == "uint16" and order == "ABCD" else 6.0 + TYPE_COST[kind] + ORDER_COST[order]
+    rarity = TYPE_COST[kind] + orders[order]
+    if kind in _MANTISSA_BITS:
+        return rarity + _float_cost(numbers, kind)
+    integers = [int(x) for x in numbers]
+    bits = 16 * REGISTERS_OF[kind]
+    signed = kind.startswith("int")
+    wild = WILD_COST if _is_wild(integers, bits) else 0.0
+    if bits == 32 and abs(integers[0]) > LARGE and _wavers(integers):
+        wild = max(wild, LARGE_COST)
+    return rarity + wild + _first_cost(integers[0], bits, signed=signed) + walk_cost(integers)
+
+
+def _wavers(numbers: Sequence[int]) -> bool:
+    steps = [b - a for a, b in pairwise(numbers)]
+    return any(s > 0 for s in steps) and any(s < 0 for s in steps)
+
+
+def _is_wild(numbers: Sequence[int], bits: int) -> bool:
+    """Whether it leaps, on the average, over more than an eighth of its range, around its ends if that is nearer."""
+    whole = 1 << bits
+    leaps = [min((b - a) % whole, (a - b) % whole) for a, b in pairwise(numbers)]
+    return bool(leaps) and sum(leaps) / len(leaps) > whole / 8
+
+
+def _first_cost(first: int, bits: int, *, signed: bool) -> float:
+    """Whole numbers are small more often than large: each magnitude is as likely as any other."""
+    return math.log(abs(first) + 1) + math.log(bits * _LN2) + (_LN2 if signed else 0.0)
+
+
+def walk_cost(numbers: Sequence[int]) -> float:
+    """The steps of a series, which stands, wanders or counts: heavy tails around no step, or around the usual one."""
+    steps = [b - a for a, b in pairwise(numbers)]
+    if not steps:
+        return 0.0
+    if not any(steps):
+        return _LEAST_STEP_COST * len(steps)
+    centres = {0.0, float(median(steps))}
+    return _TEMPER * min(_steps_cost([abs(s - c) for s in steps]) + math.log(abs(c) + 1) for c in centres)
+
+
+def _steps_cost(distances: Sequence[float]) -> float:
+    """Cauchy distributed, of the scale that suits them best."""
+    best = math.inf
+    for scale in (median(distances), sum(distances) / len(distances)):
+        scale = max(scale, 0.3)
+        total = math.log(2 + 2 * math.log2(1 + scale))
+        total += sum(max(_LEAST_STEP_COST, math.log(math.pi * scale * (1 + (d / scale) ** 2))) for d in distances)
+        best = min(best, total)
+    return best
+
+
+def _float_cost(numbers: Sequence[float], kind: str) -> float:
+    if any(not math.isfinite(x) or (x != 0 and not 1e-15 < abs(x) < 1e15) for x in numbers):
+        return IMPOSSIBLE
+    bits = _MANTISSA_BITS[kind]
+    first = next(x for x in (*numbers, 1.0) if x != 0)
+    size = math.log10(abs(first))
+    decades = 3.2 if -2 <= size <= 5 else 6.0 if -6 <= size <= 9 else 12.0
+    powers = [math.frexp(x)[1] for x in numbers if x != 0]
+    leaps = [abs(b - a) for a, b in pairwise(powers)]
+    decades += WILD_COST if leaps and median(leaps) > 3 else 0.0
+    start = decades + (1.0 if first < 0 else 0.3) + _mantissa_cost(first, kind)
+    ordered = [_ordered(x, kind) for x in numbers]
+    return start + min(walk_cost(ordered), _TEMPER * _real_steps_cost(numbers, bits))
+
+
+def _real_steps_cost(numbers: Sequence[float], bits: int) -> float:
+    """Steps as real numbers, for what crosses zero: each costs the digits that it shows beyond its scale."""
+    steps = [abs(b - a) for a, b in pairwise(numbers)]
+    if not steps or not any(steps):
+        return _LEAST_STEP_COST * len(steps)
+    scale = max(median(steps), sum(steps) / len(steps) / 4)
+    total = 3.0
+    for step, value in zip(steps, numbers[1:], strict=True):
+        if value == 0.0:
+            total += 3.0
+            continue
+        resolution = 2.0 ** (math.frexp(value)[1] - 1 - bits)
+        total += max(_LEAST_STEP_COST, math.log(math.pi * scale * (1 + (step / scale) ** 2) / resolution))
+    return total
+
+
+def _mantissa_cost(value: float, kind: str) -> float:
+    """The digits of a first value: few where it is round, in twos or in tens."""
+    bits = _MANTISSA_BITS[kind]
+    raw = struct.pack(_FORMATS[kind], value)
+    mantissa = int.from_bytes(raw) & ((1 << bits) - 1)
+    zeros = (mantissa & -mantissa).bit_length() - 1 if mantissa else bits
+    best = min(bits * _LN2, (bits - zeros) * _LN2 + 2.5)
+    for digits in range(1, 7):
+        if struct.pack(_FORMATS[kind], float(f"{value:.{digits}g}")) == raw:
+            return min(best, digits * math.log(10) + 2.0)
+    return best
+
+
+def _ordered(value: float, kind: str) -> int:
+    """The number of a float among all floats, so that neighbours differ by 1."""
+    raw = int.from_bytes(struct.pack(_FORMATS[kind], value))
+    sign = 1 << (31 if kind == "float32" else 63)
+    return raw if raw < sign else sign - raw
+
+
+def _text_cost(words: Sequence[Sequence[int]], order: str) -> float:
+    """Text stands still and is printable, padded with NULs or blanks at its end."""
+    if any(row != words[0] for row in words[1:]):
+        return IMPOSSIBLE
+    data = b"".join(w.to_bytes(2) for w in words[0])
+    if order == "BADC":
+        data = reorder(data, "BADC")
+    text = data.rstrip(b"\0 ")
+    if len(text) < 3 or not all(0x20 <= c < 0x7F for c in text) or not any(c > 0x40 for c in text):
+        return IMPOSSIBLE
+    total = 2.0 + math.log(MOST_TEXT_REGISTERS)
+    for char in text:
+        letter = chr(char)
+        total += 3.2 if letter.isalpha() else 2.7 if letter.isdigit() else 3.3 if letter in " -_./:" else 5.5
+    kinds = [_kind(chr(c)) for c in text]
+    total += sum(0.2 if a == b or (a, b) == ("A", "a") else 1.5 for a, b in pairwise(kinds))
+    return total + 0.1 * (len(data) - len(text)) + _LEAST_STEP_COST * (len(words) - 1)
+
+
+def _kind(letter: str) -> str:
+    """Small, capital, digit, or a mark between words: text changes from one to another now and then only."""
+    return "a" if letter.islower() else "A" if letter.isupper() else "0" if letter.isdigit() else "-"

@@ -1,0 +1,154 @@
+"""A draft profile from what was inferred: valid for the profile reader as it stands, with the doubts beside it as comments.
+
+It must never sound surer than the inference: what is a guess is marked so, and what stood at 0 all the time is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+
+from fieldtwin.commissioning.dump_file import Dump
+from fieldtwin.commissioning.infer import BIT_TABLES, Inference, Series
+from fieldtwin.commissioning.infer_fields import Level, Reading
+from gateway.core.profile import DeviceProfile, RegisterRange, gap_text, resolve
+from gateway.core.yaml_file import parse
+
+MOST_BITS = 200
+FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
+
+
+def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -> str:
+    """The YAML of a profile named ``draft/NAME``. Every line of a tag says how sure it is and why."""
+    series, unit = inference.series, int(dumps[0].header["address"])
+    slug = "".join(c if c.isalnum() and c.isascii() else "-" for c in name.lower()).strip("-") or f"unit-{unit}"
+    lines = [
+        "# Drafted by `fieldtwin infer`: what the registers probably are. Check it against the manual, name the tags, add units.",
+        f"# {series.passes} passes over {series.span_s:.0f} s, {_day(series.times_s[0])}. "
+        "certain: nothing else fits; likely: more than 80 %; guess: less.",
+        f"device: draft/{slug}",
+        f'source: "drafted by fieldtwin infer from {len(dumps)} dump{"s" if len(dumps) > 1 else ""}"',
+        "protocol: modbus",
+        f"factory: {{unit: {unit}}}",
+        "numbering: sent",
+        *_limits(dumps, series),
+    ]
+    tags = [line for r in inference.readings for line in _tag(r)]
+    bits, more_bits = _bits(series)
+    left = sum(_idle(r) for r in inference.readings)
+    if left or more_bits:
+        lines.append(f"# left out: {left} registers that were always 0" + (f", {more_bits} bits" if more_bits else ""))
+    lines += ["tags:", *tags, *bits] if tags or bits else ["tags: {}"]
+    return "\n".join(lines) + "\n"
+
+
+def checked(text: str, path: Path) -> DeviceProfile:
+    """The draft as the profile reader sees it. Raises `FileInvalid` where it refuses it."""
+    return resolve(parse(text, str(path)))
+
+
+def tag_name(reading: Reading) -> str:
+    """``input_12``, until somebody knows better."""
+    return f"{reading.table}_{reading.address}"
+
+
+def doubts(reading: Reading) -> str:
+    """How sure, against what, and what else is worth knowing; one line."""
+    parts = [f"{reading.level}" if reading.level is Level.CERTAIN else f"{reading.level} ({_percent(reading)})"]
+    if reading.sign_open:
+        parts.append(f"or {reading.type[1:]}, no sign was seen")
+    if reading.level is not Level.CERTAIN:
+        if reading.capped and reading.moves:
+            parts.append(reading.capped)
+        if reading.rivals and reading.rivals[0][3] >= 0.005:
+            kind, address, order, share = reading.rivals[0]
+            where = f" from {address} on" if address != reading.address else ""
+            parts.append(f"else {kind} {order}{where} ({100 * share:.0f} %)")
+    parts += reading.marks
+    parts.append(_seen(reading))
+    parts += reading.notes
+    return "; ".join(p for p in parts if p)
+
+
+def _percent(reading: Reading) -> str:
+    return f"{min(99, int(100 * reading.probability))} %"
+
+
+def _seen(reading: Reading) -> str:
+    if reading.type == "string":
+        return f"{reading.values[0]!r}".replace("#", "")
+    numbers = [float(v) for v in reading.values]
+    low, high = min(numbers), max(numbers)
+    return f"always {low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
+
+
+def _idle(reading: Reading) -> int:
+    return reading.registers if not any(reading.values) and not reading.moves else 0
+
+
+def _tag(reading: Reading) -> list[str]:
+    if _idle(reading):
+        return []
+    keys = [f'at: "{reading.table}:{reading.address}"', f"type: {reading.type}"]
+    if reading.order != "ABCD":
+        keys.append(f"order: {reading.order}")
+    if reading.type == "string":
+        keys += [f"registers: {reading.registers}", "poll: identity"]
+    if reading.scale != 1.0:
+        keys.append(f"scale: {reading.scale:g}")
+    if {"counter", "seconds"} & set(reading.marks):
+        keys.append("counter: true")
+    if "enumeration" in reading.marks:
+        states = sorted({int(v) for v in reading.values})
+        keys.append("values: {" + ", ".join(f"{s}: state_{s}" for s in states) + "}")
+    return [f"  {tag_name(reading)}: {{{', '.join(keys)}}}  # {doubts(reading)}"]
+
+
+def _bits(series: Series) -> tuple[list[str], int]:
+    """Bits that moved or were set, as many as are worth naming; and how many were not."""
+    lines, left = [], 0
+    for table in BIT_TABLES:
+        for address, bits in series.cells.get(table, {}).items():
+            if not any(bits) or len(lines) >= MOST_BITS:
+                left += 1
+                continue
+            changes = sum(a != b for a, b in pairwise(bits))
+            seen = f"changed {changes} times" if changes else "always on"
+            lines.append(f'  {table}_{address}: {{at: "{table}:{address}", type: bool}}  # certain; {seen}')
+    return lines, left
+
+
+def _limits(dumps: Sequence[Dump], series: Series) -> list[str]:
+    """What the dumps learnt of functions, read length and gaps."""
+    maps = [m for d in dumps for m in d.maps.values()]
+    words = [m for m in maps if m["map"] in ("holding", "input") and m.get("max_read")]
+    proved = [int(m["max_read"]) for m in words if m.get("limit_proved")]
+    keys = []
+    if series.cells:
+        keys.append(f"functions: {sorted(FUNCTIONS[t] for t in series.cells)}")
+    if proved:
+        keys.append(f"read_registers: {max(2, min(125, *proved, 125))}")
+    if any(m.get("pairs") for m in words):
+        keys.append("even_only: true")
+    lines = [f"limits: {{{', '.join(keys)}}}"] if keys else []
+    gaps = _gaps(series)
+    if gaps:
+        lines.append("gaps: [" + ", ".join(f'"{g}"' for g in gaps) + "]")
+    return lines
+
+
+def _gaps(series: Series) -> list[str]:
+    """What lies between readable registers and is near enough to be read over."""
+    gaps = []
+    for table, cells in series.cells.items():
+        known = sorted(cells)
+        for before, after in pairwise(known):
+            if 1 < after - before <= 125 and table in ("holding", "input"):
+                gaps.append(gap_text(RegisterRange(table, before + 1, after - before - 1)))  # type: ignore[arg-type]
+    return gaps
+
+
+def _day(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M UTC")

@@ -1,0 +1,111 @@
+"""What a value does, seen over time: it counts, it is a state, it is the time, it is another value scaled.
+
+Pure. Every mark is said only of what was seen often enough; what is a mere likeness is a note and says perhaps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+from fieldtwin.commissioning.infer_fields import FEWEST_PASSES, Reading
+
+FEWEST_STEPS = 5
+MOST_STATES, LARGEST_STATE = 8, 255
+DAY_S = 86_400
+SCALES = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
+_MAINS = (
+    ((49.5, 50.5), "mains frequency", "Hz"),
+    ((59.5, 60.5), "mains frequency", "Hz"),
+    ((215.0, 245.0), "mains voltage", "V"),
+    ((380.0, 420.0), "mains voltage, phase to phase", "V"),
+)
+
+
+def marked(reading: Reading, times_s: Sequence[float]) -> Reading:
+    """`reading` with its marks. `times_s`: when each pass was, in seconds since 1970 UTC."""
+    if reading.type == "string" or not reading.moves:
+        return reading
+    numbers = [float(v) for v in reading.values]
+    whole = "int" in reading.type or reading.type.startswith("bcd")
+    marks, notes = list(reading.marks), list(reading.notes)
+    steps = [b - a for a, b in pairwise(numbers)]
+    elapsed = [b - a for a, b in pairwise(times_s)]
+    up = sum(s > 0 for s in steps)
+    if whole and _is_time(numbers, times_s):
+        marks.append("timestamp")
+    elif whole and len(steps) >= FEWEST_STEPS and _runs_with(steps, elapsed):
+        marks.append("seconds")
+        notes.append("counts seconds, as an uptime does")
+    elif len(steps) >= FEWEST_STEPS and all(s >= 0 for s in steps) and up >= max(3, 0.5 * len(steps)):
+        marks.append("counter")
+    elif whole and _is_state(numbers, steps):
+        marks.append("enumeration")
+    elif all(s >= 0 for s in steps) and up:
+        notes.append("only went up: perhaps a counter")
+    return replace(reading, marks=tuple(marks), notes=tuple(notes + _likeness(reading, numbers, whole=whole)))
+
+
+def _is_time(numbers: Sequence[float], times_s: Sequence[float]) -> bool:
+    """Seconds since 1970, within a day of the truth (clocks stand in all time zones), and going as time goes."""
+    near = all(abs(n - t) < DAY_S for n, t in zip(numbers, times_s, strict=True))
+    shifts = [n - t for n, t in zip(numbers, times_s, strict=True)]
+    return near and max(shifts) - min(shifts) <= 2 + 0.01 * (times_s[-1] - times_s[0])
+
+
+def _runs_with(steps: Sequence[float], elapsed: Sequence[float]) -> bool:
+    """Whether it goes by one a second, and the seconds differ enough from a mere count of the passes."""
+    total = sum(elapsed)
+    return (
+        total >= 20
+        and max(elapsed) > 1.5
+        and all(abs(s - e) <= 1.5 + 0.02 * e for s, e in zip(steps, elapsed, strict=True))
+        and abs(sum(steps) - total) <= 2 + 0.02 * total
+    )
+
+
+def _is_state(numbers: Sequence[float], steps: Sequence[float]) -> bool:
+    """Few small numbers from near 0 on, each held for a while. What trembles about a number is none."""
+    states = set(numbers)
+    changes = sum(s != 0 for s in steps)
+    return (
+        len(numbers) >= 2 * FEWEST_PASSES
+        and 2 <= len(states) <= min(MOST_STATES, len(numbers) // 3)
+        and min(states) >= 0
+        and max(states) <= LARGEST_STATE
+        and 2 <= changes <= len(steps) / 4
+    )
+
+
+def _likeness(reading: Reading, numbers: Sequence[float], *, whole: bool) -> list[str]:
+    """What it looks like, without being more than that."""
+    if reading.type.startswith("float") or whole:
+        for scale in SCALES if whole else (1.0,):
+            for (low, high), what, unit in _MAINS:
+                if scale == 1.0 and whole:
+                    continue
+                if all(low <= n / scale <= high for n in numbers):
+                    return [f"perhaps {what} in {1 / scale:g} {unit}" if whole else f"perhaps {what} in {unit}"]
+    return []
+
+
+def with_scales(readings: Sequence[Reading]) -> list[Reading]:
+    """Integers that are a float of the same device times a power of ten, in every pass, get that scale."""
+    floats = [r for r in readings if r.type.startswith("float") and r.moves and r.probability >= 0.8]
+    return [_scaled(r, floats) if "int" in r.type and r.moves else r for r in readings]
+
+
+def _scaled(reading: Reading, floats: Sequence[Reading]) -> Reading:
+    """The scale under which all passes agree to the last digit. It says much only where the digits move much."""
+    numbers = [float(v) for v in reading.values]
+    spread = max(numbers) - min(numbers)
+    if len(numbers) < FEWEST_PASSES or len(set(numbers)) < 4 or spread < 5:
+        return reading
+    for other in floats:
+        theirs = [float(v) for v in other.values]
+        for scale in SCALES:
+            if all(abs(n - v * scale) <= 1.01 for n, v in zip(numbers, theirs, strict=True)):
+                note = f"is {other.table}:{other.address} times {scale:g}"
+                return replace(reading, scale=1 / scale, notes=(*reading.notes, note))
+    return reading

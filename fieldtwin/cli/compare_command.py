@@ -1,0 +1,283 @@
+"""`fieldtwin compare`: does a device do what a recording says? Parses and prints, no more."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from collections.abc import Callable, Coroutine
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.table import Table
+
+from fieldtwin.cli.device_options import device_options, logged, target_from
+from fieldtwin.cli.options import Duration, json_option, pairs
+from fieldtwin.cli.talk import data, talk
+from fieldtwin.formats.candump import read_log
+from fieldtwin.recording.asking import asker_at, changes
+from fieldtwin.recording.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
+from fieldtwin.recording.comparing_can import Frames, compare_logs
+from fieldtwin.recording.live_comparing import compare_device, compare_node
+from fieldtwin.recording.rotating import exchanges_of, header_of, parts_of
+from gateway.core.endpoint import SCHEMES
+from gateway.core.errors import FileInvalid, NotAllowed, UsageError
+from gateway.core.profile import DeviceProfile, load_profile
+from gateway.core.recording import shown
+from gateway.wallclock import run as run_precise
+from twin.data_files import find
+
+SHOWN = 20
+
+
+@click.command("compare")
+@click.argument("recording", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("other")
+@click.option(
+    "--tolerance",
+    "tolerances",
+    multiple=True,
+    metavar="[TAG=]AMOUNT",
+    help="What values may differ by, e.g. 2 or 1% or frequency=0.05; repeatable. Default: not at all.",
+)
+@click.option(
+    "--latency",
+    default="20ms/50%",
+    show_default=True,
+    metavar="AMOUNT",
+    help="What median and 90 % of the latencies may differ by, whichever of the two is more; `any`: not judged.",
+)
+@click.option(
+    "--least",
+    type=click.FloatRange(0, 100),
+    default=100.0,
+    show_default=True,
+    metavar="PERCENT",
+    help="How many of the exchanges have to be alike.",
+)
+@click.option(
+    "--most", type=click.IntRange(1), default=None, help="A live device: ask only the first so many requests."
+)
+@click.option(
+    "--listen", "listen_s", type=Duration(), default="0s", help="A live bus: listen so long, compare messages too."
+)
+@click.option(
+    "--spacing", "spacing_s", type=Duration(), default="0s", help="A live device: pause behind every exchange."
+)
+@click.option("--writes", is_flag=True, help="A live device: make the recorded writes again, too. Asks first.")
+@click.option("--yes", is_flag=True, help="With --writes: do not ask.")
+@click.option("--i-know", is_flag=True, help="With --writes: broadcasts and restarts (FC08) too.")
+@click.option("--all", "everything", is_flag=True, help=f"Show all differences, not only the first {SHOWN}.")
+@device_options
+@json_option
+def command(recording: Path, other: str, as_json: bool, everything: bool, **options: Any) -> int:
+    """Hold OTHER, a device at an endpoint or another recording, against RECORDING: the same requests, the same outcomes?
+
+    \b
+    fieldtwin compare meter.jsonl rtu:/dev/ttyUSB0 --profile eastron-sdm630 --tolerance 2%
+    fieldtwin compare meter.jsonl emulated.jsonl
+    fieldtwin compare drive.log can:socketcan/can0 --node 5 --listen 10s
+
+    Prints fidelity: the share of exchanges that are alike (values), and how near the latencies are (timing). Exit code 1
+    when it is not met. A device is only read, unless --writes.
+    """
+    rules = Rules(*_tolerances(options["tolerances"]), _latency(options["latency"]), options["least"] / 100)
+    live = other.partition(":")[0].lower() in SCHEMES and not Path(other).is_file()
+    if not live and options["writes"]:
+        raise UsageError("--writes is for a live device")
+    if recording.suffix == ".log":
+        result = _live_can(recording, other, rules, options) if live else _logs(recording, Path(other), rules, options)
+    else:
+        result = _live(recording, other, rules, options) if live else _files(recording, Path(other), rules, options)
+    if as_json:
+        said = asdict(result) | {"values": result.values, "met": result.met}
+        json.dump(said, sys.stdout)
+        sys.stdout.write("\n")
+    else:
+        _show(result, recording, other, everything)
+    return 0 if result.met else 1
+
+
+# -- what may differ ----------------------------------------------------------------------------------------------------
+
+
+def _tolerances(texts: tuple[str, ...]) -> tuple[Tolerance, dict[str, Tolerance]]:
+    plain = [t for t in texts if "=" not in t]
+    named = pairs(tuple(t for t in texts if "=" in t), "--tolerance")
+    if len(plain) > 1:
+        raise UsageError("one tolerance for all, others by tag", got=", ".join(plain))
+    return (_tolerance(plain[0]) if plain else Tolerance()), {tag: _tolerance(text) for tag, text in named.items()}
+
+
+def _tolerance(text: str) -> Tolerance:
+    try:
+        if text.endswith("%"):
+            return Tolerance(share=_positive(text[:-1]) / 100)
+        return Tolerance(_positive(text))
+    except ValueError:
+        raise UsageError("cannot read a tolerance", expected="a number such as 2, or 1%", got=text) from None
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 <= value < 1e300:
+        raise ValueError
+    return value
+
+
+def _latency(text: str) -> Tolerance | None:
+    if text == "any":
+        return None
+    absolute = share = 0.0
+    for part in text.split("/"):
+        if part.endswith("%"):
+            share = _tolerance(part).share
+        else:
+            absolute = float(Duration().convert(part, None, None))
+    return Tolerance(absolute, share)
+
+
+# -- the four cases -----------------------------------------------------------------------------------------------------
+
+
+def _profile(options: dict[str, Any]) -> DeviceProfile | None:
+    name = options["profile_name"]
+    return load_profile(find("devices", name, extra=[Path(p) for p in options["profiles"]])) if name else None
+
+
+def _files(recording: Path, other: Path, rules: Rules, options: dict[str, Any]) -> Comparison:
+    for path in (recording, other):
+        _expect_exchanges(path)
+    comparer, unit = Comparer(rules, _profile(options)), options["unit"]
+    mine, theirs = ((e for e in exchanges_of(p) if unit in (None, e.unit)) for p in (recording, other))
+    for one, two in pairs_of(mine, theirs, request_of):
+        comparer.add(one, two)
+    return comparer.result()
+
+
+def _live(recording: Path, url: str, rules: Rules, options: dict[str, Any]) -> Comparison:
+    _expect_exchanges(recording)
+    target = target_from(url, options)
+    if target.protocol != "modbus":
+        raise UsageError(f"{recording.name} is of a Modbus device", got=url)
+    if options["writes"]:
+        _allow_writes(recording, url, options)
+    comparer = Comparer(rules, target.profile)
+
+    async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
+        with logged(options["log"]) as taps:
+            async with asker_at(
+                target.url,
+                timeout_s=target.timeout_s,
+                spacing_s=options["spacing_s"],
+                echo=target.echo,
+                taps=tuple(taps),
+            ) as asker:
+                await compare_device(
+                    exchanges_of(recording), asker, comparer, unit=options["unit"], writes=options["writes"],
+                    most=options["most"] or 0, stop=stop, progress=progress,
+                )  # fmt: skip
+
+    _run(work)
+    return comparer.result()
+
+
+def _logs(recording: Path, other: Path, rules: Rules, options: dict[str, Any]) -> Comparison:
+    nodes = () if options["node"] is None else (options["node"],)
+    return compare_logs(_frames(recording), _frames(other), rules, profile=_profile(options), nodes=nodes)
+
+
+def _live_can(recording: Path, url: str, rules: Rules, options: dict[str, Any]) -> Comparison:
+    target = target_from(url, options)
+    if target.protocol != "canopen":
+        raise UsageError(f"{recording.name} is of a CAN bus", got=url)
+    if options["writes"]:
+        raise UsageError("--writes is for Modbus")
+    found: list[Comparison] = []
+
+    async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
+        found.append(
+            await compare_node(
+                lambda: _frames(recording), target, rules, node=options["node"], most=options["most"] or 0,
+                listen_s=options["listen_s"], stop=stop, progress=progress,
+            )
+        )  # fmt: skip
+
+    _run(work)
+    return found[0]
+
+
+def _frames(path: Path) -> Frames:
+    for part in parts_of(path):
+        yield from ((t_ns, frame) for t_ns, _, frame in read_log(part))
+
+
+def _expect_exchanges(path: Path) -> None:
+    if header_of(path).kind != "exchanges":
+        raise FileInvalid("a recording of signals holds no requests", path=str(path), expected="one of exchanges")
+
+
+def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
+    """A write to a plant is asked for once, with what it would be."""
+    writes = [e for e in exchanges_of(recording) if changes(e.request)]
+    dangerous = [e for e in writes if e.unit == 0 or e.request[0] == 8]
+    if dangerous and not options["i_know"]:
+        raise NotAllowed(f"{len(dangerous)} of the recorded writes are broadcasts or diagnostics", hint="--i-know")
+    if not writes or options["yes"]:
+        return
+    for exchange in writes[:SHOWN]:
+        talk.print(f"  unit {exchange.unit}: {exchange.request.hex(' ')}", soft_wrap=True, markup=False)
+    if not sys.stdin.isatty() or not click.confirm(f"make these {len(writes)} writes at {url}?", err=True):
+        raise NotAllowed("the writes were not allowed", hint="--yes")
+
+
+def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, Any, None]]) -> None:
+    """Until it is done, or a signal ends it: then what was compared so far counts."""
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            asyncio.get_running_loop().add_signal_handler(number, stop.set)
+        if not talk.is_terminal:
+            await work(stop, lambda done: None)
+            return
+        with talk.status("comparing") as status:
+            await work(stop, lambda done: status.update(f"comparing: {done} exchanges"))
+
+    run_precise(main())
+
+
+# -- what is shown --------------------------------------------------------------------------------------------------------
+
+
+def _show(result: Comparison, recording: Path, other: str, everything: bool) -> None:
+    name = recording.name if recording.suffix == ".log" else shown(parts_of(recording)[0])
+    data.print(f"{other} against {name}", soft_wrap=True, markup=False)
+    if result.differences:
+        table = Table("at s", "unit", "what", "asked", "where", "recorded", "there", box=None, pad_edge=False)
+        for d in result.differences if everything else result.differences[:SHOWN]:
+            table.add_row(f"{d.t_s:.3f}", str(d.unit), d.what, d.request, d.where, d.recorded, d.other)
+        data.print(table)
+        left = sum(result.by_kind.values()) - min(len(result.differences), SHOWN)
+        if left > 0 and not everything:
+            talk.print("  and more: --all", soft_wrap=True)
+    if result.latency:
+        table = Table(
+            "latency, ms", "n", "recorded p50", "p90", "p99", "there p50", "p90", "p99", box=None, pad_edge=False
+        )
+        for row in result.latency:
+            times = [f"{1000 * t:.1f}" for t in (*row.recorded_s, *row.other_s)]
+            table.add_row(row.service, str(row.count), *times, "" if row.alike else "beyond tolerance")
+        data.print(table)
+    kinds = ", ".join(f"{n} {kind}" for kind, n in sorted(result.by_kind.items()))
+    data.print(
+        f"{result.compared} compared, {result.alike} alike" + (f"; otherwise: {kinds}" if kinds else ""), soft_wrap=True
+    )
+    if result.left_out:
+        data.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
+    timing = "not known" if result.timing is None else f"{100 * result.timing:.1f} %"
+    verdict = "met" if result.met else "NOT met"
+    data.print(f"fidelity: values {100 * result.values:.1f} %, timing {timing}: {verdict}", soft_wrap=True)

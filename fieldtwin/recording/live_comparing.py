@@ -1,0 +1,116 @@
+"""A live device held against a recording: it is asked what was asked then, in the same order. Reads only, unless that is said.
+
+It must never know a screen; what may be written is decided by who calls.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterable
+
+from fieldtwin.commissioning.live import canopen_at
+from fieldtwin.commissioning.reading import Target
+from fieldtwin.decoding.canopen_wire import CanopenWire
+from fieldtwin.recording.asking import Asker, changes
+from fieldtwin.recording.comparing import Comparer, Comparison, Rules
+from fieldtwin.recording.comparing_can import Frames, compare_logs
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.connection import Connector, Direction, Tap
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import SdoAborted, WireError
+from gateway.core.recording import Exchange
+from gateway.wallclock import WallClock
+
+MAX_FRAMES = 1_000_000
+"""Frames of a live bus that are kept for comparing."""
+
+Progress = Callable[[int], None]
+
+
+async def compare_device(
+    recorded: Iterable[Exchange],
+    asker: Asker,
+    comparer: Comparer,
+    *,
+    unit: int | None = None,
+    writes: bool = False,
+    most: int = 0,
+    stop: asyncio.Event | None = None,
+    progress: Progress = lambda done: None,
+) -> None:
+    """Ask `most` (0: all) of the recorded requests again, of the recorded unit or of `unit`. What may change the device is
+    left out and counted, unless `writes`. Raises `ConnectionLost`."""
+    done = 0
+    for exchange in recorded:
+        if (most and done >= most) or (stop is not None and stop.is_set()):
+            return
+        if changes(exchange.request) and not writes:
+            comparer.left_out()
+            continue
+        other = await asker.ask(exchange.unit if unit is None else unit, exchange.request)
+        if other is None:
+            comparer.left_out()
+            continue
+        comparer.add(exchange, other)
+        done += 1
+        progress(done)
+
+
+class _Kept(Tap):
+    """The frames that passed, as (ns, frame)."""
+
+    def __init__(self) -> None:
+        self.frames: list[tuple[int, CanFrame]] = []
+
+    def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
+        """A bus has none."""
+
+    def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
+        if len(self.frames) < MAX_FRAMES:
+            self.frames.append((t_ns, frame))
+
+
+async def compare_node(
+    recorded: Callable[[], Frames],
+    target: Target,
+    rules: Rules,
+    *,
+    node: int | None = None,
+    most: int = 0,
+    listen_s: float = 0.0,
+    stop: asyncio.Event | None = None,
+    progress: Progress = lambda done: None,
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> Comparison:
+    """Make the SDO uploads that a log holds again, of `node` or of all nodes that were asked. With `listen_s`, listen so long
+    afterwards, and compare what nobody asks for, too. Raises `Unreachable`, `ConnectionLost`."""
+    clock, kept = clock or WallClock(), _Kept()
+    nodes, left_out = set[int](), 0
+    async with canopen_at(
+        target.url, target.bitrate, sdo_timeout_s=target.timeout_s, taps=[kept], connector=connector, clock=clock
+    ) as master:
+        done = 0
+        wire = CanopenWire("can", ())
+        for t_ns, frame in recorded():
+            for exchange in wire.feed(frame, t_ns)[1]:
+                asked = exchange.service == "SDO upload" and node in (None, exchange.unit)
+                if not asked or (most and done >= most) or (stop is not None and stop.is_set()):
+                    left_out += exchange.service == "SDO download"
+                    continue
+                span = exchange.spans[0]
+                nodes.add(exchange.unit)
+                try:
+                    await master.sdo_upload(exchange.unit, span.address, span.subindex)
+                except (SdoAborted, WireError):
+                    pass  # that is an outcome, and the frames show it
+                done += 1
+                progress(done)
+        if listen_s:
+            await clock.sleep_until_ns(clock.monotonic_ns() + round(listen_s * NS_PER_S))
+    result = compare_logs(
+        recorded(), kept.frames, rules, profile=target.profile, nodes=nodes, messages=listen_s > 0, uploads=done
+    )
+    result.left_out = left_out
+    return result

@@ -28,8 +28,8 @@ def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> No
             raise file.error(loc, f"what computes {name!r}", expected="either `formulas:` or `python: FILE.py:CLASS`")
         if simulation.python is not None and not _python(file, simulation.python)[0].is_file():
             raise file.error((*loc, "python"), "no such file", expected="FILE.py:CLASS", got=simulation.python)
-        for known in simulation.inputs.values():
-            _input_tag(file, form, system, loc, known)
+        for key, known in simulation.inputs.items():
+            _check_input(file, form, system, (*loc, "inputs", key), known)
         _check_formulas(file, simulation, name)
     for name, device in form.devices.items():
         if device.simulation is not None and device.simulation not in form.simulations:
@@ -78,15 +78,14 @@ def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> No
             )
 
 
-def _input_tag(file: YamlFile, form: PrototypeForm, system: System, loc: tuple[str, ...], text: str) -> Tag:
+def _check_input(file: YamlFile, form: PrototypeForm, system: System, loc: tuple[str, ...], text: str) -> None:
     device, _, tag = text.partition(".")
     if device not in form.devices or device not in system.devices:
-        raise file.error((*loc, "inputs"), f"no emulated device {device!r}", expected=", ".join(form.devices))
+        raise file.error(loc, f"no emulated device {device!r}", expected=", ".join(form.devices))
     tags = system.devices[device].profile.tags
     if tag not in tags or tags[tag].is_text:
         numbers = ", ".join(t.name for t in tags.values() if not t.is_text)
-        raise file.error((*loc, "inputs"), f"{device} has no number {tag!r}", expected=numbers)
-    return tags[tag]
+        raise file.error(loc, f"{device} has no number {tag!r}", expected=numbers)
 
 
 def _python(file: YamlFile, text: str) -> tuple[Path, str]:

@@ -177,9 +177,10 @@ class VirtualRun:
             if self.shore is not None:
                 await self.shore.halt()
             self.outputs_confirmed_safe = await bench.run.stop_gateway()
+            outputs = describe(bench.run.gateway, loop.now_ns)["outputs"]  # a node that was stopped holds nothing for sure
             await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
             self._judge(bench.run.field)
-            self._take_status(bench)
+            self._take_status(bench, outputs)
 
     async def _through(self, bench: VirtualBench, loop: VirtualLoop) -> None:
         """To the end of the run's time, piece by piece."""
@@ -240,11 +241,12 @@ class VirtualRun:
                 self._numbers[name] = held.number
         self.oracle.judge(self._emulated)
 
-    def _take_status(self, bench: VirtualBench) -> None:
+    def _take_status(self, bench: VirtualBench, outputs: list[dict[str, Any]]) -> None:
         now_ns = bench.loop.now_ns
         gateway, plc = bench.run.gateway, bench.run.plc
         self.gateway_status = {
             **describe(gateway, now_ns),
+            "outputs": outputs,
             "learnt": describe_learnt(gateway.drivers.values()),
             "store_error": "",
         }

@@ -72,8 +72,8 @@ def command(
             raise UsageError(f"{len(named) or 'no'} device called {name!r}", expected=f"one of {there}")
         setattr(named[0], what, said)
     write_html(document, out)
-    for file in left_out:
-        talk.print(f"left out {file}: nothing that goes into a document", markup=False, soft_wrap=True)
+    for why in left_out:
+        talk.print(f"left out: {why}", markup=False, soft_wrap=True)
     if as_json:
         json.dump(document.as_json(), sys.stdout, indent=2)
         sys.stdout.write("\n")

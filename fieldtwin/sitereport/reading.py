@@ -22,12 +22,17 @@ MOST_ROWS = 200
 SUFFIXES = (".json", ".jsonl")
 
 
+class NotTaken(FileInvalid):
+    """A file of another kind: nothing that goes into a document."""
+
+
 def read_site(
     paths: Iterable[Path], *, site: str, by: str, prepared: str, customer: str = "", remarks: str = ""
 ) -> tuple[Document, list[str]]:
-    """The document of all files, and of folders those of the kinds that it takes; what else was in these folders, and left out.
+    """The document of all files, and of folders those of the kinds that it takes; and what was left out of these, and why.
 
-    Raises `FileInvalid` for a file that was named and is none of them, `UsageError` where there is nothing.
+    Raises `FileInvalid` for a file that was named and is none of them, and for one that is damaged wherever it is; `UsageError`
+    where there is nothing.
     """
     pieces: list[tuple[Path, Piece]] = []
     left_out: list[str] = []
@@ -38,8 +43,8 @@ def read_site(
         for file in sorted(p for p in path.rglob("*") if p.suffix in SUFFIXES and p.is_file()):
             try:
                 pieces.append((file, read_piece(file)))
-            except FileInvalid:
-                left_out.append(str(file))
+            except NotTaken as e:
+                left_out.append(str(e))
     if not pieces:
         raise UsageError(
             "nothing to report", expected="dumps, and the JSON of check, diff or compare", got="none of them"
@@ -83,11 +88,11 @@ def read_piece(path: Path) -> Piece:
     try:
         data = json.loads(raw)
     except (ValueError, RecursionError) as e:
-        raise FileInvalid("not JSON", path=str(path), got=str(e)[:60]) from e
+        raise NotTaken("not JSON", path=str(path), got=str(e)[:60]) from e
     kind = data.get("kind") if isinstance(data, dict) else None
     if kind not in READERS:
         known = ", ".join(f"the JSON of `{name}`" for name in READERS)
-        raise FileInvalid("no such file is taken", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
+        raise NotTaken("not for a document", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
     try:
         return READERS[kind](data)
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as e:

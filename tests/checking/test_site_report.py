@@ -1,0 +1,178 @@
+"""The site acceptance document: every device, serial number and deviation of the files stands in it, escaped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from html import unescape
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from fieldtwin.checking.device_case import DeviceResult, Spoken
+from fieldtwin.checking.html import render_html as render_check
+from fieldtwin.checking.modbus_cases import CASES
+from fieldtwin.checking.results import as_json, as_report
+from fieldtwin.checking.subject import Subject
+from fieldtwin.cli.report_command import command
+from fieldtwin.conformance.case import failed, inconclusive, passed, skipped
+from fieldtwin.report.junit import render_junit
+from gateway.core.connection import Direction
+from gateway.core.errors import FileInvalid, UsageError
+
+NASTY = "<script>alert('1')</script>"
+SUBJECT = Subject(
+    "modbus", "tcp://192.0.2.7:502", 17, {"vendor": NASTY, "product code": "FM-3", "serial number": "A1234"},
+    "2026-11-21T10:00:00+00:00", 12.5, "A. Fitter", "fieldtwin check modbus tcp://192.0.2.7:502 --unit 17", "write",
+    ("holding:100",), 1.0,
+)  # fmt: skip
+RESULTS = [
+    DeviceResult(CASES[0], passed("silence")),
+    DeviceResult(CASES[1], failed("answers & <b>wrongly</b>"), spoken=(Spoken(1_500_000, Direction.SENT, "01 03"),)),
+    DeviceResult(CASES[2], inconclusive("cannot be told")),
+    DeviceResult(CASES[3], skipped("not on this wire")),
+    DeviceResult(CASES[4], skipped("it has no function 18")),
+    DeviceResult(CASES[5], failed("known"), waived="the meter is replaced in May"),
+]
+
+
+@pytest.fixture
+def check(tmp_path: Path) -> Path:
+    """The JSON of a check, as `--out` writes it."""
+    path = tmp_path / "unit17.json"
+    path.write_text(json.dumps(as_json(SUBJECT, RESULTS)))
+    return path
+
+
+@pytest.fixture
+def dump(tmp_path: Path) -> Path:
+    """A dump of a node that says its serial number."""
+    lines = [
+        {
+            "fieldtwin_dump": 1, "protocol": "canopen", "address": 5, "ranges": ["1000h..1FFFh"], "profile": None,
+            "endpoint": "can:socketcan/can0", "started": "2026-11-21T11:00:00.000+00:00",
+        },
+        {"pass": 0, "at": "2026-11-21T11:00:00.000+00:00"},
+        {"read": "1018h:04", "hex": "78563412", "us": 900},
+        {"read": "1008h:00", "hex": b"incl".hex(), "us": 900},
+        {"latency": {"upload": {"count": 2, "p50_us": 900, "p95_us": 950, "most_us": 1000}}},
+        {"ended": "2026-11-21T11:00:09.000+00:00", "requests": 2},
+    ]  # fmt: skip
+    path = tmp_path / "node5.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return path
+
+
+def report(*words: str | Path) -> Result:
+    return CliRunner().invoke(command, [str(word) for word in words], standalone_mode=False)
+
+
+def words_of(html: str) -> str:
+    """What a reader sees."""
+    body = html[html.index("<body") :]
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", body)).split())
+
+
+def test_all_that_the_files_say_stands_in_it(check: Path, dump: Path, tmp_path: Path) -> None:
+    out = tmp_path / "site.html"
+    result = report(
+        check, dump, "-o", out, "--site", "Pump house 3", "--by", "A. Fitter", "--for", "Water board", "--label",
+        "unit 17=Flow meter F3", "--remarks", "1 < 2",
+    )  # fmt: skip
+    assert result.return_value == 0, result.output
+    assert "2 devices, 1 deviation, 1 open point" in result.output
+    page = out.read_text()
+    seen = words_of(page)
+    for said in (
+        "Pump house 3", "Water board", "A. Fitter", "Flow meter F3", "unit 17", "node 5", "A1234", "305419896", "incl", "FM-3",
+        "1 deviation, 1 open point, 1 waived", "answers & <b>wrongly</b>", "cannot be told", "the meter is replaced in May",
+        CASES[1].clause, CASES[1].id, CASES[1].must, "it has no function 18", "2026-11-21 10:00 UTC", NASTY, "1 < 2",
+        hashlib.sha256(check.read_bytes()).hexdigest(), hashlib.sha256(dump.read_bytes()).hexdigest(), "Signatures",
+    ):  # fmt: skip
+        assert said in seen, said
+    assert "<script" not in page
+    assert "http" not in page.replace("https://", "")
+    assert "not on this wire" not in seen
+
+
+def test_serial_numbers_from_name_plates_go_before(check: Path, dump: Path, tmp_path: Path) -> None:
+    out = tmp_path / "site.html"
+    result = report(check, dump, "-o", out, "--serial", "unit 17=Z9", "--json")
+    data = json.loads(result.output)
+    assert {d["device"]: d["serial_number"] for d in data["devices"]} == {
+        "unit 17": "Z9",
+        "node 5": "305419896 (12345678h)",
+    }
+    assert [(d["weight"], d["where"]) for d in data["deviations"]] == [
+        ("deviation", CASES[1].id), ("open", CASES[2].id), ("waived", CASES[5].id),
+    ]  # fmt: skip
+    assert isinstance(report(check, "-o", out, "--serial", "unit 3=Z9").exception, UsageError)
+
+
+def test_a_folder_is_searched_and_what_does_not_belong_is_left_out(check: Path, dump: Path, tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text("{}")
+    (tmp_path / "node5.sent.jsonl").write_text('{"started": "x"}\n')
+    result = report(tmp_path, "-o", tmp_path / "site.html")
+    assert result.return_value == 0
+    assert tmp_path.name in (tmp_path / "site.html").read_text()
+    assert result.stderr.count("left out") == 2
+
+
+def test_a_dump_that_was_broken_off_is_an_open_point(dump: Path, tmp_path: Path) -> None:
+    dump.write_text("".join(dump.read_text().splitlines(keepends=True)[:-1]))
+    result = report(dump, "-o", tmp_path / "site.html")
+    assert "no deviation, 1 open point" in result.output
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        '{"kind": "fieldtwin check"}',
+        '{"kind": "fieldtwin check", "about": {}, "cases": [1], "counts": 2}',
+    ],
+)
+def test_what_is_no_such_file_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    path.write_text(text)
+    assert isinstance(report(path, "-o", tmp_path / "site.html").exception, FileInvalid)
+    assert not (tmp_path / "site.html").exists()
+
+
+def test_a_damaged_file_of_a_folder_is_no_secret(check: Path, dump: Path, tmp_path: Path) -> None:
+    dump.write_text(dump.read_text().replace("1018h:04", "1018h:zz"))
+    assert isinstance(report(tmp_path, "-o", tmp_path / "site.html").exception, FileInvalid)
+
+
+def test_nothing_is_no_document(tmp_path: Path) -> None:
+    assert isinstance(report(tmp_path, "-o", tmp_path / "site.html").exception, UsageError)
+
+
+def test_the_report_of_a_check_shows_bytes_and_escapes_what_devices_say() -> None:
+    page = render_check(SUBJECT, RESULTS, "fieldtwin check modbus tcp://192.0.2.7:502 --unit 17")
+    seen = words_of(page)
+    assert "<script" not in page
+    for said in (
+        NASTY,
+        "answers & <b>wrongly</b>",
+        "01 03",
+        "1.5 ms",
+        CASES[1].clause,
+        "danger",
+        "A. Fitter",
+        "failed",
+    ):
+        assert said in seen, said
+    assert f"For other wires: {CASES[3].id}." in seen
+
+
+def test_junit_has_each_case_with_its_bytes() -> None:
+    xml = render_junit(as_report(SUBJECT, RESULTS, "again")).decode()
+    assert xml.count("<testcase") == len(RESULTS)
+    assert xml.count("<failure") == 1
+    assert "&gt; 01 03" in xml
+    assert f"--only {CASES[1].id}" in xml

@@ -184,7 +184,7 @@ def test_a_key_that_stands_twice(invoke: Invoke, plant: Callable[..., str]) -> N
         ("listen: \"pty:line1\"", "listen: \"can:fieldtwin/x\"", "pty or tcp"),
         ("recording: cast.jsonl", "recording: nowhere.jsonl", "no recording 'nowhere.jsonl'"),
         ("  modem:        {model: mailbox", "  moden:        {model: mailbox", "no device 'moden'"),
-        ("model: mailbox,", "model: mailbox, recording: cast.jsonl,", "either"),
+        ("model: mailbox,", "model: mailbox, recording: cast.jsonl,", "one of `recording"),
         ("at_end: hold", "at_end: stop", "at_end"),
     ],
 )  # fmt: skip

@@ -64,7 +64,9 @@ class Prototype:
     def with_recording(self, device: str, path: Path, speed: float | None = None) -> Prototype:
         """The same, with `device` playing another recording."""
         old = self.devices[device]
-        form = old.form.model_copy(update={"recording": str(path), "simulation": None, "plays": {}, **({"speed": speed} if speed else {})})
+        form = old.form.model_copy(
+            update={"recording": str(path), "simulation": None, "plays": {}, **({"speed": speed} if speed else {})}
+        )
         return replace(self, devices={**self.devices, device: replace(old, form=form, recording=path)})
 
     def with_speed(self, speed: float) -> Prototype:

@@ -18,7 +18,9 @@ ModbusCase = DeviceCase[ModbusWire]
 READ, WRITE, DISRUPT = Danger.READ, Danger.WRITE, Danger.DISRUPT
 LINE = ("rtu-line",)
 ASCII = ("ascii-line",)
-ANY_LINE = ("rtu-line", "ascii-line")
+FRAMED = ("rtu-line", "rtu-stream")
+"""RTU frames, on a line or through TCP: what needs no pauses."""
+ANY_LINE = ("rtu-line", "ascii-line", "rtu-stream")
 TCP = ("mbap-stream",)
 STREAM = ("mbap-stream", "rtu-stream")
 
@@ -40,7 +42,7 @@ def case(
 HOLDING, COIL = ("holding",), ("coil",)
 CASES: tuple[ModbusCase, ...] = (
     case("MB-001", "bad CRC in a request", "SL 2.4.2", READ, "a read with the CRC inverted", "silence",
-         line.bad_check_sum, LINE),
+         line.bad_check_sum, FRAMED),
     case("MB-004", "half a request, a pause, a whole one", "SL 2.5.1.1", READ, "half a read, 100 ms, a read",
          "answer the second", line.half_then_whole, LINE),
     case("MB-005", "a gap over t1.5 inside a frame", "SL 2.5.1.1; libmodbus #400", READ,
@@ -48,20 +50,20 @@ CASES: tuple[ModbusCase, ...] = (
     case("MB-007", "two frames closer than t3.5", "SL 2.5.1.1", READ, "two reads without a pause",
          "answer both (tolerant) or none (strict)", line.no_gap, LINE),
     case("MB-008a", "leading 00 noise", "minimalmodbus #61", READ, "00 00, then a read", "hunt, take the frame",
-         line.leading_zero, LINE),
+         line.leading_zero, FRAMED),
     case("MB-008b", "leading FF noise", "minimalmodbus #61", READ, "FF FF, then a read", "hunt, take the frame",
-         line.leading_ones, LINE),
+         line.leading_ones, FRAMED),
     case("MB-009", "trailing 00s", "HA #69742", READ, "a read, then 00 00", "take the frame, drop the tail",
-         line.trailing_zeros, LINE),
+         line.trailing_zeros, FRAMED),
     case("MB-026", "broadcast write", "SL 2.4.1; libmodbus #372", DISRUPT, "FC 06 to unit 0", "execute it, keep silent",
          write.broadcast_write, ANY_LINE, ("holding", "i-know")),
     case("MB-027", "broadcast read", "libmodbus #379", READ, "a read to unit 0", "silence", line.broadcast_read, ANY_LINE),
     case("MB-029", "request to another unit", "SL 2.4.2", READ, "reads to three other units", "silence", line.other_unit,
          ANY_LINE),
     case("MB-030", "another unit's request and response, then ours", "libmodbus #18; pymodbus #674", READ,
-         "another's read with its response, then ours", "answer ours", line.neighbours_talk, LINE),
+         "another's read with its response, then ours", "answer ours", line.neighbours_talk, FRAMED),
     case("MB-031", "another unit silent, then ours", "libmodbus #83, #86", READ, "a read to a unit that is not there, ours",
-         "answer ours", line.neighbour_silent, LINE),
+         "answer ours", line.neighbour_silent, FRAMED),
     case("MB-032", "unknown function to another unit", "nanoMODBUS PR #78", DISRUPT, "function 64 to another unit",
          "silence", line.stranger_function, ANY_LINE),
     case("MB-033a", "unknown function", "AP 7", DISRUPT, "function 64 with two bytes", "exception 01", pdu.unknown_function),
@@ -107,8 +109,8 @@ CASES: tuple[ModbusCase, ...] = (
          pdu.listen_only, ANY_LINE, ("i-know",)),
     case("MB-047", "FC08 counters", "SL 2.4.2", DISRUPT, "08/0E before and after three reads", "count them", pdu.counters),
     case("MB-049", "padding bits", "AP 6.1", READ, "a read of a few bits", "padding is 0", pdu.padding),
-    case("MB-050a", "a frame of 256 bytes", "SL 2.5.1", DISRUPT, "08/00 with 250 bytes", "answer it", line.frame_of_256, LINE),
-    case("MB-050b", "a frame of 257 bytes", "SL 2.5.1", DISRUPT, "08/00 with 251 bytes", "discard it", line.frame_of_257, LINE),
+    case("MB-050a", "a frame of 256 bytes", "SL 2.5.1", DISRUPT, "08/00 with 250 bytes", "answer it", line.frame_of_256, FRAMED),
+    case("MB-050b", "a frame of 257 bytes", "SL 2.5.1", DISRUPT, "08/00 with 251 bytes", "discard it", line.frame_of_257, FRAMED),
     case("MB-051", "byte by byte", "catalogue", READ, "a read, one byte a segment", "answer it", tcp.byte_by_byte, STREAM),
     case("MB-052", "several ADUs in one segment", "OpenPLC #253; pymodbus #1949", READ, "three reads in one segment",
          "answer all, in order", tcp.several_at_once, TCP),
@@ -134,9 +136,9 @@ CASES: tuple[ModbusCase, ...] = (
     case("MB-065", "connection limit", "TG 4.2.1", DISRUPT, "20 connections that are not used, then one more",
          "serve the last one", tcp.many_connections, STREAM),
     case("MB-068", "wrong baud rate or parity", "catalogue", DISRUPT, "what another baud rate makes of a read", "silence; go on",
-         line.wrong_baud_rate, LINE),
+         line.wrong_baud_rate, FRAMED),
     case("MB-069", "two masters on one line", "pymodbus #432", DISRUPT, "two reads at once", "silence; go on",
-         line.two_masters, LINE),
+         line.two_masters, FRAMED),
     case("MB-070a", "ASCII: bad LRC", "SL 2.5.2", READ, "a read with the LRC inverted", "silence", line.bad_lrc, ASCII),
     case("MB-070b", "ASCII: a second colon", "SL 2.5.2", READ, "half a read, then a read", "answer the second",
          line.second_colon, ASCII),

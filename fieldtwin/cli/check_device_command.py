@@ -130,7 +130,7 @@ class Check:
             sys.stdout.write("\n")
         else:
             elsewhere = [] if self.options["only"] else [r for r in results if r.reason == OTHER_WIRE]
-            print_results([r for r in results if r not in elsewhere])
+            print_results([r for r in results if r not in elsewhere], "what is asked")
             if elsewhere:
                 talk.print(f"{len(elsewhere)} more cases are for other wires", markup=False)
         return exit_code(results)

@@ -66,8 +66,8 @@ class Progress:
             )
 
 
-def print_results(results: Sequence[CaseResult]) -> None:
-    """The table on stdout; without a terminal one line a case, nothing cut."""
+def print_results(results: Sequence[CaseResult], does: str = "the device") -> None:
+    """The table on stdout, with what a case is about below `does`; without a terminal one line a case, nothing cut."""
     if not data.is_terminal:
         for r in results:
             reason = f": {r.reason}" if r.reason else ""
@@ -78,7 +78,7 @@ def print_results(results: Sequence[CaseResult]) -> None:
         table.add_column("")
         table.add_column("case", no_wrap=True)
         table.add_column("danger", no_wrap=True)
-        table.add_column("the device", ratio=2)
+        table.add_column(does, ratio=2)
         table.add_column("what was found", ratio=3)
         for r in results:
             style, danger = STYLE[r.verdict], r.case.danger.value

@@ -351,7 +351,7 @@ class Incoming:
         self.duplicates = 0
         self.too_far = 0
         self._knows = knows
-        self._ack_delay_ns = ack_delay_ns
+        self.ack_delay_ns = ack_delay_ns
         self._streams: OrderedDict[bytes, _Stream] = OrderedDict()
         self._answers: deque[Frame] = deque(maxlen=MAX_STREAMS)
         self.unknown_schema = b""
@@ -445,7 +445,7 @@ class Incoming:
         return max((stream.through for stream in self._of(origin) if stream.open), default=0)
 
     def _acknowledge(self, stream: _Stream, now_ns: int, *, at_once: bool = False) -> None:
-        due_ns = now_ns if at_once else now_ns + self._ack_delay_ns
+        due_ns = now_ns if at_once else now_ns + self.ack_delay_ns
         stream.ack_ns = due_ns if stream.ack_ns is None else min(stream.ack_ns, due_ns)
 
     def next_frame(self, now_ns: int) -> Frame | None:

@@ -1,0 +1,245 @@
+"""Threads over their carriers: the modems of the reference system and TCP, in virtual time with a bad link and sudden deaths."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable, Coroutine
+from contextlib import asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from support import eventually
+from support import run as run_really
+from thread_rig import SCHEMA, ShakyCarrier, Twin, equal, value
+
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.ports import MemoryNet
+from emulators.virtual.seal import sealed
+from gateway.connections.listeners import TcpListener
+from gateway.connections.os_connector import OsConnector
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import Unreachable
+from gateway.core.nursery import Nursery
+from gateway.devices.config import BusConfig, DeviceConfig
+from gateway.store.event import Event, Kind
+from gateway.wallclock import WallClock
+from twin.prototype import DigitalTwinPrototype
+from twin.prototype_file import load_prototype
+from twin.system import load_system
+from twin.thread_frames import Schema
+from twin.thread_link import Carrier
+from twin.thread_modem import ModemCarrier
+from twin.thread_tcp import TcpDialler, TcpListening
+
+ADDRESS = Endpoint.parse("tcp://127.0.0.1:7000")
+
+
+def virtually(main: Callable[[VirtualLoop, VirtualClock, MemoryNet], Coroutine[Any, Any, None]]) -> None:
+    loop = VirtualLoop()
+    try:
+        with sealed():
+            loop.run_until_complete(main(loop, VirtualClock(loop), MemoryNet(loop)))
+    finally:
+        loop.close()
+
+
+async def until_equal(one: Twin, other: Twin, within_s: float, loop: VirtualLoop) -> float:
+    began = loop.time()
+    while not await equal(one, other):
+        assert loop.time() - began < within_s, (one.end.describe(), other.end.describe())
+        await asyncio.sleep(0.25)
+    return loop.time() - began
+
+
+class LateListening(Carrier):
+    """`TcpListening.start`, when the first link is wanted."""
+
+    name = "listening"
+
+    def __init__(self, net: MemoryNet) -> None:
+        self._net = net
+        self._real: TcpListening | None = None
+
+    async def open(self) -> Any:
+        if self._real is None:
+            self._real = await TcpListening.start(ADDRESS, self._net.listen_for_clients, [SCHEMA])
+        return await self._real.open()
+
+    async def aclose(self) -> None:
+        if self._real is not None:
+            await self._real.aclose()
+
+
+def over_tcp(net: MemoryNet, seed: int) -> tuple[Callable[[], Carrier], Callable[[], Carrier]]:
+    return (
+        lambda: ShakyCarrier(LateListening(net), seed),
+        lambda: ShakyCarrier(TcpDialler(ADDRESS, net, [SCHEMA]), seed + 1),
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_over_tcp_with_loss_repeats_reordering_and_deaths_both_logs_are_equal(tmp_path: Path, seed: int) -> None:
+    async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
+        chance = random.Random(seed)
+        plant_carrier, shore_carrier = over_tcp(net, seed)
+        plant = Twin("plant", tmp_path, clock, plant_carrier)
+        shore = Twin("shore", tmp_path, clock, shore_carrier)
+        await plant.start()
+        await shore.start()
+        for n in range(150):
+            await plant.log(*(value(10 * n + i) for i in range(chance.randrange(10))))
+            if n % 10 == 0:
+                await shore.log(Event(0, n, Kind.COMMAND, "shore", bytes([0, n % 5])))
+            await asyncio.sleep(chance.random())
+            if chance.random() < 0.06:
+                dying = chance.choice([plant, shore])
+                await dying.kill()
+                await asyncio.sleep(chance.random() * 5)
+                await dying.start()
+        await until_equal(plant, shore, 600, loop)
+        commands = [e.value for e in plant.arrived]
+        assert len({e.sequence for e in plant.arrived}) == len(commands), "nothing is told twice"
+        assert [e.sequence for e in plant.arrived] == sorted(e.sequence for e in plant.arrived)
+        await plant.kill()
+        await shore.kill()
+
+    virtually(main)
+
+
+SYSTEM = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.yaml"
+
+
+@asynccontextmanager
+async def modems(net: MemoryNet, clock: VirtualClock, seed: int) -> Any:
+    """The observatory's modems and their link in memory; carriers for both ends."""
+    system = load_system(str(SYSTEM))
+    prototype = replace(load_prototype(system), seed=seed)
+    field = DigitalTwinPrototype(system, prototype, clock).field(Path("virtual"), net)
+    await field.open()
+    async with Nursery() as nursery:
+        nursery.start(field.run(), "field")
+
+        def at(name: str, endpoint: Endpoint) -> ModemCarrier:
+            config = system.devices["modem"]
+            device = DeviceConfig(name, config.profile, name, config.address, {"inbox": 200})
+            return ModemCarrier(device, BusConfig(name, endpoint, 2.0, 1), net, clock, [SCHEMA])
+
+        yield (lambda: at("near", field.listening["lan"])), (lambda: at("far", field.far["modem"]))
+    await field.aclose()
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_over_the_modems_of_the_reference_system_both_logs_are_equal(tmp_path: Path, loss: float) -> None:
+    """64 bytes a message, 400 bytes a second, 200 ms on the way; and frames lost on top of what the link loses."""
+
+    async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
+        async with modems(net, clock, 3) as (near, far):
+            plant = Twin("plant", tmp_path, clock, lambda: ShakyCarrier(near(), 1, loss))
+            shore = Twin("shore", tmp_path, clock, lambda: ShakyCarrier(far(), 2, loss))
+            await plant.start()
+            await shore.start()
+            for n in range(40):
+                await plant.log(value(n))
+                await asyncio.sleep(0.5)
+                if n == 15:
+                    await shore.log(Event(0, 1, Kind.COMMAND, "shore", b"\0\1"))
+                    await plant.kill()
+                    await plant.start()
+                if n == 25:
+                    await shore.kill()
+                    await asyncio.sleep(30)
+                    await shore.start()
+            await until_equal(plant, shore, 600, loop)
+            assert len(await shore.all_of("plant:5f3a91c2")) == 40
+            await plant.kill()
+            await shore.kill()
+
+    virtually(main)
+
+
+def test_an_hour_without_a_carrier_costs_nothing(tmp_path: Path) -> None:
+    async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
+        plant_carrier, shore_carrier = over_tcp(net, 9)
+        plant, shore = Twin("plant", tmp_path, clock, plant_carrier), Twin("shore", tmp_path, clock, shore_carrier)
+        await plant.start()
+        for n in range(60):
+            await plant.log(*(value(600 * n + i) for i in range(600)))
+            await asyncio.sleep(60)
+        assert plant.end.waiting == 36_000
+        await shore.start()
+        took_s = await until_equal(plant, shore, 120, loop)
+        assert took_s < 120
+        assert [e.sequence for e in shore.arrived] == list(range(1, 36_001)), "told in order, each once"
+        await plant.kill()
+        await shore.kill()
+
+    virtually(main)
+
+
+def test_a_schema_that_the_other_side_does_not_have_is_said_on_both(tmp_path: Path) -> None:
+    async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
+        other = Schema(("something.else",))
+        plant = Twin("plant", tmp_path, clock, lambda: LateListening(net))
+        shore = Twin("shore", tmp_path, clock, lambda: TcpDialler(ADDRESS, net, [other]), other)
+        await plant.start()
+        await shore.start()
+        await plant.log(value(1))
+        await asyncio.sleep(5)
+        assert f"does not have our schema {SCHEMA.id.hex()}" in plant.end.trouble
+        assert SCHEMA.id.hex() in shore.end.trouble
+        assert plant.end.waiting == 1
+        await plant.kill()
+        await shore.kill()
+
+    virtually(main)
+
+
+def test_a_store_that_refuses_is_not_acknowledged_to_and_catches_up(tmp_path: Path) -> None:
+    async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
+        plant, shore = (
+            Twin("plant", tmp_path, clock, lambda: LateListening(net)),
+            Twin("shore", tmp_path, clock, lambda: TcpDialler(ADDRESS, net, [SCHEMA])),
+        )
+        await plant.start()
+        await shore.start()
+        keep = shore.store.keep
+
+        async def refuse(*args: Any, **kwargs: Any) -> int:
+            raise Unreachable("the disk is full")
+
+        shore.store.keep = refuse  # type: ignore[method-assign]
+        await plant.log(*(value(n) for n in range(50)))
+        await asyncio.sleep(20)
+        assert (plant.end.waiting, shore.end.trouble) == (50, "the disk is full")
+        shore.store.keep = keep  # type: ignore[method-assign]
+        await until_equal(plant, shore, 120, loop)
+        await plant.kill()
+        await shore.kill()
+
+    virtually(main)
+
+
+def test_over_a_real_socket(tmp_path: Path) -> None:
+    async def main() -> None:
+        listening = await TcpListening.start(Endpoint.parse("tcp://127.0.0.1:0"), TcpListener.open, [SCHEMA])
+        clock = WallClock()
+        plant = Twin("plant", tmp_path, clock, lambda: listening)
+        shore = Twin("shore", tmp_path, clock, lambda: TcpDialler(listening.bound, OsConnector(), [SCHEMA]))
+        await plant.start()
+        await shore.start()
+        await plant.log(*(value(n) for n in range(5000)))
+        await shore.log(Event(0, 1, Kind.COMMAND, "shore", b"\0\1"))
+        await eventually(lambda: equal(plant, shore))
+        assert plant.arrived[0].value == b"\0\1"
+        await shore.kill()
+        await plant.log(value(5000))
+        await shore.start()
+        await eventually(lambda: equal(plant, shore))
+        await shore.kill()
+        await plant.kill()
+
+    run_really(main())

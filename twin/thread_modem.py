@@ -1,0 +1,129 @@
+"""A thread over the reference system's modems: each datagram is one message in a mailbox, 64 bytes, a few a second.
+
+The transmitter's driver is the plant's own (`TransmitterDriver`); what is sent is put into its outbox when the one before was
+taken, and a message is acknowledged when it was read here. Either end is this class.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+
+from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.connection import Connector
+from gateway.core.errors import ConnectionLost, FieldtwinError
+from gateway.core.events import Consumer
+from gateway.core.nursery import Nursery
+from gateway.core.values import DATA
+from gateway.devices.config import BusConfig, DeviceConfig
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.tags import TagTable
+from twin.thread_frames import Schema
+from twin.thread_link import Carrier, DatagramLink
+
+TICK_NS = 20 * NS_PER_MS
+ACK_DELAY_NS = 1000 * NS_PER_MS
+"""A frame takes a second or more on the way: one ACK confirms several."""
+HALT_S = 0.5
+
+
+class _Inbox(Consumer[DATA]):
+    """What the modem received; says so."""
+
+    def __init__(self, event: str, news: asyncio.Event) -> None:
+        super().__init__(event, capacity=256)
+        self._news = news
+
+    def observe(self, item: DATA) -> None:
+        super().observe(item)
+        self._news.set()
+
+
+class ModemLink(DatagramLink):
+    """A link through a transmitter's mailboxes. It stays while the modem is away: what it holds is sent when it is back."""
+
+    ack_delay_ns = ACK_DELAY_NS
+
+    def __init__(self, driver: TransmitterDriver, bus: ModbusBus, clock: Clock, schemas: Sequence[Schema]) -> None:
+        assert driver.profile.outbox is not None
+        super().__init__(schemas, driver.profile.outbox.bytes)
+        self._driver = driver
+        self._bus = bus
+        self._clock = clock
+        self._news = asyncio.Event()
+        self._room = asyncio.Event()
+        self._inbox = _Inbox(driver.emitter.event, self._news)
+        driver.emitter.subscribe(self._inbox)
+        self._busy = False
+        self._nursery = Nursery()
+        self._nursery.start(bus.run(), "transmitter")
+        self._nursery.start(self._pump(), "mailboxes")
+
+    async def send_datagram(self, data: bytes) -> None:
+        while self._driver.consumer.queue:
+            self._room.clear()
+            self._look()
+            await self._room.wait()
+        self._driver.consumer.observe(DATA(data))
+
+    async def receive_datagram(self) -> bytes:
+        while not self._inbox.queue:
+            self._look()
+            self._news.clear()
+            await self._news.wait()
+        return self._inbox.consume().data
+
+    def _look(self) -> None:
+        if (failure := self._nursery.failure()) is not None:
+            raise ConnectionLost(f"the transmitter is not served any more: {failure}", where=self._driver.config.name)
+
+    async def _pump(self) -> None:
+        """Every so often the next exchange with the modem's mailboxes, one at a time."""
+        while True:
+            if not self._busy and self._bus.online(self._driver):
+                self._exchange()
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + TICK_NS)
+
+    def _exchange(self) -> None:
+        driver = self._driver
+        if driver.to_acknowledge and not self._inbox.queue:
+            self._submit(Job(driver, driver.acknowledge, self._done))
+        elif driver.consumer.queue:
+            self._submit(Job(driver, driver.send if driver.outbox_free else self._ask, self._done))
+
+    async def _ask(self) -> None:
+        await self._driver.check_outbox()
+
+    def _submit(self, job: Job) -> None:
+        self._busy = True
+        self._bus.submit(job)
+
+    def _done(self, error: FieldtwinError | None) -> None:
+        self._busy = False
+        if not self._driver.consumer.queue:
+            self._room.set()
+
+    async def aclose(self) -> None:
+        await self._bus.halt(HALT_S)
+        await self._nursery.__aexit__(None, None, None)
+
+
+class ModemCarrier(Carrier):
+    """The transmitter `device` on its bus, at either end of the modems' link."""
+
+    def __init__(
+        self, device: DeviceConfig, bus: BusConfig, connector: Connector, clock: Clock, schemas: Sequence[Schema]
+    ) -> None:
+        self.name = f"thread over {device.name}"
+        self._device = device
+        self._bus = bus
+        self._connector = connector
+        self._clock = clock
+        self._schemas = schemas
+
+    async def open(self) -> ModemLink:
+        tags = TagTable(self._clock)
+        driver = TransmitterDriver(self._device, tags, incoming=DATA)
+        bus = ModbusBus(self._bus, [driver], self._connector, self._clock, tags, lambda state: None)
+        return ModemLink(driver, bus, self._clock, self._schemas)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Name = Annotated[str, Field(pattern=r"^[a-zA-Z][a-zA-Z0-9_]*$")]
 Milliseconds = Annotated[int, Field(ge=1, le=3_600_000)]
@@ -263,11 +263,19 @@ class BusyForm(Strict):
     for_ms: Milliseconds
 
 
+def _as_text(formula: object) -> object:
+    """A constant is a formula, too."""
+    return repr(formula) if isinstance(formula, int | float) and not isinstance(formula, bool) else formula
+
+
+Formula = Annotated[str, BeforeValidator(_as_text)]
+
+
 class SimulationForm(Strict):
     """Values that are computed, step by step: by formulas, or by a class in Python."""
 
     step_ms: float = Field(default=100.0, ge=0.1, le=60_000)
-    formulas: dict[Name, str] = Field(default={}, description="name -> formula of t, dt, inputs and each other")
+    formulas: dict[Name, Formula] = Field(default={}, description="name -> formula of t, dt, inputs and each other")
     python: str | None = Field(
         default=None, description="FILE.py:CLASS, beside this file; it has step(t_s, dt_s, inputs)"
     )

@@ -7,6 +7,7 @@ function of time only through what is asked: nothing here waits.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 from emulators.journal import HeldJournal
@@ -15,6 +16,8 @@ from emulators.modbus.unit import Handler, ModbusUnit
 from emulators.stated import Effects, cells_of, spans_of
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import DeviceProfile, OwnFunction, Tag
+
+_WHOLE = re.compile(r"[1-9][0-9]{0,18}|0|0x[0-9a-fA-F]{1,16}")
 
 
 class StatedRegisters(RegisterBank):
@@ -111,6 +114,8 @@ def _number(tag: Tag, text: float | str) -> float:
     for number, word in tag.values:
         if word == text:
             return number * tag.scale + tag.offset
+    if isinstance(text, str) and not tag.is_text and _WHOLE.fullmatch(text):
+        return float(int(text, 0))  # an identity is text, whatever the register holds
     words = ", ".join(word for _, word in tag.values)
     expected = (
         "text" if tag.type == "string" else "none: bytes cannot be stated" if tag.is_text else words or "a number"

@@ -68,7 +68,7 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
 @click.option(
     "--listen",
     metavar="ENDPOINT",
-    help="tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH or rtu:PORT; port 0 takes a free one.",
+    help="tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:PORT; port 0 takes a free one.",
 )
 @click.option(
     "--probe",
@@ -91,6 +91,7 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
     "--hold", multiple=True, metavar="TABLE:ADDRESS=VALUE", help="A cell that always holds the same; repeatable."
 )
 @click.option("--echo", is_flag=True, help="The master is set up for a line that echoes.")
+@click.option("--ascii", "in_ascii", is_flag=True, help="On pty:PATH: the master speaks Modbus ASCII.")
 @_shared
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED)
 def modbus_master(
@@ -101,6 +102,7 @@ def modbus_master(
     none: tuple[str, ...],
     hold: tuple[str, ...],
     echo: bool,
+    in_ascii: bool,
     only: str | None,
     at_most: str,
     for_s: float,
@@ -134,7 +136,9 @@ def modbus_master(
     plan = Plan(
         only_of(only, cases), timeout_s, patience_s, wait_s, for_s, frozenset({"echo"} if echo else ()), Danger(at_most)
     )
-    options = Options(Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), _held(hold), command=argv)
+    options = Options(
+        Endpoint.parse(listen), plan, _words(values), probe, frozenset(none), _held(hold), in_ascii, command=argv
+    )
     return _judged(
         lambda listener: judge_modbus_master(options, listener),
         Listener,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from fieldtwin.conformance import canopen_plays as plays
 from fieldtwin.conformance import judges
-from fieldtwin.conformance.canopen_judges import aborts_with, legal_nmt, legal_sync, reconfigures
+from fieldtwin.conformance.canopen_judges import aborts_with, completes, legal_nmt, legal_sync, notices, reconfigures
 from fieldtwin.conformance.canopen_scene import CanopenCase, CanPlay
 from fieldtwin.conformance.case import Case, Danger, Judge
 
@@ -26,6 +26,7 @@ def _watch(id: str, title: str, clause: str, judge: Judge, must: str) -> Canopen
 SILENT = _case("CO-000", "no reply", "", READ, plays.nothing, judges.rejects, "is silent", "")
 """No case of the catalogue: how the master's timeout is guessed."""
 BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block upload")  # noqa: E731
+DOWN: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block download")  # noqa: E731
 
 CASES: tuple[CanopenCase, ...] = (
     _case("CO-001", "toggle bit repeated in a segment", "7.2.4", READ, plays.same_toggle, aborts_with(0x05030000),
@@ -45,6 +46,14 @@ CASES: tuple[CanopenCase, ...] = (
           "leaves out the last segment but one", "recover").on(holds_good=True)),
     BLOCK(_case("CO-021", "switch from block to normal upload", "7.2.4", READ, plays.expedited_instead, judges.accepts,
           "answers a block upload by an expedited one", "take it").on(holds_good=True)),
+    DOWN(_case("CO-014a", "block size 0", "CN PR #42", READ, plays.block_size(0), aborts_with(0x05040002),
+          "allows no segment of a block download", "abort with 05040002").on(strikes=1)),
+    DOWN(_case("CO-014b", "block size 128", "CN PR #42", READ, plays.block_size(128), aborts_with(0x05040002),
+          "allows 128 segments of a block download at once", "abort with 05040002").on(strikes=1)),
+    DOWN(_case("CO-015b", "block CRC refused", "7.2.4", READ, plays.refuses_crc, judges.survives,
+          "says that the check sum of a block download was wrong", "go on").on(strikes=1)),
+    DOWN(_case("CO-016b", "segment of a block download lost", "CN #205", READ, plays.honest, completes,
+          "does not hear the second segment", "send again from there, renumbered from 1").on(strikes=1, misses=2)),
     _case("CO-023", "response after the client's timeout", "catalogue", READ, plays.late, judges.late_same_shape,
           "answers after 1.5 timeouts", "discard it, never pair it with the next request").on(strikes=1),
     _case("CO-025", "a responder floods garbage", "py #409", CUT, plays.flood, judges.survives,
@@ -59,6 +68,11 @@ CASES: tuple[CanopenCase, ...] = (
           "go on").on(strikes=1),
     _case("CO-035", "unexpected boot-up", "catalogue", READ, plays.boots, reconfigures,
           "boots without being told to", "configure and start it again").on(strikes=1),
+    _case("CO-036a", "heartbeat lost", "7.2.8", READ, plays.honest, notices,
+          "sends no heartbeat for 4 s; all else goes on", "notice it; go on").on(
+          strikes=1, mutes="heartbeat", framings=("heartbeat",)),
+    _case("CO-036b", "node lost and back", "7.2.8", CUT, plays.honest, judges.survives,
+          "says nothing at all for 4 s", "ask on, in bounds; go on").on(strikes=1, mutes="all"),
     _case("CO-039a", "heartbeat of length 0", "7.2.8", READ, plays.heartbeat(b""), judges.survives,
           "sends an empty heartbeat", "ignore it"),
     _case("CO-039b", "heartbeat of an unknown state", "7.2.8", READ, plays.heartbeat(b"\x55"), judges.survives,

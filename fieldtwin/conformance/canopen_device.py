@@ -55,6 +55,11 @@ class HonestNode:
         self.objects.long = request[0] >> 5 == 5
         return self._server.request(request, now_ns)
 
+    @property
+    def receiving(self) -> bool:
+        """Whether frames are segments of a block download now, whatever stands in them."""
+        return self._server.in_sub_block
+
     def poisoned(self, request: bytes, poison: int) -> bytes:
         """An expedited upload response with another word."""
         return (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
 from fieldtwin.conformance.judges import DUTIES, all_of
-from fieldtwin.conformance.observation import Asked, Observation, Sent
+from fieldtwin.conformance.observation import Asked, Observation, Sent, Shown, Told, Word
 
 ABORT, NMT, SYNC, SDO_REQUEST = 0x80, 0x000, 0x080, 0x600
 
@@ -25,6 +25,31 @@ def aborts_with(code: int, *others: int) -> Judge:
         return failed(f"sent no abort; expected {code:08X}h")
 
     return all_of(*DUTIES, aborted)
+
+
+BLOCK_ENDED = 0xA1
+
+
+def _block_ended(seen: Observation) -> Finding | None:
+    for told in seen.of(Told, seen.begun_ns):
+        if told.data[:1] == bytes((BLOCK_ENDED,)):
+            return None
+    return failed("the block download was never brought to its end")
+
+
+completes = all_of(*DUTIES, _block_ended)
+
+
+def _noticed(seen: Observation) -> Finding | None:
+    """That a node's heartbeat stayed away shows in what is published, or in what is done about it."""
+    if any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns, seen.over_ns)):
+        return passed("its value was none meanwhile")
+    if any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns)):
+        return passed("it commanded the node")
+    return inconclusive("nothing shows that it noticed: right only for a master that watches no heartbeat")
+
+
+notices = all_of(*DUTIES, _noticed)
 
 
 def _restarted(seen: Observation) -> Finding | None:

@@ -135,3 +135,28 @@ def boot_storm(scene: CanScene) -> list[SayFrame]:
 
 def extended(scene: CanScene) -> list[SayFrame]:
     return [SayFrame(CanFrame(0x580 + scene.node, scene.false, extended=True))]
+
+
+def honest(scene: CanScene) -> list[SayFrame]:
+    """What is odd is elsewhere: in what the node does not hear or say."""
+    return [scene.reply(data) for data in scene.true]
+
+
+def block_size(size: int) -> CanPlay:
+    """Block download: the node says that `size` segments may come at once, 1 to 127 are allowed."""
+
+    def play(scene: CanScene) -> list[SayFrame]:
+        if not scene.opens:
+            return honest(scene)
+        data = scene.true[0]
+        return [scene.reply(data[:4] + bytes((size,)) + data[5:])]
+
+    return play
+
+
+def refuses_crc(scene: CanScene) -> list[SayFrame]:
+    """Block download: at its end the node says that the check sum was wrong."""
+    if scene.true[0][0] != 0xA1:
+        return honest(scene)
+    mux = scene.memory["mux"].to_bytes(3, "little")
+    return [scene.reply(b"\x80" + mux + (0x05040004).to_bytes(4, "little"))]

@@ -54,12 +54,13 @@ class CanScene:
 
 
 CanPlay = Callable[[CanScene], list[SayFrame]]
-CanWants = Literal["upload", "block upload", "nothing"]
+CanWants = Literal["upload", "block upload", "block download", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class CanopenCase:
-    """As `scene.ModbusCase`, of SDO transfers."""
+    """As `scene.ModbusCase`, of SDO transfers. `misses`: the segment of a block download that the node does not hear, 0 for none;
+    `mutes`: what of the node stays away for `mute_s` from the first strike on: ``heartbeat``, or ``all``."""
 
     about: Case
     play: CanPlay
@@ -68,6 +69,9 @@ class CanopenCase:
     holds_good: bool = False
     framings: tuple[str, ...] = ("can",)
     needs: str = ""
+    misses: int = 0
+    mutes: Literal["", "heartbeat", "all"] = ""
+    mute_s: float = 4.0
 
     def on(self, **changes: object) -> CanopenCase:
         return replace(self, **changes)  # type: ignore[arg-type]

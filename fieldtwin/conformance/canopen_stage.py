@@ -16,7 +16,7 @@ from gateway.core.errors import ConnectionLost
 from gateway.core.nursery import Nursery
 
 SDO_REQUEST, HEARTBEAT, NMT = 0x600, 0x700, 0x000
-ABORT, UPLOAD, BLOCK_UPLOAD = 0x80, 2, 5
+ABORT, UPLOAD, BLOCK_UPLOAD, BLOCK_DOWNLOAD = 0x80, 2, 5, 6
 BEHIND_S = 0.050
 MASTER = 1
 
@@ -44,6 +44,7 @@ class CanopenStage:
         self._case: CanopenCase | None = None
         self._playing: CanopenCase | None = None
         self._memory: dict[str, int] | None = None
+        self._muted = ""
         self._free_ns = 0
         self._loop = asyncio.get_running_loop()
 
@@ -99,12 +100,16 @@ class CanopenStage:
 
     def _asked(self, node: int, request: bytes, now_ns: int) -> None:
         server = self._node(node)
-        opens = request[0] >> 5 == UPLOAD or (request[0] >> 5 == BLOCK_UPLOAD and request[0] & 3 == 0)
-        if opens or request[0] >> 5 == 1:
+        receiving = server.receiving
+        opens = not receiving and _opens(request)
+        if opens or (not receiving and request[0] >> 5 == 1):
             self.recorder.add(Asked(now_ns, MASTER, bytes((node,)) + request))
         if opens:
             self._memory = self._begun(request, now_ns)
             server.objects.word = self._word_for(self._memory is not None)
+        if self._muted == "all" or (receiving and self._missed()):
+            self.last_ns = now_ns
+            return
         true = tuple(server.answer(request, now_ns))
         case = self._playing
         if case is None or self._memory is None or not true:
@@ -118,6 +123,14 @@ class CanopenStage:
         self.last_ns = now_ns
         self._send(case.play(scene), now_ns)
 
+    def _missed(self) -> bool:
+        """Whether the node does not hear this segment of a block download."""
+        case, memory = self._playing, self._memory
+        if case is None or memory is None or not case.misses:
+            return False
+        memory["segments"] = memory.get("segments", 0) + 1
+        return memory["segments"] == case.misses
+
     def _word_for(self, played: bool) -> int:
         """While odd frames hold the honest word, other transfers keep the one before: it is to come from the odd ones."""
         if self._case is not None and self._case.holds_good and not played:
@@ -129,11 +142,22 @@ class CanopenStage:
         self._playing = case = self._case
         if case is None or self.struck >= self.strikes:
             return None
-        if request[0] >> 5 != {"upload": UPLOAD, "block upload": BLOCK_UPLOAD}.get(case.wants):
+        wanted = {"upload": UPLOAD, "block upload": BLOCK_UPLOAD, "block download": BLOCK_DOWNLOAD}.get(case.wants)
+        if request[0] >> 5 != wanted:
             return None
+        if case.mutes:
+            self._muted = case.mutes
+            self.pending += 1
+            self._nursery.start(self._unmute(case.mute_s), "silence")
         self.first_ns = self.first_ns or now_ns
         self.struck += 1
-        return {"word": self._word}
+        return {"word": self._word, "mux": int.from_bytes(request[1:4], "little")}
+
+    async def _unmute(self, after_s: float) -> None:
+        await asyncio.sleep(after_s)
+        self._muted = ""
+        self.last_ns = self.now_ns()
+        self.pending -= 1
 
     def _send(self, moves: list[SayFrame], now_ns: int) -> None:
         """Frames keep their order, and honest answers keep behind odd ones that are still to come."""
@@ -185,5 +209,15 @@ class CanopenStage:
     async def _live(self) -> None:
         while True:
             await asyncio.sleep(self._heartbeat_s)
+            if self._muted:
+                continue
             for number, node in list(self._nodes.items()):
                 await self._connection.send(CanFrame(HEARTBEAT + number, bytes((node.state,))))
+
+
+def _opens(request: bytes) -> bool:
+    """Whether a request begins a transfer that a case may want."""
+    command = request[0] >> 5
+    if command == BLOCK_UPLOAD:
+        return request[0] & 3 == 0
+    return command == UPLOAD or (command == BLOCK_DOWNLOAD and request[0] & 1 == 0)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 
 from fieldtwin.conformance.case import Finding, failed, passed, skipped
-from fieldtwin.conformance.observation import Asked, Observation
+from fieldtwin.conformance.observation import Asked, Came, Left, Observation
 from gateway.core.clock import NS_PER_MS
 
 TURNAROUND_MS = 100
 MOST = {0x01: 2000, 0x02: 2000, 0x03: 125, 0x04: 125, 0x0F: 1968, 0x10: 123}
 """AP 6: how many bits or registers a request of each function may name."""
+MOST_CONNECTIONS = 4
+"""So many at once are still no leak: the old ones may need their time to end."""
 READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x07, 0x0B, 0x0C, 0x11, 0x14, 0x17, 0x18, 0x2B})
 
 
@@ -49,6 +51,17 @@ def bounded_addresses(seen: Observation) -> Finding:
         if asked.target[1] in MOST and start + _count(asked.target) > 0x10000:
             return failed(f"asked for {_count(asked.target)} from {start} on: beyond 65535")
     return passed(_of(seen))
+
+
+def few_connections(seen: Observation) -> Finding:
+    """A master that loses a connection closes its end of it: each that stays open costs the device one."""
+    count = most = 0
+    for event in seen.events:
+        count += isinstance(event, Came) - isinstance(event, Left)
+        most = max(most, count)
+    if most > MOST_CONNECTIONS:
+        return failed(f"{most} connections at once: it does not close those that it no longer uses")
+    return passed(f"at most {most} at once")
 
 
 def _count(target: bytes) -> int:

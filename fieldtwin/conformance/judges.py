@@ -213,6 +213,20 @@ def reconnects(seen: Observation) -> Finding | None:
     return None
 
 
+def asked_once(seen: Observation) -> Finding | None:
+    """What nobody answers, because it is for all, is not repeated because nobody answered."""
+    first = next(seen.of(Asked, seen.begun_ns), None)
+    again = next((a for a in seen.of(Asked, first.t_ns + 1) if a.target == first.target), None) if first else None
+    if first is None or again is None:
+        return None
+    gap_s, usual_s = (again.t_ns - first.t_ns) / NS_PER_S, seen.habit.period_s.get(first.target, 0.0)
+    if not usual_s:
+        return inconclusive(f"the same came again {gap_s:.2f} s later: whether that is its period does not show")
+    if gap_s < 0.7 * usual_s:
+        return failed(f"sent again {gap_s:.2f} s later, {usual_s:.2f} s is its period: it waited for an answer")
+    return None
+
+
 def _when(seen: Observation, t_ns: int) -> str:
     return f"{seen.since_s(t_ns):.2f} s after the first odd answer"
 
@@ -237,3 +251,4 @@ bisects = all_of(*DUTIES, asks_for_less)
 short_frame = all_of(*DUTIES, answers_at_once)
 busy = all_of(*DUTIES, backs_off)
 cut_off = all_of(*DUTIES, reconnects)
+unit_0 = all_of(goes_on, asks_cleanly, does_not_flood, asked_once)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 from emulators.modbus.rtu_receiver import with_crc
-from fieldtwin.conformance.scene import Move, Play, Say, Scene
+from fieldtwin.conformance.scene import Move, Play, Say, Scene, Unplug
 
 SPLIT_S = 0.016
 """The latency timer of a usual USB adapter."""
@@ -139,3 +139,23 @@ def collision(scene: Scene) -> list[Move]:
     """Two senders at once: where either drives a 0 there is a 0."""
     ours, other = scene.frame(scene.false), scene.from_unit(scene.neighbour, scene.true[:1] + scene.true[1:])
     return [Say(bytes(a & b for a, b in zip(ours, other[1:] + other[:1], strict=False)))]
+
+
+def bad_lrc(scene: Scene) -> list[Move]:
+    frame = scene.frame(scene.false)
+    return [Say(frame[:-3] + (b"0" if frame[-3:-2] != b"0" else b"1") + frame[-2:])]
+
+
+def second_colon(scene: Scene) -> list[Move]:
+    """A frame that begins, and then ours."""
+    return [Say(scene.frame(scene.false)[:7] + scene.frame(scene.true))]
+
+
+def long_gap(scene: Scene) -> list[Move]:
+    """Two halves, more than the second apart that SL 2.5.2.1 allows."""
+    frame = scene.frame(scene.false)
+    return [Say(frame[:7]), Say(frame[7:], 1.2)]
+
+
+def unplugged(held_s: float = 0.0) -> Play:
+    return lambda scene: [Unplug(1.0, held_s)]

@@ -7,11 +7,17 @@ from __future__ import annotations
 
 from fieldtwin.conformance import judges, line_plays, tcp_plays
 from fieldtwin.conformance.case import Case, Danger, Judge
-from fieldtwin.conformance.habits import bounded_addresses, broadcasts_wait, legal_requests, no_broadcast_reads
+from fieldtwin.conformance.habits import (
+    bounded_addresses,
+    broadcasts_wait,
+    few_connections,
+    legal_requests,
+    no_broadcast_reads,
+)
 from fieldtwin.conformance.scene import ModbusCase, Play
 
 READ, WRITE, CUT, LOOK = Danger.READ, Danger.WRITE, Danger.DISRUPT, Danger.OBSERVE
-RTU, TCP, STREAM = ("rtu",), ("tcp",), ("stream",)
+RTU, ASCII, LINES, TCP, STREAM = ("rtu",), ("ascii",), ("rtu", "ascii"), ("tcp",), ("stream",)
 
 
 def _case(
@@ -65,7 +71,7 @@ CASES: tuple[ModbusCase, ...] = (
     _bad("MB-015a", "a reply from an unexpected unit", "SL 2.4.1; libmodbus PR #860", line_plays.other_unit,
          "another unit answers", "discard it"),
     _good("MB-015b", "an unexpected unit's reply, then ours", "SL 2.4.1", line_plays.other_unit_first,
-          "another unit answers 20 ms before ours", "discard the first, the timer keeps running, take ours").on(framings=RTU),
+          "another unit answers 20 ms before ours", "discard the first, the timer keeps running, take ours").on(framings=LINES),
     _bad("MB-016", "wrong function code in a reply", "TG 4.4.1.3", line_plays.other_function, "answers for 04 instead of 03"),
     _bad("MB-017a", "byte count too small for the count asked", "AP 6.3", line_plays.too_few, "leaves out a register"),
     _bad("MB-017b", "byte count too large for the count asked", "AP 6.3", line_plays.too_many, "adds a register"),
@@ -88,11 +94,14 @@ CASES: tuple[ModbusCase, ...] = (
           "refuses reads that touch the last register", "ask for less, learn the hole").on(wants="read of several", strikes=6),
     _watch("MB-026", "broadcast write", "SL 2.4.1; libmodbus #372", broadcasts_wait,
            "leave 100 ms before the next request"
-           ).on(framings=RTU),
+           ).on(framings=LINES),
     _watch("MB-027", "broadcast read", "libmodbus #379", no_broadcast_reads,
-           "refuse it locally: nobody answers").on(framings=RTU),
+           "refuse it locally: nobody answers").on(framings=LINES),
+    _case("MB-028", "unit 0 behind a gateway", "mbusd #61", WRITE, line_plays.nothing, judges.unit_0, "answers nothing",
+          "send it once, never again for want of an answer").on(framings=TCP, wants="request to unit 0", strikes=1),
     _watch("MB-036", "counts within the standard's", "AP 6", legal_requests, "never ask for 0, 126 registers, 2001 bits"),
     _watch("MB-037", "start and count within 65536", "AP 6", bounded_addresses, "never ask beyond FFFFh"),
+    _watch("MB-065b", "few connections", "TG 4.2.1", few_connections, "close what it no longer uses").on(framings=STREAM),
     _good("MB-051", "TCP byte by byte", "catalogue", tcp_plays.bytewise, "sends one byte a segment").on(framings=TCP),
     _good("MB-052", "several ADUs in one segment", "OpenPLC #253; pymodbus #1949", tcp_plays.with_stranger,
           "sends an answer that nobody asked for and ours in one segment", "find ours").on(framings=TCP),
@@ -115,9 +124,25 @@ CASES: tuple[ModbusCase, ...] = (
           "resets the connection inside a reply", "connect again, with a pause").on(framings=STREAM, strikes=3),
     _case("MB-064b", "the other side hangs up", "TG 4.2.2", CUT, tcp_plays.hang_up, judges.cut_off,
           "ends the connection instead of answering", "connect again, with a pause").on(framings=STREAM, strikes=3),
+    _case("MB-064c", "half-open connection", "TG 4.2.2", CUT, tcp_plays.half_open, judges.cut_off,
+          "says nothing any more on the connection and leaves it open", "close it, connect again"
+          ).on(framings=STREAM, strikes=1),
+    _case("MB-065a", "connection limit", "TG 4.2.1", CUT, tcp_plays.closed_while_unused, judges.cut_off,
+          "ends the connection while it is not used", "connect again"
+          ).on(framings=STREAM, strikes=3),
+    _case("MB-066", "USB unplugged and back", "pymodbus #2326", CUT, line_plays.unplugged(), judges.cut_off,
+          "takes the port away for 1 s", "open it again and go on").on(framings=("port",), strikes=1),
+    _case("MB-067", "port locked", "HA #144615", CUT, line_plays.unplugged(2.0), judges.cut_off,
+          "takes the port away for 1 s and holds it for 2 s when it is back", "try again and go on"
+          ).on(framings=("lock",), strikes=1),
     _case("MB-068", "wrong baud rate or parity", "catalogue", CUT, line_plays.garbage, judges.survives,
           "answers with what a wrong baud rate makes of it", "go on, in bounds").on(framings=RTU, strikes=3),
     _case("MB-069", "two masters on one line", "pymodbus #432", CUT, line_plays.collision, judges.rejects,
           "overlays the reply with another frame", "never take it as data").on(framings=RTU),
+    _bad("MB-070a", "ASCII: a bad LRC", "SL 2.5.2.2", line_plays.bad_lrc, "sends another LRC").on(framings=ASCII),
+    _good("MB-070b", "ASCII: a second colon", "SL 2.5.2.1", line_plays.second_colon, "begins a frame, and begins again",
+          "start afresh at the second colon").on(framings=ASCII),
+    _bad("MB-070c", "ASCII: a gap over 1 s", "SL 2.5.2.1", line_plays.long_gap, "pauses 1.2 s inside a reply",
+         "discard it; go on").on(framings=ASCII),
 )  # fmt: skip
 """In the order in which they are played; observers judge the whole run in the end."""

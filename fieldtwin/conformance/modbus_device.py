@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from emulators.modbus.ascii import AsciiReceiver, lrc
 from emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
 from emulators.modbus.rtu_receiver import RtuReceiver, with_crc
 from emulators.modbus.unit import ModbusUnit
@@ -84,6 +85,33 @@ class RtuWire:
         return with_crc(request[:1] + pdu)
 
 
+class AsciiWire:
+    """The same on a line in ASCII."""
+
+    framing = "ascii"
+
+    def __init__(self) -> None:
+        self._receiver = AsciiReceiver()
+        self._noise = 0
+
+    def cut(self, data: bytes, now_ns: int) -> list[tuple[bytes, int]]:
+        """Whole requests: (unit id and PDU, 0)."""
+        return [(frame[:-1], 0) for frame in self._receiver.feed(data, now_ns)]
+
+    def garbage(self) -> int:
+        """Characters since the last call that belong to no request."""
+        new, self._noise = self._receiver.noise_bytes - self._noise, self._receiver.noise_bytes
+        return new
+
+    def frame(self, request: bytes, tag: int, pdu: bytes) -> bytes:
+        return in_ascii(request[:1] + pdu)
+
+
+def in_ascii(adu: bytes) -> bytes:
+    """A frame of Modbus ASCII around unit id and PDU (SL 2.5.2)."""
+    return b":" + (adu + bytes((lrc(adu),))).hex().upper().encode("ascii") + b"\r\n"
+
+
 class MbapWire:
     """The same on TCP."""
 
@@ -124,4 +152,4 @@ def mbap(tag: int, unit: int, pdu: bytes, *, protocol: int = 0, length: int | No
     return b"".join(n.to_bytes(2, "big") for n in (tag, protocol, counted)) + bytes((unit,)) + pdu
 
 
-ModbusWire = RtuWire | MbapWire
+ModbusWire = RtuWire | AsciiWire | MbapWire

@@ -15,6 +15,7 @@ from fieldtwin.conformance.modbus_device import (
     READS,
     REGISTER_READS,
     WRITES,
+    AsciiWire,
     HonestDevice,
     MbapWire,
     ModbusWire,
@@ -22,7 +23,7 @@ from fieldtwin.conformance.modbus_device import (
 )
 from fieldtwin.conformance.observation import Asked, Came, Garbled, Left, Told, Word
 from fieldtwin.conformance.recorder import Recorder
-from fieldtwin.conformance.scene import Hang, ModbusCase, Move, Say, Scene
+from fieldtwin.conformance.scene import Deaf, Hang, ModbusCase, Move, Say, Scene, Unplug
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import ByteConnection
 from gateway.core.errors import ConnectionLost
@@ -52,6 +53,8 @@ class Stage:
         self.strikes = self.struck = self.first_ns = self.last_ns = self.pending = 0
         self.clients = 0
         self.on_event: Callable[[], None] = lambda: None
+        self.unplug: Callable[[Unplug], None] = lambda move: None
+        """Takes the port away and gives it back; `pending` counts it until then."""
         self._make_wire = make_wire
         self._first: Scene | None = None
         self._loop = asyncio.get_running_loop()
@@ -96,7 +99,7 @@ class Stage:
         """What is done about a request that came at `now_ns`: honest, or what the play says."""
         true = self.device.answer(request[1:], now_ns)
         case = self.play
-        if request[0] == 0 and isinstance(wire, RtuWire):
+        if request[0] == 0 and not isinstance(wire, MbapWire):
             return []  # a broadcast: nobody answers
         honest: list[Move] = [Say(wire.frame(request, tag, true), good=True)] if true else []
         if case is None or self.struck >= self.strikes or not true or not _wanted(case, request):
@@ -113,6 +116,8 @@ class Stage:
 
 def _wanted(case: ModbusCase, request: bytes) -> bool:
     function = request[1]
+    if case.wants == "request to unit 0":
+        return request[0] == 0
     if case.wants == "register read":
         return function in REGISTER_READS
     if case.wants == "read of several":
@@ -125,6 +130,7 @@ class _Client:
 
     def __init__(self, stage: Stage, connection: ByteConnection, wire: ModbusWire, number: int) -> None:
         self.hung_up = False
+        self._deaf = False
         self._stage = stage
         self._connection = connection
         self._wire = wire
@@ -138,6 +144,8 @@ class _Client:
             now_ns = self._stage.now_ns()
             for request, tag in self._wire.cut(data, now_ns):
                 self._stage.note(Asked(now_ns, self._number, request, tag))
+                if self._deaf:
+                    continue
                 self._answer(self._stage.moves(self._wire, request, tag, now_ns), now_ns)
             self._dirty = bool(data)
             if garbage := self._wire.garbage():
@@ -183,6 +191,16 @@ class _Client:
 
     async def _do(self, move: Move) -> None:
         now_ns = self._stage.now_ns()
+        if self._deaf:
+            return
+        if isinstance(move, Deaf):
+            self._stage.last_ns = now_ns
+            self._deaf = True
+            return
+        if isinstance(move, Unplug):
+            self.hung_up = True
+            self._stage.unplug(move)
+            return
         if isinstance(move, Hang):
             self._stage.last_ns = now_ns
             self.hung_up = True
@@ -205,9 +223,11 @@ async def _hang_up(connection: ByteConnection, *, reset: bool) -> None:
 
 def wire_for(scheme: str) -> Callable[[], ModbusWire]:
     """What frames are told by on an endpoint of `scheme`."""
-    return MbapWire if scheme == "tcp" else RtuWire
+    return MbapWire if scheme == "tcp" else AsciiWire if scheme == "ascii" else RtuWire
 
 
 def traits(scheme: str) -> frozenset[str]:
-    """What a case may ask for: ``rtu`` or ``tcp`` framing, and ``stream`` where a connection can be hung up."""
-    return frozenset({"tcp", "stream"} if scheme == "tcp" else {"rtu", "stream"} if scheme == "rtu+tcp" else {"rtu"})
+    """What a case may ask for: ``rtu``, ``ascii`` or ``tcp`` framing, and ``stream`` where a connection can be hung up."""
+    if scheme == "rtu+tcp":
+        return frozenset({"rtu", "stream"})
+    return frozenset({"tcp", "stream"}) if scheme == "tcp" else frozenset({scheme})

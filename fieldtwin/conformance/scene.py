@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.conformance.case import Case
-from fieldtwin.conformance.modbus_device import MbapWire, ModbusWire, mbap
+from fieldtwin.conformance.modbus_device import ModbusWire
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +27,23 @@ class Hang:
     reset: bool = False
 
 
-Move = Say | Hang
+@dataclass(frozen=True, slots=True)
+class Deaf:
+    """Leave the connection open and never say anything on it again."""
+
+    after_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Unplug:
+    """The port is gone for `out_s` and comes back under its name; then it is somebody else's for `held_s`."""
+
+    out_s: float
+    held_s: float = 0.0
+    after_s: float = 0.0
+
+
+Move = Say | Hang | Deaf | Unplug
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +82,7 @@ class Scene:
 
     def from_unit(self, unit: int, pdu: bytes) -> bytes:
         """A frame that another unit sent."""
-        return mbap(self.tag, unit, pdu) if isinstance(self.wire, MbapWire) else with_crc(bytes((unit,)) + pdu)
+        return self.wire.frame(bytes((unit,)), self.tag, pdu)
 
     @property
     def neighbour(self) -> int:
@@ -80,21 +95,22 @@ class Scene:
 
 
 Play = Callable[[Scene], list[Move]]
-Wants = Literal["register read", "read", "write", "read of several", "nothing"]
+Wants = Literal["register read", "read", "write", "read of several", "request to unit 0", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class ModbusCase:
     """A case with its play. `strikes`: so many requests are misanswered; `holds_good` where the odd frames hold the honest
-    word, and go on until it was seen. `framings`: where there is such a thing (``rtu``, ``tcp``, ``stream`` for anything that
-    can be hung up). `needs` names an option without which the case makes no sense."""
+    word, and go on until it was seen. `framings`: where there is such a thing (``rtu``, ``ascii``, ``tcp``; ``stream`` for
+    anything that can be hung up, ``port`` for what can be unplugged, ``lock`` for what can be held). `needs` names an option
+    without which the case makes no sense."""
 
     about: Case
     play: Play
     wants: Wants = "register read"
     strikes: int = 2
     holds_good: bool = False
-    framings: tuple[str, ...] = ("rtu", "tcp")
+    framings: tuple[str, ...] = ("rtu", "ascii", "tcp")
     needs: str = ""
 
     def on(self, **changes: object) -> ModbusCase:

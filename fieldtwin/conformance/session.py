@@ -7,7 +7,6 @@ import signal
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from emulators.endpoints.ports import OsPorts
 from emulators.modbus.bank import Table
@@ -19,6 +18,7 @@ from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
 from fieldtwin.conformance.observation import Word
 from fieldtwin.conformance.probe import Classifier, OutputProbe, Probe, RegisterProbe
 from fieldtwin.conformance.program import Program
+from fieldtwin.conformance.pty_line import PtyLine
 from fieldtwin.conformance.results import CaseResult
 from fieldtwin.conformance.run import C, MasterRun, Plan
 from gateway.connections.os_connector import OsConnector
@@ -29,13 +29,14 @@ from gateway.wallclock import WallClock
 
 MAX_CLIENTS = 8
 CAN_TRAITS = frozenset({"can"})
-LISTENING = "tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH or rtu:PORT"
+LISTENING = "tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:PORT"
 
 
 @dataclass(frozen=True)
 class Options:
     """What a user asked for. `words`: the two honest ones and the poison. `probe` as `RegisterProbe` reads it, ``output``, or
-    empty. From `objects` on it is for CANopen only: fixed objects, bytes of all others, nodes that boot by themselves."""
+    empty. `ascii`: what is on the line is Modbus ASCII. From `objects` on it is for CANopen only: fixed objects, bytes of all
+    others, nodes that boot by themselves."""
 
     listen: Endpoint
     plan: Plan
@@ -43,6 +44,7 @@ class Options:
     probe: str = ""
     stands_for_none: frozenset[str] = frozenset()
     held: Mapping[tuple[Table, int], int] = field(default_factory=dict)
+    ascii: bool = False
     objects: Mapping[tuple[int, int], bytes] = field(default_factory=dict)
     size: int = 4
     nodes: frozenset[int] = frozenset()
@@ -64,15 +66,20 @@ async def judge_modbus_master(options: Options, listener: Listener) -> list[Case
 
     SIGTERM ends it, and the program with it.
     """
-    if options.listen.scheme not in ("tcp", "rtu+tcp", "pty", "rtu"):
+    if options.listen.scheme not in ("tcp", "rtu+tcp", "pty", "rtu", "ascii"):
         raise UsageError("where the master is listened for", expected=LISTENING, got=str(options.listen))
-    scheme = "rtu" if options.listen.is_serial or options.listen.scheme == "pty" else options.listen.scheme
+    in_ascii = options.ascii or options.listen.scheme == "ascii"
+    if in_ascii and options.listen.scheme in ("tcp", "rtu+tcp"):
+        raise UsageError("ASCII is for lines", expected="pty:PATH or ascii:PORT", got=str(options.listen))
+    line = options.listen.is_serial or options.listen.scheme == "pty"
+    scheme = "ascii" if in_ascii else "rtu" if line else options.listen.scheme
     stage = Stage(wire_for(scheme), options.words, options.held)
     async with AsyncExitStack() as closing:
         nursery = await closing.enter_async_context(Nursery())
-        theirs = await _open(options.listen, stage, nursery, closing)
+        theirs = await _open(options.listen, stage, nursery, closing, "ascii" if in_ascii else "rtu")
+        here = traits(scheme) | (PtyLine.traits() if options.listen.scheme == "pty" else frozenset())
         probe, on_text = _probe(options, nursery)
-        run = MasterRun(stage, CASES, SILENT, options.plan, traits(scheme), probe, listener.tell)
+        run = MasterRun(stage, CASES, SILENT, options.plan, here, probe, listener.tell)
         return await _judged(run, options, theirs, on_text, listener)
 
 
@@ -96,7 +103,8 @@ async def judge_canopen_master(options: Options, listener: Listener) -> list[Cas
         nursery = await closing.enter_async_context(Nursery())
         nursery.start(stage.serve(connection), "nodes")
         probe, on_text = _probe(options, nursery)
-        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, options.plan, CAN_TRAITS, probe, listener.tell)
+        here = CAN_TRAITS | ({"heartbeat"} if options.heartbeat_s else set())
+        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, options.plan, here, probe, listener.tell)
         return await _judged(run, options, bus.bound, on_text, listener)
 
 
@@ -122,22 +130,21 @@ async def _judged(
                 listener.say(f"  {line}")
 
 
-async def _open(listen: Endpoint, stage: Stage, nursery: Nursery, closing: AsyncExitStack) -> Endpoint:
+async def _open(listen: Endpoint, stage: Stage, nursery: Nursery, closing: AsyncExitStack, framing: str) -> Endpoint:
     """Serve `listen`; returns the master's side of it."""
     if listen.scheme in ("tcp", "rtu+tcp"):
         server = await OsPorts().listen(listen, stage.serve, MAX_CLIENTS)
         closing.push_async_callback(server.aclose)
         return server.bound
-    if listen.scheme == "rtu":
+    if listen.is_serial:
         port = await OsConnector().open_bytes(listen)
-        theirs = listen.with_path("the other end of the line")
-    else:
-        pace = listen.serial if listen.param("baudrate") else None
-        port, named = await OsPorts().serial(Path(listen.path), listen, pace)
-        theirs = Endpoint("rtu", path=named.path, params=listen.params)
-    closing.push_async_callback(port.aclose)
-    nursery.start(stage.serve(port), "line")
-    return theirs
+        closing.push_async_callback(port.aclose)
+        nursery.start(stage.serve(port), "line")
+        return listen.with_path("the other end of the line")
+    line = await PtyLine.open(listen, stage)
+    closing.push_async_callback(line.aclose)
+    nursery.start(line.run(), "line")
+    return Endpoint(framing, path=line.named.path, params=listen.params)
 
 
 def _probe(options: Options, nursery: Nursery) -> tuple[Probe | None, Callable[[str], None]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fieldtwin.conformance.modbus_device import mbap
-from fieldtwin.conformance.scene import Hang, Move, Play, Say, Scene
+from fieldtwin.conformance.scene import Deaf, Hang, Move, Play, Say, Scene
 
 BYTE_S = 0.002
 
@@ -48,3 +48,12 @@ def reset(scene: Scene) -> list[Move]:
 
 def hang_up(scene: Scene) -> list[Move]:
     return [Hang()]
+
+
+def half_open(scene: Scene) -> list[Move]:
+    return [Deaf()]
+
+
+def closed_while_unused(scene: Scene) -> list[Move]:
+    """The answer, and then an end: the master has it and asks for nothing."""
+    return [scene.good(), Hang(0.050)]

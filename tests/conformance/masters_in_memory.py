@@ -19,7 +19,7 @@ from fieldtwin.conformance.probe import Classifier
 from fieldtwin.conformance.results import CaseResult
 from fieldtwin.conformance.run import MasterRun, Plan
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from gateway.core.errors import FieldtwinError, ReplyTimeout
 from gateway.core.nursery import Nursery
 from gateway.protocols.canopen.master import CanopenMaster
 from gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
@@ -49,14 +49,19 @@ class Told:
 
 
 async def ours(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
-    """The project's client as a driver uses it: a bad answer is no value, a lost connection is opened again."""
+    """The project's client as a driver uses it: a bad answer is no value, a lost connection is opened again, and so is one
+    on which nothing comes."""
     while True:
         client = ModbusClient.at(endpoint, await net.open_bytes(endpoint), clock, timeout_s=TIMEOUT_S)
+        unheard = 0
         try:
-            while not client.closed:
+            while not client.closed and (endpoint.is_serial or unheard < 4):
                 try:
                     reply = await client.read_registers(17, "holding", 107, 2)
                     publish(str(reply.registers[0]))
+                    unheard = 0
+                except ReplyTimeout:
+                    unheard += 1
                 except FieldtwinError:
                     pass
                 await asyncio.sleep(PERIOD_S)
@@ -94,20 +99,26 @@ def judge(
 
 
 async def our_canopen(
-    net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish, block: bool = False
+    net: MemoryNet,
+    endpoint: Endpoint,
+    clock: VirtualClock,
+    publish: Publish,
+    block: bool = False,
+    download: bool = False,
 ) -> None:
-    """The project's CANopen master: reads an object, starts the node at first and whenever it boots."""
+    """The project's CANopen master: reads an object, starts the node at first and whenever it boots, and when its heartbeat is
+    back. With `download` it writes a long object by blocks as well."""
     async with Nursery() as nursery:
         connection = await net.open_can(endpoint, 125_000)
         boots: asyncio.Queue[bool] = asyncio.Queue()
         boots.put_nowait(True)
 
         def heard(event: NodeEvent) -> None:
-            if event.kind == "boot-up" and event.unexpected:
+            if (event.kind == "boot-up" and event.unexpected) or event.kind == "heartbeat-back":
                 boots.put_nowait(True)
 
         canopen = CanopenMaster(connection, clock, sdo_timeout_s=TIMEOUT_S, on_event=heard)
-        canopen.add_node(5)
+        canopen.add_node(5, heartbeat_consumer_ms=2500)
         nursery.start(canopen.run(), "master")
         while True:
             if not boots.empty():
@@ -116,6 +127,8 @@ async def our_canopen(
             try:
                 raw = await canopen.sdo_upload(5, 0x2000, 0, length=None if block else 4, block=block)
                 publish(str(int.from_bytes(raw[:4], "little")))
+                if download:
+                    await canopen.sdo_download(5, 0x2100, 0, bytes(range(50)), block=True)
             except FieldtwinError:
                 pass
             await asyncio.sleep(PERIOD_S)
@@ -130,7 +143,7 @@ def judge_canopen(master: Master, *only: str, timeout_s: float = TIMEOUT_S) -> d
         bus = await net.can_bus(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=True)
         stage = CanopenStage(WORDS, nodes=(5,))
         plan = Plan(frozenset(only), timeout_s=timeout_s, patience_s=5.0)
-        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, plan, frozenset({"can"}), told)
+        run = MasterRun(stage, CANOPEN_CASES, CANOPEN_SILENT, plan, frozenset({"can", "heartbeat"}), told)
         async with Nursery() as nursery:
             nursery.start(stage.serve(await bus.join("nodes")), "nodes")
             nursery.start(master(net, bus.bound, clock, told.publish), "master")

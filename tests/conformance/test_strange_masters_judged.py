@@ -162,3 +162,39 @@ def test_the_docs_have_every_case() -> None:
         about = case.about
         row = f"| {about.id} | {about.danger.value} | {about.title}: it {about.does} | {about.must} | {about.clause} |"
         assert row in text, row
+
+
+OPENS_AGAIN = """
+import os, select, termios, time
+ASK = bytes.fromhex("01030000000184 0a".replace(" ", ""))
+port = -1
+while True:
+    try:
+        if port < 0:
+            port = os.open(os.environ["FIELDTWIN_TTY"], os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+            termios.tcflush(port, termios.TCIOFLUSH)
+        os.write(port, ASK)
+        got, end = b"", time.monotonic() + 0.15
+        while len(got) < 7 and (left := end - time.monotonic()) > 0:
+            if select.select([port], [], [], left)[0]:
+                got += os.read(port, 64)
+        if len(got) == 7:
+            print(int.from_bytes(got[3:5], "big"))
+    except OSError:
+        if port >= 0:
+            os.close(port)
+        port = -1
+        if not %r:
+            time.sleep(60)
+    time.sleep(0.02)
+"""
+
+
+@pytest.mark.parametrize(("again", "verdict"), [(True, "passed"), (False, "failed")])
+def test_a_port_that_is_unplugged_comes_back_under_its_name(tmp_path: Path, again: bool, verdict: str) -> None:
+    code, found, said = _check(
+        tmp_path, "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66",
+        program=OPENS_AGAIN % again,
+    )  # fmt: skip
+    assert found["MB-066"][0] == verdict, said
+    assert code == (0 if again else 1)

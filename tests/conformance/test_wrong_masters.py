@@ -15,6 +15,7 @@ from fieldtwin.report.model import Verdict
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import ByteConnection
 from gateway.core.endpoint import Endpoint
+from gateway.core.errors import ConnectionLost
 
 REQUEST = bytes((17, 3, 0, 107, 0, 2))
 TIMEOUT_S = 0.2
@@ -150,3 +151,82 @@ def test_a_naive_sdo_client_fails_what_it_does_not_look_at() -> None:
     for case in ("CO-001", "CO-005", "CO-060"):
         assert results[case].verdict is Verdict.FAILED, case
     assert results["CO-008"].verdict is Verdict.PASSED
+
+
+def _tcp(request: bytes, *, closes: bool = True, again: bool = False) -> Callable[..., object]:
+    """A master on TCP, one connection as long as it lasts. Unless it `closes`, it opens another for every request and leaves the
+    old ones; `again`: what nobody answered is sent once more."""
+
+    async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+        links: list[ByteConnection] = []
+        while True:
+            try:
+                if not links or not closes or links[-1].lost is not None:
+                    links.append(await net.open_bytes(endpoint))
+                for pdu in (READ, request) if request else (READ,):
+                    for _ in range(2 if again else 1):
+                        await links[-1].write(bytes((0, 1, 0, 0, 0, len(pdu))) + pdu)
+                        reply = await _answer(links[-1])
+                        if reply:
+                            break
+                    if pdu == READ and len(reply) == 11:
+                        publish(str(int.from_bytes(reply[9:11], "big")))
+            except ConnectionLost:
+                pass
+            await asyncio.sleep(LAZY_S)
+
+    return poll
+
+
+READ = bytes((17, 3, 0, 107, 0, 1))
+TO_ALL = bytes((0, 6, 0, 1, 0, 1))
+
+
+@pytest.mark.parametrize(
+    ("master", "case", "says"),
+    [
+        (_tcp(b""), "MB-064c", "was not published"),
+        (_tcp(b"", closes=False), "MB-065b", "connections at once"),
+        (_tcp(TO_ALL, again=True), "MB-028", "it waited for an answer"),
+    ],
+)
+def test_a_master_that_handles_connections_badly_fails(master: Callable[..., object], case: str, says: str) -> None:
+    result = judge(master, "tcp://127.0.0.1:0", case)[case]  # type: ignore[arg-type]
+    assert result.verdict is Verdict.FAILED, result.reason
+    assert says in result.reason
+
+
+def test_a_write_to_unit_0_that_is_sent_once_passes() -> None:
+    result = judge(_tcp(TO_ALL), "tcp://127.0.0.1:0", "MB-028")["MB-028"]  # type: ignore[arg-type]
+    assert result.verdict is Verdict.PASSED, result.reason
+
+
+def _in_ascii(*, checks: bool, newest: bool) -> Callable[..., object]:
+    """A master on a line in ASCII: it `checks` the LRC or not, and takes the `newest` colon for the beginning or the first."""
+    asked = b":" + (REQUEST + bytes((-sum(REQUEST) & 0xFF,))).hex().upper().encode() + b"\r\n"
+
+    async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+        line = await net.open_bytes(endpoint)
+        while True:
+            await line.write(asked)
+            text = (await _answer(line)).strip()
+            try:
+                reply = bytes.fromhex(text[(text.rfind(b":") if newest else 0) + 1 :].replace(b":", b"").decode())
+            except ValueError:
+                reply = b""
+            if len(reply) >= 8 and (not checks or sum(reply) & 0xFF == 0):
+                publish(str(_first_register(reply)))
+            await asyncio.sleep(LAZY_S)
+
+    return poll
+
+
+@pytest.mark.parametrize(
+    ("checks", "newest", "case", "says"),
+    [(False, True, "MB-070a", "published 3333"), (True, False, "MB-070b", "were not taken")],
+)
+def test_a_master_that_reads_ascii_badly_fails(checks: bool, newest: bool, case: str, says: str) -> None:
+    master = _in_ascii(checks=checks, newest=newest)
+    result = judge(master, "ascii:/line?baudrate=19200&frame=7E1", case)[case]  # type: ignore[arg-type]
+    assert result.verdict is Verdict.FAILED, result.reason
+    assert says in result.reason

@@ -116,7 +116,7 @@ def _exchange_rows(path: Path) -> Rows:
             data = parse_reply(asked, e.request, e.reply).read or data
         text = " ".join(map(str, words(span, data))) if span is not None and data else ""
         yield (
-            e.t_s, e.unit, _outcome(e), 1000 * e.latency_s if e.reply else None, asked.service, span.table if span else "",
+            e.t_s, e.unit, _outcome(e), round(1000 * e.latency_s, 3) if e.reply else None, asked.service, span.table if span else "",
             span.address if span else None, span.count if span else None, text, e.request.hex(),
             e.reply.hex() if e.reply is not None else "",
         )  # fmt: skip
@@ -132,7 +132,7 @@ def _tag_rows(path: Path, profile: DeviceProfile, names: list[str]) -> Rows:
             found |= tags.of_registers(asked.write_span, asked.written, t_ns)
         if e.reply and asked.read_span is not None and (read := parse_reply(asked, e.request, e.reply).read):
             found |= tags.of_registers(asked.read_span, read, t_ns)
-        latency_ms = 1000 * e.latency_s if e.reply else None
+        latency_ms = round(1000 * e.latency_s, 3) if e.reply else None
         yield (e.t_s, e.unit, _outcome(e), latency_ms, *(found.get(name) for name in names))
 
 

@@ -23,6 +23,7 @@ from fieldtwin.recording.comparing import Comparer, Comparison, Rules, Tolerance
 from fieldtwin.recording.comparing_can import Frames, compare_logs
 from fieldtwin.recording.live_comparing import compare_device, compare_node
 from fieldtwin.recording.rotating import exchanges_of, header_of, parts_of
+from fieldtwin.sitereport.about import headed
 from gateway.core.endpoint import SCHEMES
 from gateway.core.errors import FileInvalid, NotAllowed, UsageError
 from gateway.core.profile import DeviceProfile, load_profile
@@ -93,12 +94,24 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
     else:
         result = _live(recording, other, rules, options) if live else _files(recording, Path(other), rules, options)
     if as_json:
-        said = asdict(result) | {"values": result.values, "met": result.met}
-        json.dump(said, sys.stdout)
+        json.dump(
+            _headed(recording, other, live, options) | asdict(result) | {"values": result.values, "met": result.met},
+            sys.stdout,
+        )
         sys.stdout.write("\n")
     else:
         _show(result, recording, other, everything)
     return 0 if result.met else 1
+
+
+def _headed(recording: Path, other: str, live: bool, options: dict[str, Any]) -> dict[str, Any]:
+    """Which device was compared with what: `fieldtwin report` reads it."""
+    can = recording.suffix == ".log"
+    address = options["node"] if can else options["unit"]
+    if address is None and not can:
+        address = next((exchange.unit for exchange in exchanges_of(recording)), 0)
+    endpoint, device = (other, "") if live else ("", Path(other).name)
+    return headed("compare", "canopen" if can else "modbus", endpoint, address or 0, recording.name, device=device)
 
 
 # -- what may differ ----------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from fieldtwin.cli.options import json_option, pairs, profiles_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.commissioning.diff import Differences, Leave, diff_dictionary, diff_dumps, diff_profile
 from fieldtwin.commissioning.dump_file import Dump, load_dump
+from fieldtwin.sitereport.about import headed
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.profile import DeviceProfile, load_profile
 from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
@@ -62,7 +63,10 @@ def command(
     else:
         found = _against(one, right, folders, leave)
     if as_json:
-        click.echo(json.dumps(asdict(found)))
+        h = one.header
+        endpoint, when = str(h.get("endpoint", "")), str(h.get("started", ""))
+        head = headed("diff", one.protocol, endpoint, int(h["address"]), Path(right).name, device=left.name, when=when)
+        click.echo(json.dumps(head | asdict(found)))
     else:
         _show(found, left.name, Path(right).name)
     return DIFFERENT if found.found else 0

@@ -8,10 +8,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fieldtwin.sitereport.document import Deviation, Device, Document, Piece, Source, Table, Weight
+from fieldtwin.sitereport.document import Deviation, Device, Document, Kind, Piece, Source, Table, Weight
 from fieldtwin.sitereport.reading_dump import dump_piece
 from gateway.core.errors import FileInvalid, UsageError
 
@@ -144,9 +145,91 @@ def _case(case: dict[str, Any], weight: Weight) -> Deviation:
     return Deviation(weight, what, expected, found, where, source)
 
 
+# -- comparisons and differences -------------------------------------------------------------------------------------------
+
+
+def compare_piece(data: dict[str, Any]) -> Piece:
+    """The JSON of `fieldtwin compare`: a device against a recording."""
+    about, found = data["about"], data["differences"]
+    deviations = [_difference(d) for d in found[:MOST_ROWS]]
+    if len(found) > MOST_ROWS:
+        deviations.append(
+            Deviation("deviation", "further differences", "none", f"{len(found) - MOST_ROWS} more, in the file")
+        )
+    slow = [row for row in data["latency"] if not row["alike"]]
+    deviations += [
+        Deviation("deviation", "latency differs", _ms(row["recorded_s"]), _ms(row["other_s"]), str(row["service"]))
+        for row in slow
+    ]
+    alike, timing = f"{100 * data['values']:.2f} %", data["timing"]
+    facts = [
+        ("against", str(about["against"])),
+        ("compared", f"{data['compared']} exchanges, {data['left_out']} left out"),
+        ("values", f"{alike} alike, {100 * data['least']:g} % asked for"),
+        ("timing", "not judged" if timing is None else f"{100 * timing:.1f} %"),
+    ]
+    latency = [(r["service"], r["count"], _ms(r["recorded_s"]), _ms(r["other_s"])) for r in data["latency"]]
+    tables = (_table("Latency: median, 90 %, 99 %", ("function", "exchanges", "recorded", "this one"), latency),)
+    summary = f"{data['compared']} exchanges, {alike} alike"
+    if data["met"]:  # what is allowed by the share that was asked for is no deviation
+        deviations = [
+            replace(d, weight="waived", found=f"{d.found}; within the share that was asked for") for d in deviations
+        ]
+    return _headed("comparison", about, "met" if data["met"] else "not met", summary, facts, deviations, tables)
+
+
+def _difference(found: dict[str, Any]) -> Deviation:
+    what, recorded, other, where = (str(found[key]) for key in ("what", "recorded", "other", "where"))
+    return Deviation(
+        "deviation", f"{what} differs: {found['request']}", recorded, other, where, f"at {found['t_s']:.1f} s"
+    )
+
+
+def _ms(quantiles: list[float]) -> str:
+    return ", ".join(f"{1000 * s:.1f}" for s in quantiles) + " ms"
+
+
+def diff_piece(data: dict[str, Any]) -> Piece:
+    """The JSON of `fieldtwin diff`: a dump against another one, or against a profile or an EDS."""
+    about, found = data["about"], data["found"]
+    deviations = [
+        Deviation("deviation", f"{d['name']}: {d['kind']}", str(d["right"]), str(d["left"]), str(d["at"]))
+        for d in found[:MOST_ROWS]
+    ]
+    if len(found) > MOST_ROWS:
+        deviations.append(
+            Deviation("deviation", "further differences", "none", f"{len(found) - MOST_ROWS} more, in the file")
+        )
+    facts = [("against", str(about["against"])), ("compared", f"{data['compared']} values")]
+    tables = (_table("Notes", ("note",), [(note,) for note in data["notes"]]),)
+    summary = f"{data['compared']} compared, {len(found)} different"
+    return _headed("difference", about, "different" if found else "same", summary, facts, deviations, tables)
+
+
+def _headed(
+    kind: Kind,
+    about: dict[str, Any],
+    verdict: str,
+    summary: str,
+    facts: list[tuple[str, str]],
+    deviations: list[Deviation],
+    tables: tuple[Table, ...],
+) -> Piece:
+    """A piece of what `about.headed` stands above."""
+    where = str(about["endpoint"]) or str(about["device"])
+    return Piece(
+        kind, str(about["protocol"]), int(about["address"]), where, str(about["started"]), str(about["by"]), verdict, summary,
+        {}, tuple(facts), tuple(deviations), tables, str(about["command"]),
+    )  # fmt: skip
+
+
 def _table(title: str, columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> Table:
     shown = tuple(tuple(str(text) for text in row) for row in rows[:MOST_ROWS])
     return Table(title, columns, shown, max(0, len(rows) - MOST_ROWS))
 
 
-READERS: dict[str, Callable[[dict[str, Any]], Piece]] = {"fieldtwin check": check_piece}
+READERS: dict[str, Callable[[dict[str, Any]], Piece]] = {
+    "fieldtwin check": check_piece,
+    "fieldtwin compare": compare_piece,
+    "fieldtwin diff": diff_piece,
+}

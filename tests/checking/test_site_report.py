@@ -16,12 +16,15 @@ from fieldtwin.checking.html import render_html as render_check
 from fieldtwin.checking.modbus_cases import CASES
 from fieldtwin.checking.results import as_json, as_report
 from fieldtwin.checking.subject import Subject
+from fieldtwin.cli.compare_command import command as compare
+from fieldtwin.cli.diff_command import command as diff
 from fieldtwin.cli.report_command import command
 from fieldtwin.conformance.case import failed, inconclusive, passed, skipped
 from fieldtwin.report.junit import render_junit
 from gateway.core.connection import Direction
 from gateway.core.errors import FileInvalid, UsageError
 
+ROOT = Path(__file__).parents[2]
 NASTY = "<script>alert('1')</script>"
 SUBJECT = Subject(
     "modbus", "tcp://192.0.2.7:502", 17, {"vendor": NASTY, "product code": "FM-3", "serial number": "A1234"},
@@ -95,6 +98,49 @@ def test_all_that_the_files_say_stands_in_it(check: Path, dump: Path, tmp_path: 
     assert "<script" not in page
     assert "http" not in page.replace("https://", "")
     assert "not on this wire" not in seen
+
+
+def test_comparisons_and_differences_as_the_commands_write_them(tmp_path: Path) -> None:
+    recorded = (ROOT / "recordings" / "aqualabo-c4e.jsonl").read_text().splitlines(keepends=True)[:40]
+    one, other = tmp_path / "one.jsonl", tmp_path / "other.jsonl"
+    one.write_text("".join(recorded))
+    recorded[2] = recorded[2].replace("41636cc1", "41636cc2")
+    other.write_text("".join(recorded))
+    compared = CliRunner().invoke(compare, [str(one), str(other), "--json"], standalone_mode=False)
+    assert compared.return_value == 1, compared.output
+    dumps = []
+    for name, value in (("before", "0001"), ("after", "0002")):
+        lines = [
+            {
+                "fieldtwin_dump": 1, "protocol": "modbus", "address": 30, "ranges": ["holding:5..5"], "profile": None,
+                "endpoint": "tcp://192.0.2.9:502", "started": "2026-11-21T11:00:00.000+00:00",
+            },
+            {"pass": 0, "at": "2026-11-21T11:00:00.000+00:00"},
+            {"read": "holding:5", "hex": value, "us": 900},
+            {"ended": "2026-11-21T11:00:09.000+00:00", "requests": 1},
+        ]  # fmt: skip
+        dumps.append(tmp_path / f"{name}.jsonl")
+        dumps[-1].write_text("".join(json.dumps(line) + "\n" for line in lines))
+    differs = CliRunner().invoke(diff, [*map(str, dumps), "--json"], standalone_mode=False)
+    assert differs.return_value == 1, differs.output
+    (tmp_path / "compare.json").write_text(compared.stdout)
+    (tmp_path / "diff.json").write_text(differs.stdout)
+    out = tmp_path / "site.html"
+    result = report(tmp_path / "compare.json", tmp_path / "diff.json", "-o", out)
+    assert result.return_value == 0, result.exception
+    assert "2 devices, 2 deviations" in result.output or "2 devices, 3 deviations" in result.output
+    seen = words_of(out.read_text())
+    for said in (
+        "unit 30",
+        "other.jsonl",
+        "one.jsonl",
+        "tcp://192.0.2.9:502",
+        "after.jsonl",
+        "not met",
+        "different",
+        "Comparison",
+    ):
+        assert said in seen, said
 
 
 def test_serial_numbers_from_name_plates_go_before(check: Path, dump: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from fieldtwin.formats.candump import LeftOut
 from gateway.core.canframe import CanFrame
@@ -30,18 +30,18 @@ MAX_OBJECT = 65_536
 def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFrame]]:
     """(ns, channel, frame), in the file's order. Raises `FileInvalid`, at the number of the message where that is known."""
     try:
-        from can import CanError
         from can.io.asc import ASCReader
         from can.io.blf import BLFReader
         from can.io.trc import TRCReader
     except ImportError as e:
         raise UsageError("python-can is not installed", hint="pip install python-can") from e
+    kind = path.suffix.lower()
     readers: dict[str, Any] = {".asc": ASCReader, ".blf": BLFReader, ".trc": TRCReader}
     number = 0
     try:
-        (_check_blocks if path.suffix.lower() == ".blf" else _check_lines)(path)
-        with readers[path.suffix.lower()](path) as reader:
-            for message in reader:
+        (_check_blocks if kind == ".blf" else _check_lines)(path)
+        with path.open("rb") if kind == ".blf" else path.open(encoding="utf-8", errors="replace") as file:
+            for message in _guarded(readers[kind], file, path):
                 number += 1
                 found = _frame(message, left)
                 if found is not None:
@@ -49,18 +49,28 @@ def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFram
     except OSError as e:
         raise FileInvalid(f"cannot read the log: {e.strerror or e}", path=str(path)) from e
     except FieldtwinError as e:
+        if isinstance(e, FileInvalid) and e.path:
+            raise
         raise FileInvalid(f"message {number}: {e.message}", path=str(path), got=e.got) from e
-    except (*_FOREIGN, CanError) as e:
-        raise FileInvalid(
-            f"behind message {number}: not a {path.suffix} file: {e or type(e).__name__}", path=str(path)
-        ) from e
 
 
-_FOREIGN = (
-    ValueError, KeyError, IndexError, TypeError, AttributeError, AssertionError, EOFError, NotImplementedError,
-    ArithmeticError, struct.error, zlib.error, StopIteration, RuntimeError, MemoryError, UnboundLocalError,
-)  # fmt: skip
-"""What python-can's readers raise at damaged files, as tried, besides its own CanError."""
+def _guarded(reader: Any, file: IO[Any], path: Path) -> Iterator[Any]:
+    """What python-can makes of a file. Whatever it raises is said of the file: its readers raise whatever their parsing does."""
+    number = 0
+    try:
+        messages = iter(reader(file))
+    except Exception as e:
+        raise FileInvalid(f"not a {path.suffix} file: {e or type(e).__name__}", path=str(path)) from e
+    while True:
+        try:
+            message = next(messages)
+        except StopIteration:
+            return
+        except Exception as e:
+            said = f"behind message {number}: not a {path.suffix} file: {e or type(e).__name__}"
+            raise FileInvalid(said, path=str(path)) from e
+        number += 1
+        yield message
 
 
 def _check_lines(path: Path) -> None:
@@ -95,7 +105,10 @@ def _check_blocks(path: Path) -> None:
                 packed = file.read(size - 32)
                 data = packed
                 if head[16] == _ZLIB:
-                    data = zlib.decompressobj().decompress(packed, MAX_CONTAINER + 1)
+                    try:
+                        data = zlib.decompressobj().decompress(packed, MAX_CONTAINER + 1)
+                    except zlib.error as e:
+                        raise FileInvalid(f"offset {at}: a container that is damaged: {e}", path=str(path)) from e
                 if len(data) > MAX_CONTAINER:
                     raise FileInvalid(
                         f"offset {at}: a container that is too large", path=str(path), expected=f"{MAX_CONTAINER} bytes"

@@ -57,7 +57,7 @@ def read_capture(path: Path) -> Iterator[Captured]:
                     read = json.loads(line)
                     if "started" in read:
                         continue  # a session of `WireLog`
-                    captured = _captured(read)
+                    captured = captured_of(read)
                 except (ValueError, KeyError, TypeError, FieldtwinError) as e:
                     if not line.endswith(b"\n") and not file.read(1):
                         return
@@ -72,7 +72,7 @@ def read_capture(path: Path) -> Iterator[Captured]:
         raise FileInvalid(f"cannot read the capture: {e.strerror or e}", path=str(path)) from e
 
 
-def _captured(line: dict[str, object]) -> Captured:
+def captured_of(line: dict[str, object]) -> Captured:
     data = bytes.fromhex(str(line["hex"]))
     item: bytes | CanFrame = data
     if "frame" in line:

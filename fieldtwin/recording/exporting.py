@@ -115,11 +115,10 @@ def _exchange_rows(path: Path) -> Rows:
         if e.reply and asked.read_span is not None:
             data = parse_reply(asked, e.request, e.reply).read or data
         text = " ".join(map(str, words(span, data))) if span is not None and data else ""
-        yield (
-            e.t_s, e.unit, _outcome(e), round(1000 * e.latency_s, 3) if e.reply else None, asked.service, span.table if span else "",
-            span.address if span else None, span.count if span else None, text, e.request.hex(),
-            e.reply.hex() if e.reply is not None else "",
-        )  # fmt: skip
+        latency_ms = round(1000 * e.latency_s, 3) if e.reply else None
+        at = (span.table, span.address, span.count) if span else ("", None, None)
+        reply = e.reply.hex() if e.reply is not None else ""
+        yield e.t_s, e.unit, _outcome(e), latency_ms, asked.service, *at, text, e.request.hex(), reply
 
 
 def _tag_rows(path: Path, profile: DeviceProfile, names: list[str]) -> Rows:

@@ -116,24 +116,26 @@ def upload(t_ms: float, index: int, value: int | None, *, abort: int = 0) -> lis
     ]
 
 
-def beats(count: int, every_ms: int = 100, data: bytes = b"\x05") -> list[tuple[int, CanFrame]]:
-    return [(n * every_ms * MS, CanFrame(0x705, data)) for n in range(count)]
+def beats(count: int, every_ms: int = 100) -> list[tuple[int, CanFrame]]:
+    return [(n * every_ms * MS, CanFrame(0x705, b"\x05")) for n in range(count)]
+
+
+def by_time(*parts: list[tuple[int, CanFrame]]) -> list[tuple[int, CanFrame]]:
+    return sorted((frame for part in parts for frame in part), key=lambda pair: pair[0])
 
 
 def test_a_node_is_compared_by_its_transfers_and_the_kinds_of_its_messages() -> None:
-    log = sorted(
-        [*upload(1, 0x6041, 5), *upload(50, 0x6041, 6), *upload(90, 0x1018, None, abort=0x06020000), *beats(10)],
-        key=lambda p: p[0],
-    )
+    status, gone = [*upload(1, 0x6041, 5), *upload(50, 0x6041, 6)], upload(90, 0x1018, None, abort=0x06020000)
+    log = by_time(status, gone, beats(10))
     assert compare_logs(log, log).met
     for other, kind in (
-        ([*upload(1, 0x6041, 5), *upload(50, 0x6041, 7), *upload(90, 0x1018, None, abort=0x06020000), *beats(10)], "value"),
-        ([*upload(1, 0x6041, 5), *upload(50, 0x6041, 6), *upload(90, 0x1018, None, abort=0x08000000), *beats(10)], "abort"),
-        ([*upload(1, 0x6041, 5), *upload(50, 0x6041, 6), *beats(10)], "missing"),
-        ([*upload(1, 0x6041, 5), *upload(50, 0x6041, 6), *upload(90, 0x1018, None, abort=0x06020000)], "missing"),
-        ([*upload(1, 0x6041, 5), *upload(50, 0x6041, 6), *upload(90, 0x1018, None, abort=0x06020000), *beats(10, 200)], "message"),
-    ):  # fmt: skip
-        result = compare_logs(log, sorted(other, key=lambda p: p[0]))
+        (by_time(upload(1, 0x6041, 5), upload(50, 0x6041, 7), gone, beats(10)), "value"),
+        (by_time(status, upload(90, 0x1018, None, abort=0x08000000), beats(10)), "abort"),
+        (by_time(status, beats(10)), "missing"),
+        (by_time(status, gone), "missing"),
+        (by_time(status, gone, beats(10, 200)), "message"),
+    ):
+        result = compare_logs(log, other)
         assert (result.met, result.by_kind) == (False, {kind: 1})
-    near = [*upload(1, 0x6041, 5), *upload(50, 0x6041, 7), *upload(90, 0x1018, None, abort=0x06020000), *beats(10)]
-    assert compare_logs(log, sorted(near, key=lambda p: p[0]), Rules(Tolerance(1))).met
+    near = by_time(upload(1, 0x6041, 5), upload(50, 0x6041, 7), gone, beats(10))
+    assert compare_logs(log, near, Rules(Tolerance(1))).met

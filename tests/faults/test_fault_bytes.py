@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -388,3 +390,7 @@ def test_every_fault_takes_every_frame(data: bytes, framing: Framing, kind: type
     for way in Way:
         outcome = fault.strike(understood(way, framing, data), Random(1))
         assert all(isinstance(piece.data, bytes) and piece.delay_s >= 0 for piece in outcome.pieces)
+
+
+def test_every_fault_is_in_these_tables() -> None:
+    assert set(FAULTS) <= set(re.findall(r'"([a-z-]+)"', Path(__file__).read_text()))

@@ -95,17 +95,25 @@ async def read_identity(wire: ModbusWire) -> dict[str, str]:
     identity: dict[str, str] = {}
     for code in (0x01, 0x02):
         answer = (await wire.ask(bytes((0x2B, 0x0E, code, 0)), due=False)).first
-        if answer is None or answer.refusal or len(answer.pdu) < 7:
+        if answer is None or answer.refusal:
             break
-        place = 7
-        while place + 2 <= len(answer.pdu):
-            raw = answer.pdu[place + 2 : place + 2 + answer.pdu[place + 1]]
-            name = OBJECT_NAMES.get(answer.pdu[place], f"object {answer.pdu[place]:02X}")
-            if text := shown(raw):
-                identity[name] = text
-            place += 2 + answer.pdu[place + 1]
+        identity |= objects_in(answer.pdu)
     answer = (await wire.ask(b"\x11", due=False)).first
     if answer is not None and not answer.refusal and len(answer.pdu) > 2:
         identity["server id"] = shown(answer.pdu[2:]) or answer.pdu[2:].hex(" ").upper()
     await wire.settle()
     return identity
+
+
+def objects_in(pdu: bytes) -> dict[str, str]:
+    """Name to text of what a reply of FC 43/14 says; empty for what is none."""
+    said: dict[str, str] = {}
+    if len(pdu) < 7 or pdu[:2] != b"\x2b\x0e":
+        return said
+    place = 7
+    while place + 2 <= len(pdu):
+        name = OBJECT_NAMES.get(pdu[place], f"object {pdu[place]:02X}")
+        if text := shown(pdu[place + 2 : place + 2 + pdu[place + 1]]):
+            said[name] = text
+        place += 2 + pdu[place + 1]
+    return said

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
+from fieldtwin.checking.subject import who
 from fieldtwin.commissioning.asking import PROBES, Asked, Asker
 from fieldtwin.commissioning.dump_file import Dump, DumpWriter, key_of, outcome_of
 from fieldtwin.commissioning.dump_objects import EVERYTHING, ListedObjects, ObjectKey, ObjectSweep, of_dictionary
@@ -274,7 +275,7 @@ def check_resumable(job: Job, earlier: Dump) -> None:
 
 def started(job: Job, clock: Clock) -> dict[str, Any]:
     """The header of a new dump."""
-    return job.header() | {"endpoint": job.target.url, "started": _iso(clock.utc_ns())}
+    return job.header() | {"endpoint": job.target.url, "started": _iso(clock.utc_ns()), "by": who()}
 
 
 def _map_line(found: TableMap) -> dict[str, Any]:

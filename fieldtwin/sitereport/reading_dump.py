@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.checking.checked import shown
+from fieldtwin.checking.modbus_session import objects_in
 from fieldtwin.commissioning.dump_file import Dump, load_dump
 from fieldtwin.sitereport.document import SERIAL, Deviation, Piece, Table
 
@@ -45,7 +46,7 @@ def dump_piece(path: Path) -> Piece:
 
 
 def identity(dump: Dump) -> dict[str, str]:
-    """What a CANopen node says of itself in its objects; a Modbus device is asked by checks."""
+    """What the device says of itself: a CANopen node in its objects, a Modbus device by functions 2B/0E and 11."""
     said: dict[str, str] = {}
     for each in dump.passes:
         for key, name in NUMBERS.items():
@@ -55,7 +56,19 @@ def identity(dump: Dump) -> dict[str, str]:
         for key, name in IDENTITY.items():
             if (raw := each.cells.get(key)) is not None and (text := shown(raw)):
                 said[name] = text
+    if raw := _raw(dump, 0x2B):
+        said |= objects_in(b"\x2b" + raw)
+    if raw := _raw(dump, 0x11):
+        said["server id"] = shown(raw) or raw.hex(" ").upper()
     return said
+
+
+def _raw(dump: Dump, function: int) -> bytes:
+    """What that function answered, empty where it did not."""
+    try:
+        return bytes.fromhex(dump.functions.get(function, {}).get("hex", ""))
+    except (TypeError, ValueError):
+        return b""
 
 
 def _tables(dump: Dump) -> tuple[Table, ...]:

@@ -117,6 +117,7 @@ def test_comparisons_and_differences_as_the_commands_write_them(tmp_path: Path) 
             },
             {"pass": 0, "at": "2026-11-21T11:00:00.000+00:00"},
             {"read": "holding:5", "hex": value, "us": 900},
+            {"function": 0x2B, "hex": "0e0183000001" + "0004" + b"ACME".hex(), "us": 900},
             {"ended": "2026-11-21T11:00:09.000+00:00", "requests": 1},
         ]  # fmt: skip
         dumps.append(tmp_path / f"{name}.jsonl")
@@ -126,7 +127,7 @@ def test_comparisons_and_differences_as_the_commands_write_them(tmp_path: Path) 
     (tmp_path / "compare.json").write_text(compared.stdout)
     (tmp_path / "diff.json").write_text(differs.stdout)
     out = tmp_path / "site.html"
-    result = report(tmp_path / "compare.json", tmp_path / "diff.json", "-o", out)
+    result = report(tmp_path / "compare.json", tmp_path / "diff.json", dumps[0], "-o", out)
     assert result.return_value == 0, result.exception
     assert "2 devices, 2 deviations" in result.output or "2 devices, 3 deviations" in result.output
     seen = words_of(out.read_text())

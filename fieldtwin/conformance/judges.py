@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
-from fieldtwin.conformance.observation import Asked, Came, Ended, Garbled, Observation, Shown, Told, Word
+from fieldtwin.conformance.observation import Asked, Came, Ended, Garbled, Left, Observation, Shown, Told, Word
 from gateway.core.clock import NS_PER_S
 
 FLOOD_FACTOR = 5.0
@@ -158,6 +158,8 @@ def quarantines(seen: Observation) -> Finding | None:
     """
     late = next((t for t in seen.of(Told, seen.begun_ns) if not t.good), None)
     first = next(seen.of(Asked, seen.begun_ns), None)
+    if late is None and any(not left.by_us for left in seen.of(Left, seen.begun_ns)):
+        return None  # it gave up the connection: on that nothing comes late
     if late is None or first is None:
         return inconclusive("the late answer was never sent")
     again = next((a for a in seen.of(Asked, first.t_ns + 1, late.t_ns) if a.target == first.target), None)

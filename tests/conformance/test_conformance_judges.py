@@ -8,7 +8,13 @@ from fieldtwin.conformance import judges
 from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
 from fieldtwin.conformance.canopen_judges import legal_nmt, legal_sync
 from fieldtwin.conformance.case import Judge
-from fieldtwin.conformance.habits import bounded_addresses, broadcasts_wait, legal_requests, no_broadcast_reads
+from fieldtwin.conformance.habits import (
+    bounded_addresses,
+    broadcasts_wait,
+    few_connections,
+    legal_requests,
+    no_broadcast_reads,
+)
 from fieldtwin.conformance.modbus_cases import CASES
 from fieldtwin.conformance.observation import (
     Asked,
@@ -17,6 +23,7 @@ from fieldtwin.conformance.observation import (
     Event,
     Garbled,
     Habit,
+    Left,
     Observation,
     Sent,
     Shown,
@@ -148,3 +155,17 @@ def test_every_case_says_what_it_is(cases: tuple[object, ...]) -> None:
     for about in abouts:
         assert all((about.title, about.clause, about.does, about.must)), about.id
         assert about.role == "master"
+
+
+def test_a_master_that_gives_the_connection_up_needs_no_quarantine() -> None:
+    events: list[Event] = [Asked(_at(0), 1, READ), Left(_at(0.2), 1), Came(_at(0.3), 2), *_good()[2:]]
+    assert judges.late_same_shape(_seen(*events)).verdict is Verdict.PASSED
+    events[1] = Left(_at(0.2), 1, by_us=True)
+    assert judges.late_same_shape(_seen(*events)).verdict is Verdict.INCONCLUSIVE
+
+
+def test_connections_that_pile_up_are_counted() -> None:
+    some = [Came(_at(n), n) for n in range(4)]
+    assert few_connections(_seen(*some)).reason == "at most 4 at once"
+    assert few_connections(_seen(*some, Left(_at(5), 1), Came(_at(5), 9))).verdict is Verdict.PASSED
+    assert few_connections(_seen(*some, Came(_at(5), 9))).verdict is Verdict.FAILED

@@ -157,7 +157,7 @@ def _packets(file: Path, out: Path, ports: tuple[int, ...], as_json: bool) -> in
     notes = [
         (pairs_.unanswered, "requests without an answer"), (pairs_.strays, "answers to nothing"),
         (pairs_.malformed, "malformed"), (packets.lost_bytes, "bytes that the capture lost"),
-        (packets.fragments, "fragments of IP packets, left out"), (packets.cut_short, "packets cut short"),
+        (packets.fragments, "IP packets of which a piece is missing"), (packets.cut_short, "packets cut short"),
         (found.can_left_out, "CAN frames left out (CAN FD, or cut short)"),
         (found.other_conversations, "conversations that are not Modbus"),
         (found.servers_left_out, "exchanges of one server too many, left out"),

@@ -10,8 +10,10 @@ Sources: RFC 791, 8200, 768, 9293; link types: https://www.tcpdump.org/linktypes
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+
+from fieldtwin.formats.ip_fragments import Fragments
 
 LINK_NULL, LINK_ETHERNET, LINK_RAW, LINK_LOOP, LINK_SLL, LINK_SLL2 = 0, 1, 101, 108, 113, 276
 _RAW = (12, 14, LINK_RAW, 228, 229)
@@ -119,7 +121,8 @@ OnEnd = Callable[[Conversation], None]
 
 @dataclass(slots=True)
 class PacketCounters:
-    """What came of the packets: `carried` had something to say; `fragments` are pieces of IP packets, left out."""
+    """What came of the packets: `carried` had something to say; `fragments` are IP packets of which a
+    piece is missing."""
 
     packets: int = 0
     carried: int = 0
@@ -136,6 +139,7 @@ class Conversations:
         self.counters = PacketCounters()
         self._on_data, self._on_end = on_data, on_end
         self._open: dict[tuple[bool, Side, Side], Conversation] = {}
+        self._fragments = Fragments()
 
     def packet(self, t_ns: int, link: int, data: bytes) -> None:
         """The next packet of the capture."""
@@ -154,6 +158,8 @@ class Conversations:
 
     def finish(self) -> None:
         """The capture is over."""
+        self._fragments.finish()
+        self.counters.fragments = self._fragments.given_up
         for key in list(self._open):
             self._end(key)
 
@@ -162,10 +168,12 @@ class Conversations:
             self.counters.cut_short += 1
             return
         head, total = (data[at] & 15) * 4, data[at + 2] << 8 | data[at + 3]
-        if (data[at + 6] & 0x3F) | data[at + 7]:
-            self.counters.fragments += 1
-            return
         end = at + total if total else len(data)  # 0: the network card divided it later
+        if (data[at + 6] & 0x3F) | data[at + 7]:
+            place = data[at + 6] << 8 | data[at + 7]
+            key = data[at + 12 : at + 20], data[at + 9], data[at + 4 : at + 6]
+            self._piece(t_ns, key, (place & 0x1FFF) * 8, bool(place & 0x2000), data[at + head : end], key[0], key[1])
+            return
         self._transport(t_ns, data[at + 9], data[at + 12 : at + 16], data[at + 16 : at + 20], data, at + head, end)
 
     def _ip6(self, t_ns: int, data: bytes, at: int) -> None:
@@ -177,10 +185,22 @@ class Conversations:
         start, end = at + 40, at + 40 + length
         while following in (0, 43, 60) and start + 8 <= min(end, len(data)):  # options and routing, by 8 bytes
             following, start = data[start], start + 8 + data[start + 1] * 8
-        if following == 44:
-            self.counters.fragments += 1
+        if following == 44 and start + 8 <= len(data):
+            place = data[start + 2] << 8 | data[start + 3]
+            key = source + target, data[start + 4 : start + 8]
+            body = data[start + 8 : end]
+            self._piece(t_ns, key, place & 0xFFF8, bool(place & 1), body, source + target, data[start])
             return
         self._transport(t_ns, following, source, target, data, start, end)
+
+    def _piece(
+        self, t_ns: int, key: Hashable, offset: int, more: bool, data: bytes, addresses: bytes, protocol: int
+    ) -> None:
+        """A piece of an IP packet; the last one brings what it carries."""
+        whole = self._fragments.add(key, offset, data, more=more)
+        if whole is not None:
+            half = len(addresses) // 2
+            self._transport(t_ns, protocol, addresses[:half], addresses[half:], whole, 0, len(whole))
 
     def _transport(
         self, t_ns: int, protocol: int, source: bytes, target: bytes, data: bytes, at: int, end: int

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Hashable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange
@@ -58,11 +58,13 @@ class _Side:
         self.kinds: dict[tuple[int, str], _Kind] = {}
         self._frames, self._nodes, self._uploads = frames, nodes, uploads
         self._told = 0
+        self.began_ns = -1
 
     def transfers(self) -> Iterator[Exchange]:
         """Once; afterwards `kinds` are complete."""
         wire = CanopenWire("can", ())
         for t_ns, frame in self._frames:
+            self.began_ns = t_ns if self.began_ns < 0 else self.began_ns
             for done in wire.feed(frame, t_ns)[1]:
                 yield from self._sorted(done)
         for done in wire.finish():
@@ -121,6 +123,8 @@ def compare_logs(
     judge_latencies(result, latencies, rules)
     if messages:
         _compare_messages(sides[0].kinds, sides[1].kinds, rules, result)
+    began_s = max(sides[0].began_ns, 0) / 1e9
+    result.differences = [replace(d, t_s=d.t_s - began_s) for d in result.differences]
     return result
 
 

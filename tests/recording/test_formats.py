@@ -156,6 +156,29 @@ def test_what_mbpoll_prints_is_an_exchange(
     ]  # fmt: skip
 
 
+MODPOLL = """modpoll 3.10 - FieldTalk(tm) Modbus(R) Polling Utility
+Protocol configuration: Modbus RTU
+Slave configuration...: address = 1, start reference = 100, count = 2
+Communication.........: COM1, 19200, 8, 1, even, t/o 1.00 s, poll rate 1000 ms
+Data type.............: 16-bit register, input register table
+
+-- Polling slave... (Ctrl-C to stop)
+[100]: 7
+[101]: -8
+-- Polling slave... (Ctrl-C to stop)
+Reply time-out!
+-- Polling slave... (Ctrl-C to stop)
+Illegal Data Address exception response!
+"""
+
+
+def test_what_modpoll_prints_is_an_exchange() -> None:
+    request = bytes.fromhex("0400630002")
+    assert [(e.t_s, e.request, e.reply) for e in read_polls(MODPOLL.splitlines())] == [
+        (0.0, request, bytes.fromhex("04040007fff8")), (1.0, request, None), (2.0, request, b"\x84\x02"),
+    ]  # fmt: skip
+
+
 def test_a_poll_session_becomes_a_recording_with_a_draft(tmp_path: Path) -> None:
     text = POLL.format(kind="16-bit register, input register table", count=1, values="[8449]: 7")
     path = table(tmp_path, text, "poll.txt")

@@ -124,6 +124,31 @@ def test_servers_units_and_framings_are_kept_apart(tmp_path: Path) -> None:
     assert [m.endpoint for m in only.made] == ["rtu+tcp://10.0.0.3:4001"]
 
 
+def pieces(packet: bytes, size: int) -> list[bytes]:
+    """An IPv4 packet in fragments of `size` bytes."""
+    ethernet, head, body = packet[:14], bytearray(packet[14:34]), packet[34 : 14 + int.from_bytes(packet[16:18])]
+    out = []
+    for at in range(0, len(body), size):
+        piece = body[at : at + size]
+        head[2:4] = (20 + len(piece)).to_bytes(2)
+        head[6:8] = (at // 8 | (0x2000 if at + size < len(body) else 0)).to_bytes(2)
+        out.append(ethernet + bytes(head) + piece)
+    return out
+
+
+def test_ip_packets_in_pieces_are_put_together(tmp_path: Path) -> None:
+    packets = []
+    for n, packet in enumerate(polls()):  # each with an identification of its own
+        numbered = packet[:18] + n.to_bytes(2) + packet[20:]
+        found = pieces(numbered, 24)
+        packets += found[::-1] if n % 2 else found
+    summary, found = imported(tmp_path, pcap(packets))
+    assert told(found) == WANTED
+    assert summary.packets.fragments == 0
+    (tmp_path / "r.jsonl").unlink()
+    assert imported(tmp_path, pcap([*packets, pieces(polls()[2], 24)[0]]))[0].packets.fragments == 1
+
+
 def test_a_draft_profile_of_each_unit_can_be_loaded(tmp_path: Path) -> None:
     talk = Talk()
     steps = [

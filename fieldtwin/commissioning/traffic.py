@@ -45,6 +45,8 @@ class Heard:
     units: dict[int, UnitHeard] = field(default_factory=dict)
     repeated: int = 0
     """Requests that came twice at once, as where every sender hears itself."""
+    glitches: int = 0
+    """Pieces of one or two bytes beside frames, as where a transceiver's direction is switched too early or too late."""
     longest_gap_ns: int = 0
     bursts: int = 0
     values: dict[int, int] = field(default_factory=dict)
@@ -107,6 +109,7 @@ class LineEar:
         heard = self.heard
         if frame.bad:
             heard.bad_frames += 1
+            heard.glitches += len(frame.raw) <= 2
             return
         heard.frames += 1
         heard.good_bytes += len(frame.raw)

@@ -1,0 +1,82 @@
+"""Stopping something long and keeping what it found: `q` on a terminal, or Ctrl-C once; a second Ctrl-C ends at once."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator
+from types import FrameType
+
+
+class StopKey:
+    """``with StopKey() as stop:`` inside a running loop; `pressed` says whether it was."""
+
+    def __init__(self) -> None:
+        self._pressed = False
+        self._undo = contextlib.ExitStack()
+
+    @property
+    def listens(self) -> bool:
+        """Whether there is a keyboard to press `q` on."""
+        return sys.stdin is not None and sys.stdin.isatty()
+
+    def pressed(self) -> bool:
+        return self._pressed
+
+    def __enter__(self) -> StopKey:
+        self._undo.enter_context(self._interrupts())
+        if self.listens:
+            self._undo.enter_context(self._keys())
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._undo.close()
+
+    @contextlib.contextmanager
+    def _interrupts(self) -> Iterator[None]:
+        before = signal.getsignal(signal.SIGINT)
+
+        def interrupted(number: int, frame: FrameType | None) -> None:
+            if self._pressed:
+                raise KeyboardInterrupt
+            self._pressed = True
+
+        try:
+            signal.signal(signal.SIGINT, interrupted)
+        except ValueError:  # not in the main thread: then nobody presses Ctrl-C here
+            yield
+            return
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    @contextlib.contextmanager
+    def _keys(self) -> Iterator[None]:
+        """Single keys without Enter, where the terminal can; elsewhere Ctrl-C alone."""
+        try:
+            import termios
+            import tty
+        except ImportError:  # Windows
+            yield
+            return
+        descriptor = sys.stdin.fileno()
+        try:
+            before = termios.tcgetattr(descriptor)
+        except termios.error:
+            yield
+            return
+        loop = asyncio.get_running_loop()
+        tty.setcbreak(descriptor)
+        loop.add_reader(descriptor, self._on_key)
+        try:
+            yield
+        finally:
+            loop.remove_reader(descriptor)
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+    def _on_key(self) -> None:
+        if sys.stdin.read(1) in ("q", "Q", ""):
+            self._pressed = True

@@ -25,7 +25,7 @@ WINDOW = 2000
 """Events that are under way or wait for their turn in memory; the rest waits in the store."""
 FAR_AHEAD = 100_000
 """Numbers so far behind the first gap are not kept: they come again."""
-RTO_FIRST_NS, RTO_MIN_NS, RTO_MAX_NS = 3 * NS_PER_S, 200 * NS_PER_MS, 60 * NS_PER_S
+RTO_FIRST_NS, RTO_MIN_NS, RTO_MAX_NS = NS_PER_S, 200 * NS_PER_MS, 60 * NS_PER_S
 MAX_STREAMS = 16
 MAX_RANGES = 1000
 

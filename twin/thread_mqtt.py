@@ -1,0 +1,148 @@
+"""A thread over an MQTT broker, as Sparkplug B (the extra `mqtt`). The only file that knows aiomqtt."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+
+import aiomqtt
+
+from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.errors import ConnectionLost, Desync, Unreachable
+from gateway.store.event import Event
+from twin.sparkplug import MAX_PAYLOAD
+from twin.thread_frames import Frame
+from twin.thread_link import Carrier, Link
+from twin.thread_sparkplug import EdgeNode, HostApplication, Message
+
+KEEPALIVE_S = 15
+TIMEOUT_S = 10.0
+QUEUED = 1000
+"""Messages that may wait to be read; what is too much is dropped by the client, and comes again."""
+ACK_DELAY_NS = 100 * NS_PER_MS
+GOODBYE_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Broker:
+    """Where the broker is and who we are there. The password is never shown."""
+
+    host: str
+    port: int = 1883
+    username: str | None = None
+    password: str | None = None
+    tls: ssl.SSLContext | None = None
+
+    def __str__(self) -> str:
+        return f"mqtt://{self.host}:{self.port}"
+
+
+Side = EdgeNode | HostApplication
+
+
+class MqttLink(Link):
+    """A session with the broker."""
+
+    ack_delay_ns = ACK_DELAY_NS
+
+    def __init__(self, client: aiomqtt.Client, side: Side, clock: Clock, where: str) -> None:
+        self.side = side
+        self.garbled = 0
+        self._client = client
+        self._clock = clock
+        self._where = where
+        self._messages: AsyncIterator[aiomqtt.Message] = aiter(client.messages)
+
+    async def begin(self) -> None:
+        """Subscribe, and say that we are here."""
+        try:
+            for topic in self.side.subscriptions:
+                await self._client.subscribe(topic, qos=1)
+        except aiomqtt.MqttError as e:
+            raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
+        for message in self.side.hello():
+            await self._publish(message)
+
+    async def _publish(self, message: Message) -> None:
+        try:
+            await self._client.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
+        except aiomqtt.MqttError as e:
+            raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
+
+    async def send(self, frame: Frame) -> None:
+        for message in self.side.messages(frame, self._clock.utc_ns() // NS_PER_MS):
+            await self._publish(message)
+
+    async def receive(self) -> Frame:
+        while True:
+            try:
+                message = await anext(self._messages)
+            except (aiomqtt.MqttError, StopAsyncIteration) as e:
+                raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
+            payload = message.payload
+            if not isinstance(payload, bytes) or len(payload) > MAX_PAYLOAD:
+                self.garbled += 1
+                continue
+            try:
+                frame = self.side.frame(message.topic.value, payload)
+            except Desync:
+                self.garbled += 1
+                continue
+            if frame is not None:
+                return frame
+
+    def fit(self, tag: bytes, events: Sequence[Event]) -> int:
+        return self.side.fit(events)
+
+    def knows(self, schema: bytes) -> bool:
+        """Births announce every name: nobody needs to have the schema beforehand."""
+        return True
+
+    async def aclose(self) -> None:
+        with suppress(ConnectionLost, TimeoutError):
+            async with asyncio.timeout(GOODBYE_S):
+                await self._publish(self.side.will())
+        with suppress(aiomqtt.MqttError):
+            await self._client.__aexit__(None, None, None)
+
+
+class MqttCarrier(Carrier):
+    """Goes to the broker. `make_side` is called for each session with its number: births and deaths are counted."""
+
+    def __init__(self, broker: Broker, make_side: Callable[[int], Side], clock: Clock) -> None:
+        self.name = f"thread over {broker}"
+        self._broker = broker
+        self._make_side = make_side
+        self._clock = clock
+        self._sessions = 0
+
+    async def open(self) -> MqttLink:
+        b = self._broker
+        side = self._make_side(self._sessions)
+        self._sessions += 1
+        will = side.will()
+        client = aiomqtt.Client(
+            b.host,
+            b.port,
+            username=b.username,
+            password=b.password,
+            tls_context=b.tls,
+            timeout=TIMEOUT_S,
+            keepalive=KEEPALIVE_S,
+            max_queued_incoming_messages=QUEUED,
+            will=aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
+        )
+        try:
+            await client.__aenter__()
+        except aiomqtt.MqttError as e:
+            raise Unreachable(f"the broker refuses or is not there: {e}", where=str(b)) from e
+        link = MqttLink(client, side, self._clock, str(b))
+        try:
+            await link.begin()
+        except BaseException:
+            await link.aclose()
+            raise
+        return link

@@ -60,8 +60,8 @@ class ScanProgress:
 
 
 def phase_line(progress: Progress) -> str:
-    """``likely settings: about 30 s``."""
-    about = f": about {duration(progress.total_s)}" if progress.total_s else ""
+    """``likely settings: up to 30 s``."""
+    about = f": up to {duration(progress.total_s)}" if progress.total_s >= 1 else ""
     return f"{progress.phase}{about}"
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 from fieldtwin.commissioning.can_ear import BusEar, BusHeard
@@ -120,6 +121,7 @@ class CanScanner:
         try:
             self.result.facts = self._facts(self._endpoint)
             await self._listen()
+            self.result.heard = deepcopy(self._ear.heard)  # what is heard from now on is answers to us as well
             if self._may_ask():
                 await self._ask()
         finally:

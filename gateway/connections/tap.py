@@ -117,6 +117,8 @@ class _TappedCan(CanConnection):
     def __init__(self, inner: CanConnection, endpoint: Endpoint, observers: _Observers) -> None:
         self._inner = inner  # before the base class, which sets `overruns`
         self._observers = observers
+        self.bitrate = int(getattr(inner, "bitrate", 0))
+        """What the medium runs at (bit/s), 0 where it does not know."""
         super().__init__(cast(CANConnection, inner.inbound), endpoint, inner.max_pending)
         for frame in inner.inbound.data_stream:
             observers.saw(endpoint, Direction.RECEIVED, frame)

@@ -38,6 +38,8 @@ async def _borrowed(wire: CanopenWire, key: Key) -> AsyncIterator[bytes]:
 
 
 async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> Finding:
+    if wrong:
+        await wire.abandon(key)  # whatever is still under way
     now = await wire.upload(key)
     if now != before:
         said = now.hex(" ").upper() if isinstance(now, bytes) else str(now)
@@ -220,7 +222,7 @@ async def crc_mismatch(wire: CanopenWire) -> Finding:
             raise NotHere("its block download has no CRC")
         reply = await wire.ask(_segments(before)[0])
         if reply.data[:2] != b"\xa2\x01":
-            return await verdict(wire, f"{reply} instead of an acknowledgement")
+            return await _unchanged(wire, key, before, f"{reply} instead of an acknowledgement")
         return await _unchanged(wire, key, before, aborted(await wire.ask(_end(before, crc16(before) ^ 0xFFFF)), CRC))
 
 

@@ -1,0 +1,91 @@
+"""Values of one device again and again: their history, bounded, and a sparkline of it.
+
+It must never write, and never asks faster than it is told to. Knows no screen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import AsyncGenerator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from fieldtwin.commissioning.point import Answer, Point
+from gateway.core.clock import NS_PER_S, Clock
+from gateway.core.profile import Tag
+
+MOST_SAMPLES = 3600
+"""So many samples of a tag are kept for a sparkline and a plot; older ones are counted and forgotten."""
+BLOCKS = "▁▂▃▄▅▆▇█"
+GAP = " "
+
+
+@dataclass
+class History:
+    """What a tag was, in seconds since the start; None where there was no good value. `least` and `most` of all samples ever."""
+
+    times_s: deque[float] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
+    values: deque[float | None] = field(default_factory=lambda: deque(maxlen=MOST_SAMPLES))
+    samples: int = 0
+    bad: int = 0
+    changes: int = 0
+    least: float = math.inf
+    most: float = -math.inf
+    _last: object = None
+
+    def add(self, t_s: float, answer: Answer) -> None:
+        value = answer.value.value
+        good = answer.value.good
+        number = float(value) if isinstance(value, int | float) and good else None
+        self.times_s.append(t_s)
+        self.values.append(number)
+        self.samples += 1
+        self.bad += not good
+        if good:
+            self.changes += self.samples > 1 and self._last is not None and answer.value.raw != self._last
+            self._last = answer.value.raw
+        if number is not None:
+            self.least, self.most = min(self.least, number), max(self.most, number)
+
+    def sparkline(self, width: int) -> str:
+        """The last `width` samples as blocks between their own smallest and largest; a blank where there is none."""
+        return sparkline(list(self.values)[-width:])
+
+
+def sparkline(values: Sequence[float | None]) -> str:
+    """One character a value. A value that does not change is a line in the middle."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return GAP * len(values)
+    low, high = min(known), max(known)
+    span = high - low
+    if not span or not math.isfinite(span):
+        return "".join(GAP if v is None else BLOCKS[3] for v in values)
+    top = len(BLOCKS) - 1
+    return "".join(GAP if v is None else BLOCKS[min(top, int((v - low) / span * len(BLOCKS)))] for v in values)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One round: when, in seconds since the first, and what came. `late_s`: how much later than it was due."""
+
+    number: int
+    t_s: float
+    answers: Mapping[str, Answer]
+    late_s: float
+
+
+async def samples(
+    point: Point, tags: Sequence[Tag], clock: Clock, every_s: float, count: int | None = None
+) -> AsyncGenerator[Sample, None]:
+    """A sample every `every_s` seconds, `count` of them, or until closed. A round that lasts longer makes the next one late, and
+    that is not made up for."""
+    start_ns = due_ns = clock.monotonic_ns()
+    number = 0
+    while count is None or number < count:
+        await clock.sleep_until_ns(due_ns)
+        now_ns = clock.monotonic_ns()
+        answers = await point.read(tags)
+        number += 1
+        yield Sample(number, (now_ns - start_ns) / NS_PER_S, answers, (now_ns - due_ns) / NS_PER_S)
+        due_ns = max(due_ns + round(every_s * NS_PER_S), clock.monotonic_ns())

@@ -289,6 +289,8 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
     data.print(
         f"{result.compared} compared, {result.alike} alike" + (f"; otherwise: {kinds}" if kinds else ""), soft_wrap=True
     )
+    if result.extra:
+        data.print(f"{result.extra} more there, of which the recording says nothing", soft_wrap=True)
     if result.left_out:
         data.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
     timing = "not known" if result.timing is None else f"{100 * result.timing:.1f} %"

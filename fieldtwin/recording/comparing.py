@@ -60,7 +60,7 @@ class Rules:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """An exchange that went otherwise. `what` is value, exception, silence, reply, missing or extra; `where` a tag or
+    """An exchange that went otherwise. `what` is value, exception, silence, reply or missing; `where` a tag or
     register."""
 
     t_s: float
@@ -85,13 +85,14 @@ class LatencyRow:
 
 @dataclass(slots=True)
 class Comparison:
-    """What came of it."""
+    """What came of it. `extra`: what the other has beyond the recording; nothing was said of that."""
 
     compared: int = 0
     alike: int = 0
     differences: list[Difference] = field(default_factory=list)
     by_kind: dict[str, int] = field(default_factory=dict)
     left_out: int = 0
+    extra: int = 0
     latency: list[LatencyRow] = field(default_factory=list)
     timing: float | None = None
     least: float = 1.0
@@ -121,12 +122,12 @@ class Comparer:
     def add(self, recorded: Exchange | None, other: Exchange | None) -> None:
         """One exchange on both sides; None where a side does not have it."""
         result = self._result
+        if recorded is None:
+            result.extra += other is not None
+            return
         result.compared += 1
-        if recorded is None or other is None:
-            there = recorded or other
-            assert there is not None
-            kind = "missing" if other is None else "extra"
-            self._differ(there, kind, "", _outcome(recorded), _outcome(other))
+        if other is None:
+            self._differ(recorded, "missing", "", _outcome(recorded), _outcome(None))
             return
         before = sum(result.by_kind.values())
         self._judge(recorded, other)

@@ -104,11 +104,12 @@ def compare_logs(
     sides = _Side(recorded, wanted, uploads), _Side(other, wanted, uploads)
     latencies: dict[str, tuple[array[float], array[float]]] = {}
     for one, two in pairs_of(sides[0].transfers(), sides[1].transfers(), _transfer):
+        if one is None:
+            result.extra += 1
+            continue
         result.compared += 1
-        if one is None or two is None:
-            there = one or two
-            assert there is not None
-            _differ(result, there, "missing" if two is None else "extra", _outcome(one), _outcome(two))
+        if two is None:
+            _differ(result, one, "missing", _outcome(one), "not asked")
             continue
         if _alike(one, two, rules, tags):
             result.alike += 1
@@ -199,9 +200,7 @@ def _differ(result: Comparison, done: Exchange, what: str, recorded: str, other:
         result.differences.append(Difference(done.t_ns / 1e9, done.unit, done.service, what, where, recorded, other))
 
 
-def _outcome(done: Exchange | None) -> str:
-    if done is None:
-        return "not asked"
+def _outcome(done: Exchange) -> str:
     if done.abort is not None:
         return f"abort {done.abort:08X}h"
     return done.problem or str(done.value if done.value is not None else "nothing")

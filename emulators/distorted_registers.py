@@ -26,14 +26,14 @@ class DistortedRegisters(RegisterBank):
     def __init__(self, bank: RegisterBank, peek: Peek, profile: DeviceProfile, journal: HeldJournal) -> None:
         self.distortions = Distortions()
         self._peek = peek
-        self._bank = bank
+        self.bank = bank
         self._journal = journal
         self._tags = [t for t in profile.tags.values() if t.readable and not t.is_text]
         self._scales = {t.name: profile.tags.get(t.scale_by) for t in self._tags if t.scale_by is not None}
         self._noted: set[str] = set()
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
-        cells = self._bank.read(table, address, count, now_ns)
+        cells = self.bank.read(table, address, count, now_ns)
         if not self.distortions and not self._noted:
             return cells
         held = list(cells)
@@ -55,10 +55,10 @@ class DistortedRegisters(RegisterBank):
         return held
 
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
-        self._bank.check_read(table, address, count, now_ns)
+        self.bank.check_read(table, address, count, now_ns)
 
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
-        self._bank.write(table, address, values, now_ns)
+        self.bank.write(table, address, values, now_ns)
 
     def _cells(self, tag: Tag, own: list[int], now_ns: int) -> list[int]:
         """The cells that the tag has instead of its `own`."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from array import array
 from bisect import bisect_right
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -78,6 +78,24 @@ class SignalTrack:
         """The signal `name` at `t_s`; before the first row that row's value, after the last one that one's."""
         return self._interpolate(self._columns[self._column(name)], *self._locate(t_s))
 
+    def nearest_s(self, values: Mapping[str, float]) -> float | None:
+        """The time of the row that is nearest to `values`, a signal's distance counted in parts of its own spread; None where
+        none of them is a signal of this track. Of rows that are equally near the earliest."""
+        distances = array("d", bytes(8 * len(self._times)))
+        known = False
+        for name, wanted in values.items():
+            if name not in self._index or math.isnan(wanted):
+                continue
+            column = self._columns[self._index[name]]
+            there = [value for value in column if not math.isnan(value)]
+            if not there:
+                continue
+            known = True
+            spread = (max(there) - min(there)) or 1.0
+            for row, value in enumerate(column):
+                distances[row] += 1.0 if math.isnan(value) else ((value - wanted) / spread) ** 2
+        return self._times[distances.index(min(distances))] if known else None
+
     def values(self, t_s: float) -> dict[str, float]:
         """All signals at `t_s`, of one and the same instant."""
         place = self._locate(t_s)
@@ -128,6 +146,10 @@ class Signals(Protocol):
         """All signals at a place that `position_s` told; of a simulation, no earlier than it was asked for before."""
         ...
 
+    def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:
+        """Be now as near to `values` as can be, and go on from there; False where that is not possible."""
+        ...
+
     def at(self, now_ns: int, name: str) -> float:
         """One of them now; NaN where there is no value. Raises `FileInvalid` for a name that there is not."""
         ...
@@ -175,6 +197,13 @@ class SignalPlayer(Signals):
     def values(self, now_ns: int) -> dict[str, float]:
         """All signals now, of one instant."""
         return self.track.values(self.position_s(now_ns))
+
+    def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:
+        nearest_s = self.track.nearest_s(values)
+        if nearest_s is None:
+            return False
+        self.start_ns = now_ns - round(nearest_s / self.speed * NS_PER_S)
+        return True
 
     def values_at(self, position_s: float) -> dict[str, float]:
         """All signals at a time of the recording."""

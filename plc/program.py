@@ -16,7 +16,7 @@ program. Nothing here waits.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar
@@ -217,6 +217,14 @@ class Program(ABC):
         for v in self.variables.values():
             if v.retain and v.name in kept:
                 self.__dict__[v.name] = kept[v.name]
+
+    def resume(self, known: Mapping[str, Scalar]) -> None:
+        """Before the first scan: go on from what was known of the outputs and locals, as far as it is known. A program whose
+        state is more than its variables overrides this. Raises `UsageError` for a value that a variable cannot hold."""
+        for v in self.variables.values():
+            if v.role is not Role.INPUT and v.name in known and not isinstance(self.__dict__.get(v.name), Outbox):
+                self.check(v.name, known[v.name])
+                self.put(v.name, known[v.name])
 
     def tag(self, name: str) -> TagValue:
         """Input `name` with quality, reason and time, as this scan sees it (after its substitute policy)."""

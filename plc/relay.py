@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
 from gateway.core.errors import Bug, Desync
 from gateway.core.events import Consumer, Producer
 from gateway.core.image import Message, TagKind
-from gateway.core.statemachine import STATE_CODES, EventStateMachine
-from gateway.core.values import COMMAND, DATA, RESPONSE
+from gateway.core.statemachine import STATE_CODES, EventStateMachine, encode_period
+from gateway.core.values import COMMAND, DATA, RESPONSE, Scalar
 from plc.program import Outbox, Program, ScanInfo, message_input, message_output, var_local, var_output
 from plc.states import ANY, StateTable, Transition
 
@@ -166,6 +166,13 @@ class Relay(Program):
         self._log_sent = 0
         self._log_lost = 0
         self._too_long = 0
+
+    def resume(self, known: Mapping[str, Scalar]) -> None:
+        """The state follows from the period that was commanded last."""
+        period = known.get("period")
+        if isinstance(period, int):
+            self.logic.machine.process_event(encode_period(period))
+        self._show()
 
     def execute(self, scan: ScanInfo) -> None:
         logic = self.logic

@@ -98,6 +98,8 @@ class FieldSide:
         self.listening: dict[str, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
         self.far_units: dict[str, ModbusUnit] = {}
+        self.signals: dict[str, Signals] = {}
+        """What devices play, by their names."""
         self.faults = FieldFaults(system, prototype.seed, clock)
         self._run_dir = run_dir
         self._clock = clock
@@ -234,6 +236,13 @@ class FieldSide:
         for device, node, connection in zip(on_it, nodes, connections, strict=True):
             self._nursery.start(serve_node(connection, node, self._clock), f"node {device.name}")
 
+    async def join(self, bus: str, name: str) -> CanConnection:
+        """An end on an emulated CAN bus for somebody who only listens; closing it is up to them."""
+        for port in self._buses:
+            if port.bound == self.listening.get(bus):
+                return await port.join(name)
+        raise UsageError(f"no emulated CAN bus {bus!r}", expected=", ".join(str(p.bound) for p in self._buses) or "one")
+
     # -- devices --------------------------------------------------------------------------------------------------------
 
     def _modbus_unit(self, config: DeviceConfig) -> EmulatedUnit | RecordedDevice:
@@ -342,6 +351,10 @@ class FieldSide:
 
     def _signals(self, emulated: EmulatedDevice) -> Signals:
         """What the device plays: a simulation, or its recording from now on."""
+        self.signals[emulated.name] = signals = self._made_signals(emulated)
+        return signals
+
+    def _made_signals(self, emulated: EmulatedDevice) -> Signals:
         form = emulated.form
         if form.simulation is not None:
             return self._simulations.signals_of(emulated.name, form, emulated.profile)

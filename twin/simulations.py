@@ -104,10 +104,10 @@ class Simulations:
     def _make(self, name: str, form: SimulationForm, start_ns: int) -> Simulation:
         inputs = tuple(form.inputs)
         if form.python is None:
-            step, names = by_formulas(form.formulas, form.start, inputs, f"{self._form.seed}:{name}")
+            step, start = by_formulas(form.formulas, form.start, inputs, f"{self._form.seed}:{name}")
         else:
-            step, names = by_model(PythonModel(*_python(self._file, form.python), form.start), inputs)
-        return Simulation(step, names, dict.fromkeys(inputs, 0.0), start_ns, round(form.step_ms * NS_PER_MS))
+            step, start = by_model(PythonModel(*_python(self._file, form.python), form.start), inputs)
+        return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS))
 
     def signals_of(self, device: str, form: EmulatedForm, profile: DeviceProfile) -> SimulatedSignals:
         """What `device` plays: what its entry says, else every value of the simulation that has the name of one of its tags."""

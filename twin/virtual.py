@@ -42,7 +42,8 @@ class VirtualPrototype:
     """``async with VirtualPrototype(system, prototype, loop, run_dir) as run`` inside `loop`. `run_dir` takes the audit log and
     what is retained; the exchange log is in memory.
 
-    `seed` replaces the prototype file's. `taps` observe the gateway's wires. After entering, `field`, `gateway` and `plc` run.
+    `seed` replaces the prototype file's. `taps` observe the gateway's wires. `prepare` is called when everything is made and
+    nothing has run yet. After entering, `field`, `gateway` and `plc` run.
     """
 
     def __init__(
@@ -55,6 +56,7 @@ class VirtualPrototype:
         seed: int | None = None,
         taps: Sequence[Tap] = (),
         on_change: Callable[[Change], None] | None = None,
+        prepare: Callable[[VirtualPrototype], None] | None = None,
     ) -> None:
         self.system = system
         self.prototype = prototype if seed is None else replace(prototype, seed=seed)
@@ -71,6 +73,7 @@ class VirtualPrototype:
         self._run_dir = run_dir
         self._taps = taps
         self._on_change = on_change
+        self._prepare = prepare
         self._stack = AsyncExitStack()
 
     async def __aenter__(self) -> VirtualPrototype:
@@ -115,6 +118,8 @@ class VirtualPrototype:
             plc_config(self.system, self._run_dir), for_plc, clock.monotonic_ns, on_change=self._on_change
         )
         self._stack.callback(self.plc.close)
+        if self._prepare is not None:
+            self._prepare(self)
         self._nursery = await self._stack.enter_async_context(Nursery())
         self._stack.push_async_callback(self._stop)
         self._nursery.start(self.field.run(), "field side")

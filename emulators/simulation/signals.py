@@ -34,6 +34,10 @@ class SimulatedSignals(Signals):
     def values_at(self, position_s: float) -> dict[str, float]:
         return self.values(self.start_ns + round(position_s * NS_PER_S))
 
+    def begin_with(self, values: Mapping[str, float], now_ns: int) -> bool:
+        """Only formulas can: a model in Python has its state to itself."""
+        return self._simulation.begin_with({self._plays[s]: value for s, value in values.items() if s in self._plays})
+
     def at(self, now_ns: int, name: str) -> float:
         if name not in self._plays:
             raise FileInvalid(

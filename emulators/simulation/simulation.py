@@ -25,21 +25,23 @@ Step = Callable[[float, float, Mapping[str, float]], Mapping[str, float]]
 class Simulation:
     """Values by name from `start_ns` on, a step every `step_ns`; the first is at `start_ns` itself, with dt 0.
 
-    `inputs` are the names that `put` may set; they are 0 before. Between two steps values stand still.
+    `start`: what the values are before the first step, NaN where only the step knows. `inputs` are the names that `put` may
+    set; they are 0 before. Between two steps values stand still.
     """
 
     def __init__(
-        self, step: Step, names: Sequence[str], inputs: Mapping[str, float], start_ns: int, step_ns: int
+        self, step: Step, start: Mapping[str, float], inputs: Sequence[str], start_ns: int, step_ns: int
     ) -> None:
         if step_ns <= 0:
             raise UsageError("the step of a simulation", expected="more than 0 ns", got=str(step_ns))
-        self.names = tuple(names)
+        self.names = tuple(start)
         self.start_ns = start_ns
         self.skipped = 0
         """Steps that were left out because nobody had looked for so long."""
         self._step = step
+        self._own_state = any(math.isnan(value) for value in start.values())
         self._step_ns = step_ns
-        self._values: dict[str, float] = dict.fromkeys(names, math.nan) | dict(inputs)
+        self._values: dict[str, float] = dict(start) | dict.fromkeys(inputs, 0.0)
         self._inputs = frozenset(inputs)
         self._next_ns = start_ns
         self._t_s = 0.0
@@ -50,6 +52,12 @@ class Simulation:
             raise UsageError(f"no input {name!r}", expected=", ".join(sorted(self._inputs)))
         self._advance(now_ns - 1)
         self._values[name] = value
+
+    def begin_with(self, values: Mapping[str, float]) -> bool:
+        """Other values for the next step to begin with; False where the step has its state to itself."""
+        known = {name: value for name, value in values.items() if name in self.names}
+        self._values.update(known)
+        return bool(known) and not self._own_state
 
     def values(self, now_ns: int) -> Mapping[str, float]:
         """All values now. To be read, not kept: it changes with the next step."""
@@ -72,9 +80,9 @@ class Simulation:
 
 def by_formulas(
     formulas: Mapping[str, str], start: Mapping[str, float], inputs: Sequence[str], seed: str
-) -> tuple[Step, tuple[str, ...]]:
+) -> tuple[Step, dict[str, float]]:
     """A step that evaluates `formulas` in their order: each sees the new values of those before it, and its own and later
-    ones as they were. `start` is what they are before the first step, 0 where not said. Raises `UsageError`, with the name.
+    ones as they were; and what they are before the first step: `start`, 0 where not said. Raises `UsageError`, with the name.
     """
     known = (*formulas, *inputs)
     for name in start:
@@ -85,20 +93,19 @@ def by_formulas(
         if name in (TIME, STEP) or name in inputs:
             raise UsageError(f"{name!r} is no name for a value", expected="one that is not taken")
         made[name] = Formula(text, known, Random(f"{seed}:{name}"))
-    held = {name: float(start.get(name, 0.0)) for name in formulas}
 
     def step(t_s: float, dt_s: float, values: Mapping[str, float]) -> Mapping[str, float]:
-        scope = {**values, **held, TIME: t_s, STEP: dt_s}
+        scope = {**values, TIME: t_s, STEP: dt_s}
         for name, formula in made.items():
-            scope[name] = held[name] = formula(scope)
-        return held
+            scope[name] = formula(scope)
+        return {name: scope[name] for name in made}
 
-    return step, tuple(formulas)
+    return step, {name: float(start.get(name, 0.0)) for name in formulas}
 
 
-def by_model(model: PythonModel, inputs: Sequence[str]) -> tuple[Step, tuple[str, ...]]:
-    """A step of a Python model, and the names of what it computes: those of a step at time 0 of length 0, taken here, with all
-    inputs 0. The step raises `FileInvalid` when other names come: a device that plays one would have no value.
+def by_model(model: PythonModel, inputs: Sequence[str]) -> tuple[Step, dict[str, float]]:
+    """A step of a Python model, and what it computes, as no value: the names of a step at time 0 of length 0, taken here, with
+    all inputs 0. The step raises `FileInvalid` when other names come: a device that plays one would have no value.
     """
     names = tuple(model.step(0.0, 0.0, dict.fromkeys(inputs, 0.0)))
     for name in names:
@@ -116,4 +123,4 @@ def by_model(model: PythonModel, inputs: Sequence[str]) -> tuple[Step, tuple[str
             )
         return out
 
-    return step, names
+    return step, dict.fromkeys(names, math.nan)

@@ -43,6 +43,7 @@ COMMANDS = {
     "compare": ("fieldtwin.cli.compare_command", "Hold a device, or a recording, against a recording."),
     "import": ("fieldtwin.cli.import_command", "Turn foreign files into recordings."),
     "export": ("fieldtwin.cli.export_command", "Turn recordings into CSV, Parquet, candump logs or pcap."),
+    "what-if": ("fieldtwin.cli.what_if_command", "Fork a prototype from what is known, and see what comes of a plan."),
     "test": ("fieldtwin.cli.test_command", "Run scenarios against a prototype, and judge it."),
     "with": ("fieldtwin.cli.with_command", "Run any command against the emulated field; end with its exit status."),
     "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),

@@ -199,7 +199,7 @@ def message(words: list[int], box: Box) -> bytes:
 
 def put_into_inbox(near: DistortedRegisters, box: Box, sequence: int, payload: bytes) -> None:
     """What arrives over the acoustic link, without waiting for it: the cells that the modem itself sets."""
-    cells = near._bank._cells  # type: ignore[attr-defined]
+    cells = near.bank._cells  # type: ignore[attr-defined]
     padded = payload + b"\0" * (len(payload) % 2)
     body = [int.from_bytes(padded[i : i + 2]) for i in range(0, len(padded), 2)]
     cells.poke("holding", box.at.address, sequence, len(payload), *body)

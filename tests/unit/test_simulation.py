@@ -25,8 +25,8 @@ def at(seconds: float) -> int:
 
 
 def simulation(formulas: dict[str, str], inputs: tuple[str, ...] = (), **start: float) -> Simulation:
-    step, names = by_formulas(formulas, start, inputs, "seed")
-    return Simulation(step, names, dict.fromkeys(inputs, 0.0), START, STEP)
+    step, begin = by_formulas(formulas, start, inputs, "seed")
+    return Simulation(step, begin, inputs, START, STEP)
 
 
 def test_a_tank_fills_by_what_flows_in() -> None:
@@ -126,8 +126,8 @@ class Shadow(Tank):
 def model(tmp_path: Path, name: str, start: Mapping[str, float] | None = None, text: str = MODEL) -> Simulation:
     path = tmp_path / "tank.py"
     path.write_text(text)
-    step, names = by_model(PythonModel(path, name, start or {}), ("inflow",))
-    return Simulation(step, names, {"inflow": 0.0}, START, STEP)
+    step, begin = by_model(PythonModel(path, name, start or {}), ("inflow",))
+    return Simulation(step, begin, ("inflow",), START, STEP)
 
 
 def test_a_python_model(tmp_path: Path) -> None:

@@ -34,11 +34,11 @@ def test_the_pond_of_the_page(tmp_path: Path) -> None:
         pond = load(tmp_path / "p.yaml").data["simulations"]["pond"]
         form = SimulationForm.model_validate(pond)
         if form.python is None:
-            step, names = by_formulas(form.formulas, form.start, tuple(form.inputs), "1")
+            step, begin = by_formulas(form.formulas, form.start, tuple(form.inputs), "1")
         else:
             (tmp_path / "pond.py").write_text(snippets("python")[0], encoding="utf-8")
-            step, names = by_model(PythonModel(tmp_path / "pond.py", "Pond", form.start), tuple(form.inputs))
-        made = Simulation(step, names, dict.fromkeys(form.inputs, 0.0), 0, round(form.step_ms * 1e6))
+            step, begin = by_model(PythonModel(tmp_path / "pond.py", "Pond", form.start), tuple(form.inputs))
+        made = Simulation(step, begin, tuple(form.inputs), 0, round(form.step_ms * 1e6))
         made.put("pump", 100.0, 0)
         values = made.values(10 * NS_PER_S)
         assert values["depth_mm"] == pytest.approx(1000 * values["level"])

@@ -1,0 +1,136 @@
+"""``fieldtwin what-if``: what would come of a command, a fault, or a whole plan."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.talk import data, talk
+from fieldtwin.cli.what_if_view import show
+from fieldtwin.whatif.state import KnownState
+from gateway.core.errors import FileInvalid, UsageError
+
+
+@click.command("what-if")
+@click.argument("system", required=False)
+@click.option("--from", "source", default="", help="What is known: a state file, a knowledge store, or instance:NAME.")
+@click.option("--origin", default="", help="Whose knowledge, where a store has that of several.")
+@click.option(
+    "--command", "commands", multiple=True, help="A period that the far side commands: PERIOD_S or PERIOD_S@TIME."
+)
+@click.option("--faults", "fault_file", type=click.Path(path_type=Path), help="Faults, as `run --faults` takes them.")
+@click.option("--require", multiple=True, help="An expression that must hold all the time.")
+@click.option("--finally", "finally_", multiple=True, help="An expression that must hold at the end.")
+@click.option("--plans", "plan_file", type=click.Path(path_type=Path), help="Several plans, in a file.")
+@click.option("--horizon", "horizon_s", type=Duration(), default="1h", show_default=True, help="How far ahead.")
+@click.option(
+    "--settle", "settle_s", type=Duration(), default="5s", show_default=True, help="From when on requirements count."
+)
+@click.option("--jobs", type=click.IntRange(1, 64), default=2, show_default=True, help="Processes at once.")
+@click.option("--seed", type=int, help="Instead of the prototype file's.")
+@click.option("--prototype-file", type=click.Path(path_type=Path), help="Instead of the one beside the system file.")
+@click.option("--save-state", type=click.Path(path_type=Path), help="Write what is known to a file, and end.")
+@profiles_option
+@json_option
+def command(
+    system: str | None,
+    source: str,
+    origin: str,
+    commands: tuple[str, ...],
+    fault_file: Path | None,
+    require: tuple[str, ...],
+    finally_: tuple[str, ...],
+    plan_file: Path | None,
+    horizon_s: float,
+    settle_s: float,
+    jobs: int,
+    seed: int | None,
+    prototype_file: Path | None,
+    save_state: Path | None,
+    profiles: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    """Fork the prototype of SYSTEM in virtual time from what is known, and see what comes of a plan.
+
+    The plant is not touched. Exit status: 0 when a plan meets all that is required, 1 when none does.
+    """
+    from fieldtwin.whatif.fork import Fork
+    from fieldtwin.whatif.many import answers
+    from fieldtwin.whatif.plan import Plan, load_plans
+    from fieldtwin.whatif.plan import command as parsed
+    from twin.system import load_system
+
+    plans: list[Plan] = []
+    if plan_file is not None:
+        named, plans = load_plans(plan_file)
+        beside = plan_file.parent / named
+        system = system or (str(beside) if beside.exists() else named)
+    if system is None:
+        raise UsageError("which system?", expected="SYSTEM, or --plans FILE which names it")
+    folders = tuple(Path(p) for p in profiles)
+    loaded = load_system(system, folders)
+    state = _state(source, origin, system, folders)
+    if save_state is not None:
+        try:
+            save_state.write_text(state.dump(loaded), encoding="utf-8")
+        except OSError as e:
+            raise FileInvalid(f"cannot be written: {e.strerror or e}", path=str(save_state)) from e
+        talk.print(f"{len(state.values)} values, {len(state.programs)} programs → {save_state}")
+        return 0
+    if commands or require or finally_ or fault_file or not plans:
+        faults = _faults(fault_file, loaded)
+        plans.append(Plan("as said", tuple(parsed(c) for c in commands), faults, require, finally_))
+    fork = Fork(system, state, horizon_s, folders, prototype_file, seed, settle_s)
+    talk.print(f"{loaded.name}: {len(plans)} plan{'s'[: len(plans) != 1]}, {horizon_s:g} s ahead, from {state.source}")
+    outcomes = answers(
+        fork, plans, jobs, lambda o: talk.print(f"  {o.plan}: {'met' if o.met else 'not met'}, {o.took_s:.1f} s")
+    )
+    if as_json:
+        found: dict[str, Any] = {
+            "fieldtwin_what_if": 1,
+            "system": loaded.name,
+            "from": state.source,
+            "utc_ms": state.utc_ms,
+        }
+        click.echo(json.dumps(found | {"outcomes": [o.described() for o in outcomes]}, indent=1))
+    else:
+        show(data, outcomes)
+    return 0 if any(o.met for o in outcomes) else 1
+
+
+def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> KnownState:
+    from fieldtwin.whatif.state import known_state, of_instance, read_state
+    from twin.system import load_system
+
+    loaded = load_system(system, folders)
+    if not source:
+        return KnownState()
+    if source.startswith("instance:"):
+        from twin.instance import runtime_root
+
+        return asyncio.run(of_instance(runtime_root() / source.removeprefix("instance:")))
+    if source.startswith(("postgresql:", "postgres:")) or _is_sqlite(Path(source)):
+        return asyncio.run(known_state(source, loaded, origin))
+    return read_state(Path(source), loaded)
+
+
+def _is_sqlite(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(16) == b"SQLite format 3\0"
+    except OSError:
+        return False
+
+
+def _faults(path: Path | None, system: Any) -> tuple[dict[str, Any], ...]:
+    if path is None:
+        return ()
+    from emulators.faults.schema import load_faults
+    from twin.fault_aims import target
+
+    return load_faults(path, lambda spec: target(system, spec))

@@ -1,0 +1,63 @@
+"""Begins a fork with what is known: programs go on from their variables, devices from their values."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+from emulators.distorted_registers import DistortedRegisters
+from emulators.models.register_device import StatedRegisters
+from fieldtwin.whatif.state import KnownState, Number
+from gateway.core.errors import FileInvalid, UsageError
+from twin.virtual import VirtualPrototype
+
+
+def retain_for(state: KnownState, run_dir: Path) -> None:
+    """Let the fork's PLC find what the other one retained."""
+    if state.retained is not None:
+        shutil.copyfile(state.retained, run_dir / "retain")
+
+
+def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
+    """For `VirtualPrototype(prepare=...)`. Returns the devices of which values are known that could not be taken over.
+
+    A recording is sought through for its nearest row, a simulation by formulas goes on from the values, registers hold them.
+    A device that has its state to itself (a drive's motor, a model in Python) begins as it always does. What the
+    programs command is written by the gateway anew. Raises `FileInvalid` for a variable that cannot hold its value.
+    """
+    for bound in run.plc.programs:
+        known = state.programs.get(bound.name)
+        if known:
+            try:
+                bound.program.resume(known)
+            except UsageError as e:
+                raise FileInvalid(
+                    f"{bound.name}: {e.message}", path=state.source, expected=e.expected, got=e.got
+                ) from e
+    by_device: dict[str, dict[str, Number]] = {}
+    for name, value in state.values.items():
+        device, _, tag = name.partition(".")
+        by_device.setdefault(device, {})[tag] = value
+    return [device for device, values in by_device.items() if not _begin_device(run, device, values)]
+
+
+def _begin_device(run: VirtualPrototype, name: str, values: Mapping[str, Number]) -> bool:
+    now_ns = run.clock.monotonic_ns()
+    device = run.field.devices.get(name)
+    if device is None:
+        return False
+    taken = False
+    bank = device.unit.bank if device.unit is not None and hasattr(device.unit, "bank") else None
+    if isinstance(bank, DistortedRegisters):
+        bank = bank.bank
+    if isinstance(bank, StatedRegisters):
+        tags = device.emulated.profile.tags
+        sets = [(tags[tag], float(v)) for tag, v in values.items() if not tags[tag].is_text and not isinstance(v, str)]
+        bank.set(sets, now_ns)
+        taken = bool(sets)
+    signals = run.field.signals.get(name)
+    if signals is not None:
+        numbers = {tag: float(v) for tag, v in values.items() if not isinstance(v, str)}
+        taken = signals.begin_with(numbers, now_ns) or taken
+    return taken

@@ -1,0 +1,207 @@
+"""One fork: a prototype in virtual time that begins with what is known, does what a plan says, and is watched to the horizon.
+
+The gateway, the PLC and the emulators are those of every prototype run, unmodified; only what happens is summed up instead of
+traced. Sealed off like every run in virtual time.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from contextlib import AsyncExitStack, ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.seal import sealed
+from fieldtwin.running.shore import Shore
+from fieldtwin.running.states import state_words
+from fieldtwin.scenarios.expression import Expression
+from fieldtwin.whatif.begin import begin, retain_for
+from fieldtwin.whatif.outcome import Outcome, Requirement
+from fieldtwin.whatif.plan import Plan
+from fieldtwin.whatif.state import KnownState
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import FieldtwinError, UsageError
+from gateway.core.nursery import Nursery
+from gateway.core.values import Quality, Reason
+from gateway.wallclock import WallClock
+from plc.publishing import Change
+from twin.field_process import FieldConfig, resolve
+from twin.virtual import VirtualPrototype
+
+LOOK_S = 1.0
+"""How often the requirements are looked at, besides each change of a program's variables."""
+MAX_TRANSITIONS = 10_000
+MAX_HORIZON_S = 30 * 86_400.0
+
+
+@dataclass(frozen=True)
+class Fork:
+    """What is forked: `system` by name or path, from `state`, for `horizon_s` seconds. Requirements count from `settle_s` on:
+    before, the gateway has not read everything yet."""
+
+    system: str
+    state: KnownState
+    horizon_s: float
+    profiles: tuple[Path, ...] = ()
+    prototype_file: Path | None = None
+    seed: int | None = None
+    settle_s: float = 5.0
+
+
+def answer(fork: Fork, plan: Plan) -> Outcome:
+    """Run `plan` in a fork. What fails in it is in the outcome's `error`; raises `FileInvalid` or `UsageError` for what cannot be
+    begun at all."""
+    if not 0 < fork.horizon_s <= MAX_HORIZON_S:
+        raise UsageError("the horizon", expected="over 0 s to 30 days", got=f"{fork.horizon_s:g} s")
+    run = _ForkRun(fork, plan)
+    clock = WallClock()
+    began_ns = clock.monotonic_ns()
+    run.run()
+    run.outcome.took_s = (clock.monotonic_ns() - began_ns) / NS_PER_S
+    return run.outcome
+
+
+class _ForkRun:
+    def __init__(self, fork: Fork, plan: Plan) -> None:
+        config = FieldConfig(
+            system=fork.system,
+            run_dir="",
+            prototype=str(fork.prototype_file) if fork.prototype_file else "",
+            profiles=tuple(map(str, fork.profiles)),
+        )
+        twin = resolve(config)
+        self.fork, self.plan = fork, plan
+        self.system, self.prototype = twin.ecs.system, twin.prototype
+        self.outcome = Outcome(plan.name, fork.horizon_s)
+        self._words = {
+            f"{p}.state": words for p, words in state_words(twin.ecs.layout, self.system.plc.programs).items()
+        }
+        self._known = [f"{d}.{t}" for d, c in self.system.devices.items() for t in c.profile.tags]
+        self._variables = [t.name for region in twin.ecs.layout.regions for t in region.tags]
+        self._requirements = [self._requirement("require", text) for text in plan.require]
+        self._at_the_end = [self._requirement("finally", text) for text in plan.finally_]
+        self._run: VirtualPrototype | None = None
+
+    def _requirement(self, kind: str, text: str) -> tuple[Requirement, Expression]:
+        expression = Expression(text, [*self._known, *self._variables])
+        made = Requirement(kind, text)
+        self.outcome.requirements.append(made)
+        return made, expression
+
+    def run(self) -> None:
+        loop = VirtualLoop()
+        with ExitStack() as stack:
+            run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-what-if-")))
+            stack.callback(loop.close)
+            retain_for(self.fork.state, run_dir)
+            with sealed():
+                try:
+                    loop.run_until_complete(self._main(loop, run_dir))
+                except FieldtwinError as e:
+                    self.outcome.error = str(e)
+            for context in loop.unhandled[:1]:
+                told = f"{context.get('message')} {context.get('exception') or ''}".strip()
+                self.outcome.error = self.outcome.error or f"nobody caught: {told}"
+
+    async def _main(self, loop: VirtualLoop, run_dir: Path) -> None:
+        run = self._run = VirtualPrototype(
+            self.system,
+            self.prototype,
+            loop,
+            run_dir,
+            seed=self.fork.seed,
+            on_change=self._changed,
+            prepare=lambda made: self.outcome.not_taken.extend(begin(made, self.fork.state)),
+        )
+        async with AsyncExitStack() as stack:
+            await stack.enter_async_context(run)
+            run.gateway.tags.on_put = self.outcome.saw_tag
+            if self.plan.commands:
+                nursery = await stack.enter_async_context(Nursery())
+                nursery.start(self._shore().run(list(self.plan.commands)), "far end")
+            for fault in self.plan.faults:
+                run.field.faults.inject(fault)
+            await self._watch(run, loop)
+            for requirement, expression in self._at_the_end:
+                self._judge(requirement, expression)
+
+    def _shore(self) -> Shore:
+        assert self._run is not None
+        device = next(iter(self._run.field.far), None)
+        if device is None:
+            raise UsageError("nobody can command this system", expected="a transmitter with a far end")
+        return Shore(self.system, device, self._run.field.far[device], self._run.clock, self._run.net)
+
+    async def _watch(self, run: VirtualPrototype, loop: VirtualLoop) -> None:
+        end_ns = run.started_ns + round(self.fork.horizon_s * NS_PER_S)
+        settled_ns = run.started_ns + round(min(self.fork.settle_s, self.fork.horizon_s) * NS_PER_S)
+        while loop.now_ns < end_ns:
+            await run.clock.sleep_until_ns(min(loop.now_ns + round(LOOK_S * NS_PER_S), end_ns))
+            failure = run.failure()
+            if failure is not None:
+                raise failure
+            if loop.now_ns >= settled_ns:
+                for requirement, expression in self._requirements:
+                    self._judge(requirement, expression)
+
+    # -- what is seen ---------------------------------------------------------------------------------------------------
+
+    def _now_s(self) -> float:
+        assert self._run is not None
+        return (self._run.loop.now_ns - self._run.started_ns) / NS_PER_S
+
+    def _changed(self, change: Change) -> None:
+        value = self._named(change.tag, change.after)
+        self.outcome.saw_variable(change.tag, value)
+        if change.tag in self._words and self._run is not None:
+            seen = self.outcome.states.setdefault(change.tag.removesuffix(".state"), [])
+            if len(seen) < MAX_TRANSITIONS:
+                seen.append((self._now_s(), str(value)))
+
+    def _named(self, tag: str, value: Any) -> Any:
+        return self._words[tag].get(value, value) if tag in self._words else value
+
+    def _judge(self, requirement: Requirement, expression: Expression) -> None:
+        if requirement.broken_s is None and not expression.evaluate(self._look):
+            requirement.broken_s = self._now_s()
+            requirement.seen = "; ".join(
+                f"{name}: {self._look('value', name)!r}" for name in dict.fromkeys(expression.names)
+            )
+
+    def _look(self, function: str, name: str) -> Any:
+        run = self._run
+        assert run is not None
+        if name == "plc.late":
+            return 0.0
+        if name == "command_pending":
+            return False
+        tags = run.gateway.tags
+        if name not in tags.names:
+            outputs = run.plc.outputs.last()
+            known = {
+                "value": self._named(name, outputs.get(name)),
+                "quality": "good",
+                "age": 0.0,
+                "reason": "",
+                "updates": 0,
+            }
+            return known[function]
+        now_ns = run.clock.monotonic_ns()
+        seen = tags.current(name, now_ns)
+        match function:
+            case "quality":
+                return Quality(seen.quality).name.lower()
+            case "reason":
+                return Reason(seen.reason).name.lower()
+            case "age":
+                return (now_ns - seen.t_ns) / NS_PER_S
+            case "updates":
+                return self.outcome.variables[name].updates if name in self.outcome.variables else 0
+        return seen.value
+
+
+Progress = Callable[[Outcome], None]
+"""Told of each outcome as it comes."""

@@ -1,0 +1,28 @@
+"""Many plans at once, in processes of this computer."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+
+from fieldtwin.whatif.fork import Fork, Progress, answer
+from fieldtwin.whatif.outcome import Outcome
+from fieldtwin.whatif.plan import Plan
+
+
+def answers(fork: Fork, plans: Sequence[Plan], jobs: int, progress: Progress = lambda outcome: None) -> list[Outcome]:
+    """The outcome of each plan, in their order. One job or one plan: in this process. Raises as `answer`."""
+    if jobs <= 1 or len(plans) == 1:
+        found = []
+        for plan in plans:
+            found.append(answer(fork, plan))
+            progress(found[-1])
+        return found
+    with ProcessPoolExecutor(min(jobs, len(plans)), multiprocessing.get_context("spawn")) as pool:
+        waiting: dict[Future[Outcome], int] = {pool.submit(answer, fork, plan): n for n, plan in enumerate(plans)}
+        outcomes: dict[int, Outcome] = {}
+        for done in as_completed(waiting):
+            outcomes[waiting[done]] = done.result()
+            progress(done.result())
+    return [outcomes[n] for n in range(len(plans))]

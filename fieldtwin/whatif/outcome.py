@@ -1,0 +1,118 @@
+"""What came of a plan: each variable over the horizon, and each requirement with the instant at which it first did not hold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from gateway.core.values import Quality, TagValue
+
+
+@dataclass(slots=True)
+class VariableOutcome:
+    """A tag or a program's variable: how often it was new, and its values that were good."""
+
+    updates: int = 0
+    good: int = 0
+    lowest: float = math.inf
+    highest: float = -math.inf
+    total: float = 0.0
+    first: Any = None
+    last: Any = None
+    numbers: int = 0
+
+    def saw(self, value: Any, good: bool) -> None:
+        self.updates += 1
+        if not good or value is None:
+            return
+        self.good += 1
+        if self.first is None:
+            self.first = value
+        self.last = value
+        if isinstance(value, int | float) and not math.isnan(value):
+            self.numbers += 1
+            self.total += value
+            self.lowest, self.highest = min(self.lowest, value), max(self.highest, value)
+
+    def described(self) -> dict[str, Any]:
+        shown: dict[str, Any] = {
+            "updates": self.updates,
+            "good": self.good,
+            "first": _shown(self.first),
+            "last": _shown(self.last),
+        }
+        if self.numbers:
+            shown |= {"min": self.lowest, "max": self.highest, "mean": self.total / self.numbers}
+        return shown
+
+
+@dataclass(slots=True)
+class Requirement:
+    """`kind`: ``require`` or ``finally``. `broken_s`: when it first did not hold, None while it does; `seen`: what was then."""
+
+    kind: str
+    text: str
+    broken_s: float | None = None
+    seen: str = ""
+
+    def described(self) -> dict[str, Any]:
+        return {
+            "kind": self.kind,
+            "text": self.text,
+            "met": self.broken_s is None,
+            "at_s": self.broken_s,
+            "seen": self.seen,
+        }
+
+
+@dataclass
+class Outcome:
+    """Of one plan. `error`: why there is none. `not_taken`: devices that could not begin with what was known of them."""
+
+    plan: str
+    horizon_s: float = 0.0
+    variables: dict[str, VariableOutcome] = field(default_factory=dict)
+    requirements: list[Requirement] = field(default_factory=list)
+    not_taken: list[str] = field(default_factory=list)
+    states: dict[str, list[tuple[float, str]]] = field(default_factory=dict)
+    error: str = ""
+    took_s: float = 0.0
+
+    @property
+    def met(self) -> bool:
+        return not self.error and all(r.broken_s is None for r in self.requirements)
+
+    def saw_tag(self, name: str, value: TagValue) -> None:
+        """A tag was published."""
+        self._of(name).saw(value.value, value.quality is not Quality.BAD)
+
+    def saw_variable(self, name: str, value: Any) -> None:
+        """A program changed a variable."""
+        self._of(name).saw(value, True)
+
+    def _of(self, name: str) -> VariableOutcome:
+        found = self.variables.get(name)
+        if found is None:
+            found = self.variables[name] = VariableOutcome()
+        return found
+
+    def described(self) -> dict[str, Any]:
+        """As JSON-able data; of the same fork always the same, but for `took_s`."""
+        return {
+            "plan": self.plan,
+            "met": self.met,
+            "error": self.error,
+            "horizon_s": self.horizon_s,
+            "requirements": [r.described() for r in self.requirements],
+            "states": {p: [[round(t, 3), s] for t, s in seen] for p, seen in self.states.items()},
+            "variables": {name: v.described() for name, v in sorted(self.variables.items())},
+            "not_taken": self.not_taken,
+            "took_s": round(self.took_s, 3),
+        }
+
+
+def _shown(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.hex()
+    return None if isinstance(value, float) and math.isnan(value) else value

@@ -1,0 +1,94 @@
+"""Plans: what is done in a fork, and what must hold meanwhile. One by the command line, or several in a file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from emulators.faults.schema import seconds
+from fieldtwin.running.shore import Scripted
+from gateway.core.errors import FieldtwinError, UsageError
+from gateway.core.statemachine import encode_period
+from gateway.core.yaml_file import YamlFile, load, validate
+
+MAX_PLANS = 1000
+Text = Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CommandForm(_Strict):
+    """A period that the far side commands, and when: ``{at: 10s, period_s: 60}``."""
+
+    at: str = "0s"
+    period_s: int
+
+
+class PlanForm(_Strict):
+    name: Text
+    commands: list[CommandForm] = []
+    faults: list[dict[str, Any]] = []
+    require: list[Text] = []
+    finally_: list[Text] = Field(default=[], alias="finally")
+
+
+class PlansForm(_Strict):
+    """Several plans for one system. `require` and `finally` at the top are every plan's."""
+
+    what_if: Text
+    require: list[Text] = []
+    finally_: list[Text] = Field(default=[], alias="finally")
+    plans: Annotated[list[PlanForm], Field(min_length=1, max_length=MAX_PLANS)]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """`require`: expressions that hold all the time; `finally_`: at the end. `faults` as in a fault file."""
+
+    name: str
+    commands: tuple[Scripted, ...] = ()
+    faults: tuple[dict[str, Any], ...] = ()
+    require: tuple[str, ...] = ()
+    finally_: tuple[str, ...] = ()
+
+
+def command(text: str) -> Scripted:
+    """``60``, or ``60@10min``: the period, and when it is sent. Raises `UsageError`."""
+    period, _, at = text.partition("@")
+    try:
+        encode_period(int(period))
+        return Scripted(seconds(at) if at else 0.0, int(period))
+    except (ValueError, FieldtwinError) as e:
+        raise UsageError("a command", expected="PERIOD_S or PERIOD_S@TIME, such as 60@10min", got=repr(text)) from e
+
+
+def load_plans(path: Path) -> tuple[str, list[Plan]]:
+    """The system that a file of plans is for, and the plans. Raises `FileInvalid`."""
+    file = load(path)
+    form = validate(file, PlansForm)
+    names = [plan.name for plan in form.plans]
+    for n, plan in enumerate(form.plans):
+        if plan.name in names[:n]:
+            raise file.error(("plans", n, "name"), "two plans of one name", expected="another", got=plan.name)
+    return form.what_if, [_plan(file, form, n, plan) for n, plan in enumerate(form.plans)]
+
+
+def _plan(file: YamlFile, form: PlansForm, number: int, plan: PlanForm) -> Plan:
+    commands = []
+    for n, each in enumerate(plan.commands):
+        try:
+            commands.append(command(f"{each.period_s}@{each.at}"))
+        except UsageError as e:
+            raise file.error(("plans", number, "commands", n), e.message, expected=e.expected, got=e.got) from e
+    return Plan(
+        plan.name,
+        tuple(commands),
+        tuple(plan.faults),
+        (*form.require, *plan.require),
+        (*form.finally_, *plan.finally_),
+    )

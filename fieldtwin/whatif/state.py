@@ -1,0 +1,158 @@
+"""What is known of a system at one instant: the values of its devices, and the variables of its programs.
+
+Read from a file, from a knowledge store (SQLite file or PostgreSQL), or from an instance that runs. What was not good is not
+known. It must never know how a fork is begun with it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gateway.core.control import ControlClient
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.statemachine import STATES, encode_period
+from gateway.core.values import Quality
+from gateway.store.event import Kind
+from gateway.store.knowledge import open_knowledge
+from twin.model import DigitalModel
+from twin.system import System
+
+VERSION = 1
+MAX_BYTES = 16 << 20
+Number = float | int | str | bool
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    fieldtwin_state: int
+    system: str
+    utc_ms: int = 0
+    values: dict[str, Number] = {}
+    programs: dict[str, dict[str, Number]] = {}
+
+
+@dataclass(frozen=True)
+class KnownState:
+    """`values`: DEVICE.TAG -> value in engineering units; `programs`: program -> variable -> value. `utc_ms` 0: no time known.
+
+    `retained` is a file of retained variables as a PLC keeps it, where there is one.
+    """
+
+    values: Mapping[str, Number] = field(default_factory=dict)
+    programs: Mapping[str, Mapping[str, Number]] = field(default_factory=dict)
+    utc_ms: int = 0
+    source: str = "the beginning: nothing is known"
+    retained: Path | None = None
+
+    def dump(self, system: System) -> str:
+        """As a file that `read_state` takes."""
+        values = {k: v for k, v in self.values.items() if not (isinstance(v, float) and math.isnan(v))}
+        form = _File(VERSION, system.name, self.utc_ms, values, {p: dict(v) for p, v in self.programs.items()})
+        return json.dumps(msgspec.to_builtins(form), indent=1) + "\n"
+
+
+def read_state(path: Path, system: System) -> KnownState:
+    """A state file. Raises `FileInvalid`; names that the system does not have are refused."""
+    try:
+        data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
+    except OSError as e:
+        raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
+    if not data:
+        raise FileInvalid("no state of a system", path=str(path), expected=f"JSON of at most {MAX_BYTES >> 20} MiB")
+    try:
+        form = msgspec.json.decode(data, type=_File)
+    except msgspec.MsgspecError as e:
+        raise FileInvalid(
+            "no state of a system", path=str(path), expected="as --save-state writes it", got=str(e)
+        ) from e
+    if form.fieldtwin_state != VERSION:
+        raise FileInvalid(
+            "a state of another version", path=str(path), expected=str(VERSION), got=str(form.fieldtwin_state)
+        )
+    if form.system != system.name:
+        raise FileInvalid("another system's state", path=str(path), expected=system.name, got=form.system)
+    for name in form.values:
+        device, _, tag = name.partition(".")
+        if device not in system.devices or tag not in system.devices[device].profile.tags:
+            raise FileInvalid(f"the system has no tag {name!r}", path=str(path), expected="DEVICE.TAG")
+    for program in form.programs:
+        if program not in system.plc.programs:
+            expected = ", ".join(system.plc.programs)
+            raise FileInvalid(f"the system has no program {program!r}", path=str(path), expected=expected)
+    return KnownState(form.values, form.programs, form.utc_ms, str(path))
+
+
+async def known_state(place: str, system: System, origin: str = "") -> KnownState:
+    """The last that a knowledge store knows of an origin; without a name, of its only one. Raises `FileInvalid` or
+    `UsageError`. Nothing older is used where the last value of a tag was bad.
+    """
+    store = await open_knowledge(place)
+    try:
+        origins = list(await store.origins())
+        if not origin and len(origins) != 1:
+            raise UsageError(
+                "which origin of the knowledge?", expected=", ".join(origins) or "one with events", got="none"
+            )
+        name = origin or origins[0]
+        if name not in origins:
+            raise UsageError(f"nothing is known of {name!r}", expected=", ".join(origins) or "an origin with events")
+        values: dict[str, Number] = {}
+        programs: dict[str, Mapping[str, Number]] = {}
+        latest_ms = 0
+        async for events in store.replay(name, 0, 1 << 62):
+            for event in events:
+                if event.kind == Kind.VALUE:
+                    latest_ms = max(latest_ms, event.t_ms)
+                    if event.quality >= Quality.BAD or event.value is None or isinstance(event.value, bytes):
+                        values.pop(event.name, None)
+                    else:
+                        values[event.name] = event.value
+                elif event.kind == Kind.STATE and isinstance(event.value, int):
+                    latest_ms = max(latest_ms, event.t_ms)
+                    programs[event.name.partition(".")[0]] = of_period(event.value)
+        known = {n: v for n, v in values.items() if n.partition(".")[0] in system.devices}
+        return KnownState(
+            known, {p: v for p, v in programs.items() if p in system.plc.programs}, latest_ms, f"{place}: {name}"
+        )
+    finally:
+        await store.aclose()
+
+
+def of_period(period_s: int) -> dict[str, Number]:
+    """The variables of a program with the reference state machine, after a command of `period_s`."""
+    model = DigitalModel()
+    state = model.process_event(encode_period(period_s))
+    return {"period": period_s, "period_s": period_s, "state": list(STATES).index(state.name)}
+
+
+async def of_instance(run_dir: Path) -> KnownState:
+    """What an instance knows that runs now, by its control channels. Raises `Unreachable`."""
+    gateway, plc = await _asked(run_dir / "gateway.sock"), await _asked(run_dir / "plc.sock")
+    values = {
+        name: tag["value"]
+        for name, tag in gateway["tags"].items()
+        if tag["quality"] == "good" and isinstance(tag["value"], int | float | str)
+    }
+    programs: dict[str, dict[str, Number]] = {}
+    for name, value in plc["variables"].items():
+        program, _, variable = name.partition(".")
+        if isinstance(value, int | float | str):
+            programs.setdefault(program, {})[variable] = value
+    retained = run_dir / "retain"
+    return KnownState(values, programs, 0, f"instance {run_dir.name}", retained if retained.is_file() else None)
+
+
+async def _asked(socket: Path) -> dict[str, Any]:
+    client = await ControlClient.connect_unix(socket)
+    try:
+        found = await client.call("get")
+    finally:
+        await client.aclose()
+    assert isinstance(found, dict)
+    return found

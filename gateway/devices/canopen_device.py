@@ -277,13 +277,18 @@ class CanopenDriver(DeviceDriver):
         self.emitter.emit(MEASUREMENT(data))
 
     def on_event(self, event: NodeEvent) -> None:
-        """The node's state changed, or its heartbeat was lost: its values follow at once."""
+        """The node's state changed, or its heartbeat was lost: its values follow at once.
+
+        One that restarted, or may have, can have lost its mappings: until it is brought up again its process data mean nothing.
+        """
         if event.kind == "boot-up":
             self._rpdos, self._started = {}, False
         if event.kind == "heartbeat-lost":
             self.sink.put_bad(self.tag_names, Reason.HEARTBEAT_LOST)
         elif event.kind == "boot-up" or (event.kind == "state" and event.state is not NmtState.OPERATIONAL):
             self.sink.put_bad(self.pdo_tags, Reason.NOT_OPERATIONAL)
+        if event.kind in ("boot-up", "heartbeat-lost"):
+            self._listen([])
 
     # -- what the node is sent -----------------------------------------------------------------------------------------
 

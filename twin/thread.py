@@ -77,7 +77,7 @@ class PTDigitalThreadProcess(DigitalThreadProcess):
         self.share(Kind.VALUE, name, value)
 
     def respond(self, program: str, response: RESPONSE) -> None:
-        """The control logic sent this to its transmitter. A STATUS is known by its period."""
+        """The control logic sent this to its transmitter: a STATUS, or a measurement whose payload stays as it is."""
         self.share(Kind.STATE if isinstance(response, STATUS) else Kind.PAYLOAD, program, response)
 
 

@@ -30,7 +30,7 @@ class Kind(IntEnum):
     REFUSAL = 2
     """`value` says why a command or plan was refused; `name` by whom."""
     STATE = 3
-    """`value` is the period in seconds that a state machine holds, by which its state is known; `name` whose it is."""
+    """`value` is a STATUS, state and period (bytes, `twin.status`); `name` is whose state machine it is."""
     VERDICT = 4
     """`value` is what an analysis found; `name` of what."""
     PAYLOAD = 5

@@ -13,7 +13,7 @@ from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.run import Plan, Transcript, play
 from fieldtwin.commissioning.live import frames_at
 from gateway.core.canframe import CanFrame
-from gateway.core.clock import Clock
+from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Connector, Direction, Tap
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import Unreachable
@@ -67,6 +67,7 @@ async def check_canopen(
     """The whole check. Raises `Unreachable` where the node does not answer."""
     dictionary = load_dictionary(options.eds, options.node) if options.eds is not None else None
     clock = options.clock or WallClock()
+    began_ns = clock.monotonic_ns()
     transcript = _OfTheNode(clock, options.node)
     taps = (transcript, *options.taps)
     async with frames_at(
@@ -80,7 +81,7 @@ async def check_canopen(
         say(f"1000h is {wire.device_type.hex(' ').upper()}")
         before = transcript.spoken
         results = await play(wire, CASES, options.plan, transcript, clock, tell, options.go_on)
-    return Checked(identity, results, before)
+    return Checked(identity, results, before, (clock.monotonic_ns() - began_ns) / NS_PER_S)
 
 
 async def learn(wire: CanopenWire) -> dict[str, str]:

@@ -9,11 +9,12 @@ from fieldtwin.checking.device_case import DeviceResult, Spoken
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """What the device says of itself, name to text, the results, and what was said before the first case."""
+    """What the device says of itself, name to text, the results, what was said before the first, and how long all took."""
 
     identity: dict[str, str]
     results: list[DeviceResult]
     before: tuple[Spoken, ...] = ()
+    took_s: float = 0.0
 
 
 def shown(raw: bytes) -> str:

@@ -13,7 +13,7 @@ from fieldtwin.checking.modbus_learn import learn
 from fieldtwin.checking.modbus_wire import ModbusWire
 from fieldtwin.checking.run import Plan, Transcript, play
 from fieldtwin.commissioning.live import bytes_at
-from gateway.core.clock import Clock
+from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, Connector, Tap
 from gateway.core.endpoint import Endpoint
 from gateway.protocols.modbus.framings import framing_of
@@ -67,6 +67,7 @@ async def check_modbus(
     """The whole check. Raises `Unreachable` where nobody answers."""
     endpoint = Endpoint.parse(options.endpoint)
     clock = options.clock or WallClock()
+    began_ns = clock.monotonic_ns()
     transcript = Transcript(clock)
     async with AsyncExitStack() as opened:
 
@@ -87,7 +88,7 @@ async def check_modbus(
         before = transcript.spoken
         results = await play(wire, CASES, options.plan, transcript, clock, tell, options.go_on)
         await wire.aclose()
-    return Checked(identity, results, before)
+    return Checked(identity, results, before, (clock.monotonic_ns() - began_ns) / NS_PER_S)
 
 
 async def read_identity(wire: ModbusWire) -> dict[str, str]:

@@ -25,9 +25,16 @@ if TYPE_CHECKING:
     from fieldtwin.checking.subject import Subject
 
 DANGERS = ("observe", "read", "write", "disrupt")
+_WRITES = "writes, wrong ones too; what is given by --write gets back what was there"
 MEANS = {
-    "write": "writes to the cells given by --write, wrong writes too, and puts back what was there",
-    "disrupt": "unknown functions, long frames, listen-only, counters, NMT: the device or its neighbours may stop answering",
+    "modbus": {
+        "write": _WRITES,
+        "disrupt": "unknown functions, long frames, FC 08, many connections: the device or others may stop answering",
+    },
+    "canopen": {
+        "write": _WRITES,
+        "disrupt": "NMT, guarding, LSS, unknown commands: the node is stopped and restarted",
+    },
 }
 FILE = click.Path(dir_okay=False, path_type=Path)
 _CELL = re.compile(r"^(holding|coil|input|discrete):(\d{1,5})(?:\+(\d{1,3}))?$")
@@ -96,7 +103,7 @@ class Check:
         risky = [c for c in played if c.danger.rank > Danger.READ.rank]
         if not risky or self.options["yes"]:
             return
-        for danger, means in MEANS.items():
+        for danger, means in MEANS[self.protocol].items():
             ids = [c.id for c in risky if c.danger.value == danger]
             if ids:
                 talk.print(f"{len(ids)} cases of danger {danger}: {means}.\n  {', '.join(ids)}", markup=False)
@@ -146,6 +153,16 @@ class Check:
             plan.at_most.value, wrote, timeout_s,
         )  # fmt: skip
 
+    def estimate(self, on_paper: Checked) -> None:
+        """Say how many cases there are and how long they take with a device that answers at once."""
+        from fieldtwin.cli.talk import talk
+
+        played = sum(bool(result.spoken) for result in on_paper.results)
+        talk.print(
+            f"{played} cases, about {max(1, round(on_paper.took_s))} s where it answers at once; Ctrl-C stops",
+            markup=False,
+        )
+
     def on_paper(self, checked: Checked) -> int:
         """What would be sent."""
         from fieldtwin.cli.check_view import print_paper
@@ -180,14 +197,15 @@ def modbus(
     """Judge a Modbus device from outside: the rows of the catalogue that a master can ask for.
 
     \b
-    fieldtwin check modbus tcp://192.0.2.7:502 --unit 1
-    fieldtwin check modbus rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1 --unit 17 --html unit17.html
-    fieldtwin check modbus tcp://192.0.2.7:502 --write holding:100 --allow write --dry-run
+    fieldtwin check modbus tcp://192.0.2.7:502 --unit 1 --html unit1.html
+    fieldtwin check modbus 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' --unit 17
+    fieldtwin check modbus tcp://192.0.2.7:502 --write holding:100 --dry-run
 
     Reads only, unless told otherwise. Exit code 0 when cases passed and none failed.
     """
     from fieldtwin.checking.modbus_cases import CASES
     from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus, traits_of
+    from fieldtwin.checking.paper import modbus_on_paper
 
     if options["list_only"]:
         return _list(CASES, options["as_json"])
@@ -203,11 +221,11 @@ def modbus(
         endpoint, unit, plan, timeout_s, 1 / options["rate"], echo,
         {table: at for table, at, _ in map(_cell, reads)}, may_write,
     )  # fmt: skip
+    on_paper = modbus_on_paper(to_do)
     if options["dry_run"]:
-        from fieldtwin.checking.paper import modbus_on_paper
-
-        return check.on_paper(modbus_on_paper(to_do))
+        return check.on_paper(on_paper)
     check.ask(CASES, plan, traits)
+    check.estimate(on_paper)
     began = datetime.now(UTC)
     checked = played(
         len([c for c in CASES if c.chosen(plan.only)]), options["log_path"], check.words,
@@ -248,12 +266,13 @@ def canopen(
 
     \b
     fieldtwin check canopen can:socketcan/can0 --node 5 --eds inclinometer.eds
-    fieldtwin check canopen can:fieldtwin/127.0.0.1:29536 --node 5 --write 2000:00 --html node5.html
+    fieldtwin check canopen can:fieldtwin/127.0.0.1:29536 --node 5 --write 1017:00
 
     Uploads only, unless told otherwise. Exit code 0 when cases passed and none failed.
     """
     from fieldtwin.checking.canopen_cases import CASES
     from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
+    from fieldtwin.checking.paper import canopen_on_paper
 
     if options["list_only"]:
         return _list(CASES, options["as_json"])
@@ -266,11 +285,11 @@ def canopen(
     has = ({"object"} if may_write else set()) | ({"eds"} if eds is not None else set())
     plan = check.plan(CASES, has, bool(writes))
     to_do = CanopenOptions(endpoint, node, plan, bitrate or 0, timeout_s, 1 / options["rate"], boot_s, eds, may_write)
+    on_paper = canopen_on_paper(to_do)
     if options["dry_run"]:
-        from fieldtwin.checking.paper import canopen_on_paper
-
-        return check.on_paper(canopen_on_paper(to_do))
+        return check.on_paper(on_paper)
     check.ask(CASES, plan, frozenset({"can"}))
+    check.estimate(on_paper)
     began = datetime.now(UTC)
     checked = played(
         len([c for c in CASES if c.chosen(plan.only)]), options["log_path"], check.words,

@@ -50,7 +50,7 @@ def command(
     """Make a site acceptance document of what was found: who, when, which serial numbers, every deviation, room to sign.
 
     \b
-    fieldtwin report site/ -o acceptance.html --site "Pump house 3" --serial "unit 1=A1234"
+    fieldtwin report site/ -o acceptance.html --serial "unit 1=A1234"
     fieldtwin report unit1.json unit1-dump.jsonl node5.json
 
     SITE is files, or folders of them: dumps, and the JSON of `check --out`, `diff` and `compare`. Print it from any browser.

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import itemgetter
 
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.errors import Unreachable
-from gateway.store.event import Event, Kind, KnowledgeStore
+from gateway.store.event import Event, Kind, KnowledgeStore, StoreFull
 
 QUEUE = 200_000
 """Four seconds of the fastest writing that we promise."""
@@ -27,12 +27,16 @@ LOSS_NAME = "knowledge"
 _SAYS_WHAT_IS = {int(Kind.VALUE), int(Kind.STATE)}
 _NAME_OF = itemgetter(3)
 
+MakeRoom = Callable[[], Awaitable[int]]
+"""Forgets events in the store; how many. 0: there is nothing that may go."""
+
 
 class KnowledgeWriter:
     """Writes one origin's events in batches. `observe` never waits and never fails; `run` writes until cancelled.
 
     `on_trouble` is told once when the room runs short (`reserve_bytes`), once when nothing can be written, and with ``""`` when
-    that is over. `on_written` is told the last number after each batch.
+    that is over. `on_written` is told the last number after each batch. `make_room` may forget what nobody needs any more
+    when the store is full.
     """
 
     def __init__(
@@ -45,6 +49,7 @@ class KnowledgeWriter:
         reserve_bytes: int = RESERVE_BYTES,
         on_trouble: Callable[[str], None] = lambda text: None,
         on_written: Callable[[int], None] = lambda last: None,
+        make_room: MakeRoom | None = None,
     ) -> None:
         self.origin = origin
         self.written = 0
@@ -58,6 +63,7 @@ class KnowledgeWriter:
         self._reserve = reserve_bytes
         self._on_trouble = on_trouble
         self._on_written = on_written
+        self._make_room = make_room
         self._lost = 0
         """Dropped, and not yet on record."""
 
@@ -89,7 +95,11 @@ class KnowledgeWriter:
         """Write everything that is queued; how many events. Raises `Unreachable`, and keeps what was not written."""
         done = 0
         while self._queue or self._lost:
-            done += await self._write()
+            try:
+                done += await self._write()
+            except StoreFull:
+                if self._make_room is None or not await self._make_room():
+                    raise
         self._look_at_room()
         return done
 

@@ -79,6 +79,15 @@ class ThreadEnd:
             self.out.appended(last)
             self._news.set()
 
+    async def make_room(self) -> int:
+        """Forget the older half of what the other side has confirmed; how many events. For a store of this side that is full."""
+        if self.out is None:
+            return 0
+        first, _ = await self._store.span(self._origin)
+        if first > self.out.through:
+            return 0
+        return await self._store.forget(self._origin, first + (self.out.through - first) // 2)
+
     async def run(self) -> None:
         """Keep the thread up. Raises `FieldtwinError` only when the store cannot be read at the start."""
         if self._origin:

@@ -88,6 +88,30 @@ def test_through_a_full_disk_nothing_is_lost_that_fits_the_queue_and_the_rest_is
     run(main())
 
 
+def test_a_full_store_forgets_what_may_go_and_nothing_else(tmp_path: Path) -> None:
+    async def main() -> None:
+        store, origin = await moody(tmp_path)
+        may_go = [2, 0]
+
+        async def make_room() -> int:
+            gone = may_go.pop(0)
+            store.full = gone == 0
+            return gone
+
+        writer = KnowledgeWriter(store, origin, WallClock(), make_room=make_room)
+        store.full = True
+        writer.observe(value(1))
+        assert await writer.flush() == 1
+        store.full = True
+        writer.observe(value(2))
+        with pytest.raises(StoreFull):
+            await writer.flush()
+        assert (writer.queued, writer.dropped) == (1, 0)
+        await store.aclose()
+
+    run(main())
+
+
 def test_short_room_is_said_early_once_and_when_it_is_over(tmp_path: Path) -> None:
     async def main() -> None:
         store, origin = await moody(tmp_path)

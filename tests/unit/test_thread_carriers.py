@@ -223,6 +223,29 @@ def test_a_store_that_refuses_is_not_acknowledged_to_and_catches_up(tmp_path: Pa
     virtually(main)
 
 
+def test_a_full_store_of_the_sender_gives_up_what_the_other_side_has_and_nothing_else(tmp_path: Path) -> None:
+    async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
+        plant = Twin("plant", tmp_path, clock, lambda: LateListening(net))
+        shore = Twin("shore", tmp_path, clock, lambda: TcpDialler(ADDRESS, net, [SCHEMA]))
+        await plant.start()
+        await plant.log(*(value(n) for n in range(100)))
+        assert await plant.end.make_room() == 0, "nothing is confirmed yet"
+        await shore.start()
+        await until_equal(plant, shore, 60, loop)
+        await plant.log(value(100))
+        assert await plant.end.make_room() == 50
+        assert await plant.store.span(plant.origin) == (51, 101)
+        await plant.kill()
+        await plant.start()
+        while plant.end.waiting:
+            await asyncio.sleep(1)
+        assert [e.sequence for e in await shore.all_of(plant.origin)] == list(range(1, 102))
+        await plant.kill()
+        await shore.kill()
+
+    virtually(main)
+
+
 def test_over_a_real_socket(tmp_path: Path) -> None:
     async def main() -> None:
         listening = await TcpListening.start(Endpoint.parse("tcp://127.0.0.1:0"), TcpListener.open, [SCHEMA])

@@ -1,0 +1,195 @@
+"""Forks: they begin with what is known, do what a plan says, and tell what came of it."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from support import run
+
+from fieldtwin.cli.what_if_command import command
+from fieldtwin.running.shore import Scripted
+from fieldtwin.whatif.fork import Fork, answer
+from fieldtwin.whatif.many import answers
+from fieldtwin.whatif.plan import Plan, load_plans
+from fieldtwin.whatif.plan import command as parsed
+from fieldtwin.whatif.state import KnownState, known_state, of_period, read_state
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.values import Quality, Reason
+from gateway.store.event import Event, Kind
+from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from twin.system import load_system
+
+ROOT = Path(__file__).resolve().parents[2]
+OBSERVATORY = load_system("observatory")
+DEEP = KnownState({"ctd.pressure": 250.0, "ctd.temperature": 8.0}, {"relay": of_period(1)})
+
+
+def test_a_fork_goes_on_from_what_is_known() -> None:
+    """The relay is ACTIVE with the period of before, and the sensor is where it was in the cast."""
+    outcome = answer(Fork("observatory", DEEP, 6.0, settle_s=3.0), Plan("go on", require=("relay.state == 'ACTIVE'",)))
+    assert outcome.error == ""
+    assert outcome.met
+    assert [state for _, state in outcome.states["relay"]] == ["ACTIVE"]
+    pressure = outcome.variables["ctd.pressure"]
+    assert pressure.first == pytest.approx(
+        250.0, abs=15.0
+    )  # the nearest row by both signals, and some seconds of the cast
+    assert pressure.lowest > 200
+    assert outcome.variables["ctd.sample_period_s"].last == 1
+    assert outcome.not_taken == []
+
+
+def test_without_knowledge_it_begins_as_any_prototype() -> None:
+    outcome = answer(
+        Fork("observatory", KnownState(), 2.0, settle_s=1.0), Plan("nothing", require=("relay.state == 'ACTIVE'",))
+    )
+    assert not outcome.met
+    [broken] = outcome.requirements
+    assert broken.broken_s == pytest.approx(1.0)
+    assert broken.seen == "relay.state: 'STANDBY'"
+
+
+def test_commands_and_faults_of_a_plan_and_the_same_again() -> None:
+    fork = Fork("observatory", DEEP, 12.0, settle_s=3.0)
+    silent = ({"name": "silence", "device": "ctd", "from": "4s"},)
+    plans = [
+        Plan("off", (Scripted(0.5, -1),), finally_=("relay.state == 'OFF'",)),
+        Plan("dead", (), silent, require=("quality(ctd.pressure) == 'good'",)),
+    ]
+    off, dead = answers(fork, plans, jobs=1)
+    assert off.met
+    assert [state for _, state in off.states["relay"]] == ["ACTIVE", "OFF"]
+    assert not dead.met
+    assert 4.0 < (dead.requirements[0].broken_s or 0) < 9.0
+    again = answer(fork, plans[0])
+    assert {**again.described(), "took_s": 0} == {**off.described(), "took_s": 0}
+
+
+def test_a_simulation_goes_on_from_its_values() -> None:
+    known = KnownState({"localiser.x": 5.0, "localiser.heading": 0.0, "console.enable": 1, "console.speed": 1.0})
+    outcome = answer(Fork("lab_vehicle", known, 4.0), Plan("drive", finally_=("localiser.x > 6",)))
+    assert outcome.met, outcome.described()
+    assert outcome.variables["localiser.x"].lowest >= 5.0
+
+
+def test_what_cannot_be() -> None:
+    with pytest.raises(UsageError, match="the horizon"):
+        answer(Fork("observatory", DEEP, 0.0), Plan("x"))
+    with pytest.raises(UsageError, match="no tag or variable"):
+        answer(Fork("observatory", DEEP, 1.0), Plan("x", require=("ctd.presure > 1",)))
+    with pytest.raises(UsageError, match="a command"):
+        parsed("fast")
+    assert parsed("60@10min") == Scripted(600.0, 60)
+    nobody = answer(Fork("lab_vehicle", KnownState(), 1.0), Plan("x", (Scripted(0, 1),)))
+    assert "nobody can command this system" in nobody.error
+    assert not nobody.met
+
+
+# -- where a state comes from ---------------------------------------------------------------------------------------------
+
+
+def test_a_state_file_says_what_it_was_given(tmp_path: Path) -> None:
+    path = tmp_path / "now.json"
+    path.write_text(DEEP.dump(OBSERVATORY), encoding="utf-8")
+    again = read_state(path, OBSERVATORY)
+    assert (again.values, again.programs) == (DEEP.values, DEEP.programs)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"fieldtwin_state": 1', '"fieldtwin_state": 9', "another version.*expected 1; got 9"),
+        ('"system": "observatory"', '"system": "pump"', "another system's state"),
+        ("ctd.pressure", "ctd.presure", "no tag 'ctd.presure'"),
+        ('"relay"', '"rely"', "no program 'rely'"),
+        ('"values"', '"valeus"', "no state of a system"),
+        ("{", "", "no state of a system"),
+    ],
+)
+def test_a_wrong_state_file(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "now.json"
+    path.write_text(DEEP.dump(OBSERVATORY).replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(FileInvalid, match=message):
+        read_state(path, OBSERVATORY)
+
+
+def test_the_last_that_a_store_knows(tmp_path: Path) -> None:
+    async def main() -> KnownState:
+        store = await SqliteKnowledge.open(tmp_path / "k.db", offload=in_place)
+        try:
+            mine = await store.own("plant", system="observatory", prototype=True, log="1")
+            await store.append(
+                mine,
+                [
+                    Event(0, 1000, Kind.VALUE, "ctd.pressure", 100.0, Quality.GOOD, 0),
+                    Event(0, 2000, Kind.VALUE, "ctd.pressure", 101.5, Quality.GOOD, 0),
+                    Event(0, 2000, Kind.VALUE, "ctd.temperature", 8.0, Quality.GOOD, 0),
+                    Event(0, 2500, Kind.STATE, "relay", 2),
+                    Event(0, 3000, Kind.VALUE, "ctd.temperature", None, Quality.BAD, Reason.TIMEOUT),
+                ],
+            )
+        finally:
+            await store.aclose()
+        return await known_state(str(tmp_path / "k.db"), OBSERVATORY)
+
+    known = run(main())
+    assert dict(known.values) == {"ctd.pressure": 101.5}  # what turned bad is not known
+    assert known.programs == {"relay": {"period": 2, "period_s": 2, "state": 1}}
+    assert known.utc_ms == 3000
+
+
+# -- plans in a file, and the command --------------------------------------------------------------------------------------
+
+PLANS = """\
+what_if: observatory
+require: ["quality(inclinometer.slope_long) == 'good'"]
+plans:
+  - name: keep
+    finally: ["relay.state == 'ACTIVE'"]
+  - name: stop
+    commands: [{at: 500ms, period_s: 0}]
+    finally: ["relay.state == 'ACTIVE'"]
+"""
+
+
+def test_several_plans_by_command(tmp_path: Path) -> None:
+    (tmp_path / "plans.yaml").write_text(PLANS, encoding="utf-8")
+    (tmp_path / "now.json").write_text(DEEP.dump(OBSERVATORY), encoding="utf-8")
+    words = [
+        "--plans",
+        str(tmp_path / "plans.yaml"),
+        "--from",
+        str(tmp_path / "now.json"),
+        "--horizon",
+        "8s",
+        "--jobs",
+        "1",
+    ]
+    said = CliRunner().invoke(command, [*words, "--json"], standalone_mode=False)
+    assert said.exception is None
+    found = json.loads(said.stdout)
+    assert [(o["plan"], o["met"]) for o in found["outcomes"]] == [("keep", True), ("stop", False)]
+    assert said.return_value == 0  # one of them will do
+    assert found["outcomes"][1]["requirements"][1]["seen"] == "relay.state: 'STANDBY'"
+    shown = CliRunner().invoke(command, words, standalone_mode=False).stdout
+    assert "keep: met" in shown
+    assert re.search(r"ctd\.pressure +2[45]\d", shown)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("name: stop", "name: keep", r"two plans of one name"),
+        ("period_s: 0", "period_s: 99999", r"plans.yaml:7:\d+: a command"),
+        ("finally:", "finaly:", r"finaly.*did you mean"),
+    ],
+)
+def test_a_wrong_file_of_plans(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "plans.yaml"
+    path.write_text(PLANS.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(FileInvalid, match=message):
+        load_plans(path)

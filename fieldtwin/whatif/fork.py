@@ -84,6 +84,7 @@ class _ForkRun:
         self._requirements = [self._requirement("require", text) for text in plan.require]
         self._at_the_end = [self._requirement("finally", text) for text in plan.finally_]
         self._run: VirtualPrototype | None = None
+        self._over = False
 
     def _requirement(self, kind: str, text: str) -> tuple[Requirement, Expression]:
         expression = Expression(text, [*self._known, *self._variables])
@@ -125,6 +126,7 @@ class _ForkRun:
             for fault in self.plan.faults:
                 run.field.faults.inject(fault)
             await self._watch(run, loop)
+            run.gateway.tags.on_put, self._over = None, True  # what its end brings (safe outputs) is none of the plan's
             for requirement, expression in self._at_the_end:
                 self._judge(requirement, expression)
 
@@ -154,6 +156,8 @@ class _ForkRun:
         return (self._run.loop.now_ns - self._run.started_ns) / NS_PER_S
 
     def _changed(self, change: Change) -> None:
+        if self._over:
+            return
         value = self._named(change.tag, change.after)
         self.outcome.saw_variable(change.tag, value)
         if change.tag in self._words and self._run is not None:

@@ -21,7 +21,7 @@ from fieldtwin.commissioning.live import frame_of, modbus_at
 from fieldtwin.commissioning.point import Answer, Point, decoded
 from fieldtwin.commissioning.reading import Target, dry_point, point_at, text_of
 from fieldtwin.commissioning.writing import Write, Written
-from gateway.core.errors import NotAllowed, ReplyTimeout, UsageError
+from gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, UsageError
 from gateway.core.profile import Tag
 from gateway.protocols.modbus.diagnostics import Diagnostics
 from gateway.wallclock import run as run_precise
@@ -115,22 +115,46 @@ async def _write(
             _show(writes, old)
             if not yes and not click.confirm("Write?", default=False, err=True):
                 raise click.Abort
-            done: list[Written] = []
-            try:
-                for write, before in zip(writes, old, strict=True):
-                    done.append(await writing.carry_out(point, write, before))
-                if hold_s is not None:
-                    talk.print(f"written; the old values come back in {hold_s:g} s")
-                    await asyncio.sleep(hold_s)
-            finally:
-                if hold_s is not None:
-                    done = await _put_back(point, done)
-            return done
+            return await _carry_out(point, writes, old, hold_s)
+
+
+async def _carry_out(
+    point: Point, writes: Sequence[Write], old: Sequence[Answer | None], hold_s: float | None
+) -> list[Written]:
+    """All writes, in order. With `hold_s` what was written is put back, also where one of them failed or somebody stopped it."""
+    done: list[Written] = []
+    try:
+        for write, before in zip(writes, old, strict=True):
+            # Until it is known what came of it, it was written.
+            done.append(Written(write, before.value.raw if before is not None else None, None))
+            done[-1] = await writing.carry_out(point, write, before)
+        if hold_s is not None:
+            talk.print(f"written; the old values come back in {hold_s:g} s")
+            await asyncio.sleep(hold_s)
+    except BaseException:
+        if hold_s is None:
+            for written in done[:-1]:
+                talk.print(Text("done before: ") + _told(written), soft_wrap=True)
+        raise
+    finally:
+        if hold_s is not None:
+            done = await _put_back(point, done)
+    return done
 
 
 async def _put_back(point: Point, done: list[Written]) -> list[Written]:
-    """The last one first."""
-    return [await writing.restore(point, written) for written in reversed(done)][::-1]
+    """The last one first, and each of them, whatever comes of the others."""
+    back: list[Written] = []
+    failed: FieldtwinError | None = None
+    for written in reversed(done):
+        try:
+            back.insert(0, await writing.restore(point, written))
+        except FieldtwinError as e:
+            talk.print(Text(f"{written.write.tag.name} was not put back: {e}", "red"), soft_wrap=True)
+            failed = failed or e
+    if failed is not None:
+        raise failed
+    return back
 
 
 def _show(writes: Sequence[Write], old: Sequence[Answer | None]) -> None:

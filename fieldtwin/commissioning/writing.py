@@ -149,17 +149,18 @@ async def carry_out(point: Point, write: Write, old: Answer | None) -> Written:
 
 
 async def restore(point: Point, done: Written) -> Written:
-    """Put back what was there before, and read that back. Nothing is sent where nothing was changed.
+    """Put back what was there before, and read that back. Nothing is written where the device holds it: a write that failed.
 
     Raises `NotAllowed` where nobody knows what was there, otherwise as `carry_out`.
     """
+    tag = done.write.tag
     if done.before is None:
-        raise NotAllowed(f"{done.write.tag.name} cannot be put back: what it held was not read")
-    if done.same or _same(done.write, done.before):
+        raise NotAllowed(f"{tag.name} cannot be put back: what it held was not read")
+    answer = (await point.read([tag]))[tag.name]
+    if not answer.problem and _equal(tag, done.before, answer.value.raw):
         return Written(done.write, done.before, done.before, same=True, restored=True)
-    data = done.before[-1:] if done.write.tag.at is not None and done.write.tag.at.table == "coil" else done.before
-    await point.write(done.write.tag, data)
-    return Written(done.write, done.before, await _verify(point, done.write, data), restored=True)
+    await point.write(tag, done.before)
+    return Written(done.write, done.before, await _verify(point, done.write, done.before), restored=True)
 
 
 async def _verify(point: Point, write: Write, data: bytes) -> bytes:

@@ -18,7 +18,8 @@ from fieldtwin.commissioning.plotting import check_plot, plot
 from fieldtwin.commissioning.point import Answer
 from fieldtwin.commissioning.reading import Target, point_at
 from fieldtwin.commissioning.watching import BLOCKS, MOST_SAMPLES, History, samples, sparkline
-from gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.commissioning.writing import before, plan_write
+from gateway.core.errors import FileInvalid, ModbusExceptionReply, UsageError
 from gateway.core.values import Quality, Reason, TagValue
 
 
@@ -90,3 +91,39 @@ def test_a_dry_run_needs_no_device() -> None:
         assert result.return_value == 0, result.output
         assert result.stdout.startswith("00 01 00 00 00 06 01 0")
         assert "00 64" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["tcp://192.0.2.1", "holding:1=5"], "--yes"),
+        (["rtu:/dev/ttyS99", "holding:1=5", "--unit", "0", "--yes"], "--i-know"),
+        (["tcp://192.0.2.1", "--restart-communications", "--yes"], "--i-know"),
+        (["tcp://192.0.2.1", "holding:1"], "ITEM=VALUE"),
+        (["tcp://192.0.2.1", "input:1=5", "--yes"], "read-only"),
+        (["can:fieldtwin/127.0.0.1:1", "1010h:01=1", "--type", "uint32", "--yes"], "--i-know"),
+    ],
+)
+def test_a_write_that_is_not_meant_is_refused_before_anything_is_opened(args: list[str], says: str) -> None:
+    result = CliRunner().invoke(write_command.command, args, standalone_mode=False)
+    assert isinstance(result.exception, UsageError)
+    assert says in str(result.exception)
+
+
+def test_a_restart_is_shown_by_a_dry_run() -> None:
+    args = ["rtu:/dev/ttyS99", "--unit", "9", "--restart-communications", "--dry-run"]
+    result = CliRunner().invoke(write_command.command, args, standalone_mode=False)
+    assert result.stdout.startswith("09 08 00 01 00 00")
+
+
+def test_what_was_written_is_put_back_even_where_a_later_write_fails() -> None:
+    async def main() -> None:
+        made = bank([Span("holding", 0, 2), Span("holding", 2, 1, "ro")], {"holding": {0: [1, 2, 3]}})
+        async with point_at(Target(URL, 1), connector=Wired(unit(made)), clock=loop()) as point:
+            writes = [plan_write(tags_of([f"holding:{i}"], "modbus")[0], "9") for i in range(3)]
+            old = [await before(point, w) for w in writes]
+            with pytest.raises(ModbusExceptionReply):
+                await write_command._carry_out(point, writes, old, 0.0)
+        assert list(made.read("holding", 0, 3, 0)) == [1, 2, 3]
+
+    run_virtually(main())

@@ -46,6 +46,8 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
 
 def _described(kind: type[Fault]) -> dict[str, Any]:
     """A fault as JSON; its parameters as JSON schema has them."""
+    from emulators.faults.schema import aims_of
+
     own = kind.form.model_json_schema().get("properties", {})
     for parameter in own.values():
         parameter.pop("title", None)
@@ -55,6 +57,7 @@ def _described(kind: type[Fault]) -> dict[str, Any]:
         "on": kind.kind.value,
         "summary": kind.summary,
         "direction": ways,
+        "aims": aims_of(kind),
         "parameters": own,
         **({"codes": {_code(code): text for code, text in kind.codes.items()}} if kind.codes else {}),
     }

@@ -220,9 +220,11 @@ async def listen_only(wire: ModbusWire) -> Finding:
     echo = await wire.ask(b"\x08\x00\x00\x5a\x5a")
     if echo.first is None or echo.first.refusal:
         raise NotHere(f"it has no function 08: {echo}")
-    entered = await wire.ask(b"\x08\x00\x04\x00\x00", due=False)
-    meanwhile = await wire.ask(wire.good, due=False)
-    left = await wire.ask(b"\x08\x00\x01\x00\x00", due=False)  # whatever it said: it may have gone into the mode
+    try:
+        entered = await wire.ask(b"\x08\x00\x04\x00\x00", due=False)
+        meanwhile = await wire.ask(wire.good, due=False)
+    finally:  # whatever happened: it may be in that mode
+        left = await wire.ask(b"\x08\x00\x01\x00\x00", due=False)
     after = await wire.still_good()
     if entered.first is not None and entered.first.refusal and not after:
         raise NotHere(f"it has no listen-only mode: {entered}")

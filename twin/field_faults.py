@@ -17,7 +17,7 @@ from emulators.endpoints.ports import Datagrams
 from emulators.faults.can_fault import BusFault
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active, Aim, ValueFault
-from emulators.faults.frames import Framing
+from emulators.faults.frames import Framing, Way
 from emulators.faults.schema import FaultSpec, parse_fault
 from emulators.faults.set_value import Form, SetValue
 from emulators.wires.can_faults import Rule
@@ -72,6 +72,12 @@ class FieldFaults:
     def refuses(self, bus: str) -> bool:
         """Whether who connects to the emulators of `bus` is turned away now."""
         return self._buses[bus].refuses(self._clock.monotonic_ns())
+
+    def watch(self, told: Callable[[str, object, bool, bytes], None]) -> None:
+        """From now on `told` learns what is on each line and socket: the bus, who carries it (one for each connection), whether
+        it comes from an emulator, and the bytes. CAN buses have listeners of their own (`FieldSide.join`)."""
+        for name, wire in self._buses.items():
+            wire.watch = _watcher(name, told)
 
     # -- putting in and taking away -------------------------------------------------------------------------------------
 
@@ -163,3 +169,7 @@ def framing_of(endpoint: Endpoint) -> Framing:
     if endpoint.scheme == "ascii":
         return Framing.ASCII
     return Framing.RTU if endpoint.is_serial or endpoint.scheme == "rtu+tcp" else Framing.MBAP
+
+
+def _watcher(bus: str, told: Callable[[str, object, bool, bytes], None]) -> Callable[[object, Way, bytes], None]:
+    return lambda end, way, data: told(bus, end, way is Way.REPLY, data)

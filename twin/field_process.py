@@ -23,8 +23,8 @@ from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock, run
 from twin.field import FieldSide
 from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from twin.prototype_file import Prototype, load_prototype
+from twin.system import System, load_system
 
 HELD_AT_ONCE = 5_000
 """A field side that stood for hours holds more than a line of the control channel takes."""
@@ -47,6 +47,11 @@ class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def resolve(config: FieldConfig) -> DigitalTwinPrototype:
     """Read system and prototype file, apply what the command line says, and put both sides together, checked."""
+    return DigitalTwinPrototype(*resolve_files(config), WallClock())
+
+
+def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
+    """The field side's part of it: without the gateway's and the PLC's, and so without the programs."""
     system = load_system(config.system, [Path(p) for p in config.profiles])
     prototype = load_prototype(system, Path(config.prototype) if config.prototype else None)
     for device, path in config.recordings.items():
@@ -59,7 +64,7 @@ def resolve(config: FieldConfig) -> DigitalTwinPrototype:
         if bus not in prototype.buses:
             raise UsageError(f"no bus {bus!r}", expected=", ".join(prototype.buses))
         prototype = prototype.with_listen(bus, Endpoint.parse(url))
-    return DigitalTwinPrototype(system, prototype, WallClock())
+    return system, prototype
 
 
 class FieldProcess:

@@ -71,12 +71,14 @@ class FaultyEnd(ByteConnection):
     async def write(self, data: bytes) -> None:
         for piece in self._said(data):
             await self.inner.write(piece)
+            self._show(Way.REPLY, piece)
 
     async def answer(self, data: bytes, after_s: float) -> None:
         """As `PtyEnd.answer`."""
         assert isinstance(self.inner, PtyEnd)
         for n, piece in enumerate(self._said(data, after_s)):
             await (self.inner.answer(piece, after_s) if n == 0 else self.inner.write(piece))
+            self._show(Way.REPLY, piece)
 
     async def aclose(self) -> None:
         self.detach()
@@ -101,8 +103,13 @@ class FaultyEnd(ByteConnection):
     def _now_ns(self) -> int:
         return round(self._loop.time() * NS_PER_S)
 
+    def _show(self, way: Way, data: bytes) -> None:
+        if self._faults.watch is not None:
+            self._faults.watch(self, way, data)
+
     def _heard(self, data: bytes) -> bool:
         """A chunk from the other side; True: it is dealt with."""
+        self._show(Way.REQUEST, data)
         if self._dead:
             return True
         assembler = self._in[Way.REQUEST]
@@ -209,6 +216,7 @@ class FaultyEnd(ByteConnection):
     async def _write_quietly(self, data: bytes) -> None:
         try:
             await self.inner.write(data)
+            self._show(Way.REPLY, data)
         except ConnectionLost:
             pass  # it was too late
 

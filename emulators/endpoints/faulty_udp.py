@@ -53,6 +53,7 @@ class FaultyDatagrams(Datagrams):
                 self._later(piece, self._send, peer)
             else:
                 await self._inner.send(piece.data, peer)
+                self._show(Way.REPLY, piece.data, peer)
 
     async def aclose(self) -> None:
         for task in (self._listening, *self._tasks):
@@ -73,6 +74,11 @@ class FaultyDatagrams(Datagrams):
     async def _send_quietly(self, data: bytes, peer: tuple[str, int]) -> None:
         with contextlib.suppress(ConnectionLost):  # it was too late
             await self._inner.send(data, peer)
+            self._show(Way.REPLY, data, peer)
+
+    def _show(self, way: Way, data: bytes, peer: tuple[str, int]) -> None:
+        if self._faults.watch is not None:
+            self._faults.watch(peer, way, data)
 
     def _later(self, piece: Piece, then: Callable[[bytes, tuple[str, int]], None], peer: tuple[str, int]) -> None:
         """`then`, when the piece's time has come, unless it went by itself meanwhile."""
@@ -87,6 +93,7 @@ class FaultyDatagrams(Datagrams):
         try:
             while True:
                 data, peer = await self._inner.receive()
+                self._show(Way.REQUEST, data, peer)
                 frame = understood(Way.REQUEST, self._faults.framing, data)
                 if len(self._asked) < MOST_WAITING:
                     self._asked[peer] = frame.address

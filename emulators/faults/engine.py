@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
-from emulators.faults.frames import Frame, Framing, understood
+from emulators.faults.frames import Frame, Framing, Way, understood
 
 
 class WireFaults:
@@ -16,6 +16,9 @@ class WireFaults:
         self.active: dict[str, Active] = {}
         self.listeners: list[Callable[[Active], None]] = []
         """Told of each fault that is put in, in the order of their subscription."""
+        self.watch: Callable[[object, Way, bytes], None] | None = None
+        """Told what is on the wire: who carries it (an end), which way, the bytes. What a fault keeps back is no reply on the
+        wire; what an emulator never gets to hear is a request on it all the same. It may not raise."""
 
     def put_in(self, active: Active) -> None:
         self.active[active.id] = active

@@ -45,6 +45,7 @@ COMMANDS = {
     "export": ("fieldtwin.cli.export_command", "Turn recordings into CSV, Parquet, candump logs or pcap."),
     "what-if": ("fieldtwin.cli.what_if_command", "Fork a prototype from what is known, and see what comes of a plan."),
     "test": ("fieldtwin.cli.test_command", "Run scenarios against a prototype, and judge it."),
+    "test-host": ("fieldtwin.cli.test_host_command", "Emulated devices for tests, over stdin and stdout."),
     "with": ("fieldtwin.cli.with_command", "Run any command against the emulated field; end with its exit status."),
     "faults": ("fieldtwin.cli.faults_command", "List the faults that can be put on wires and into devices."),
     "template": (

@@ -81,6 +81,11 @@ class ControlServer:
         while self._sockets:
             self._sockets.pop().unlink(missing_ok=True)
 
+    async def serve_pipe(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve whoever started us, over our own input and output: trusted, and no socket is listened on. Returns when they
+        are gone."""
+        await self._serve(reader, writer, trusted=True)
+
     async def _serve_unix(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await self._serve(reader, writer, trusted=True)
 

@@ -1,0 +1,20 @@
+"""`fieldtwin test-host`: what the pytest plugin starts, and whoever tests drivers in another language."""
+
+from __future__ import annotations
+
+import click
+
+
+@click.command("test-host")
+def command() -> int:
+    """Emulated devices for somebody's tests, made and ended over standard input and output.
+
+    Requests are lines of JSON, and so are answers: {"v": 1, "id": 1, "verb": "device", "args": {"device": "ctd-reference"}}.
+    The pytest plugin of fieldtwin starts it; docs/testing.md has the verbs. It ends when its input does.
+    """
+    from fieldtwin.testhost.host import Host
+    from gateway.wallclock import run
+    from twin.child import allow_open_files
+
+    allow_open_files()
+    return run(Host().serve())

@@ -1,0 +1,127 @@
+"""What one test has: a field side on wires of its own, with what is said on them, or a program that it steps.
+
+A `Bench` lives from `open` to `aclose`; its folder holds its files and virtual serial ports, and goes with it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.testhost.one_device import endpoint_words
+from fieldtwin.testhost.wire_log import WireLog
+from gateway.core.clock import Clock
+from gateway.core.connection import CanConnection
+from gateway.core.errors import ConnectionLost, UsageError
+from gateway.core.nursery import Nursery
+from gateway.core.profile import Tag
+from gateway.devices.codec import decode, decode_little
+from twin.field import FieldSide
+from twin.mapping import mapped_endpoint
+from twin.prototype_file import Prototype
+from twin.system import System
+
+
+class Bench:
+    """The emulated field side of a system. Raises what opening one raises, and what its emulators fail with."""
+
+    def __init__(self, system: System, prototype: Prototype, clock: Clock, folder: Path) -> None:
+        self.system = system
+        self.field = FieldSide(system, prototype, folder, clock)
+        self.log = WireLog(system, clock)
+        self._folder = folder
+        self._nursery = Nursery()
+        self._ears: list[CanConnection] = []
+
+    async def open(self) -> None:
+        await self.field.open()
+        self.field.faults.watch(self.log.on_bytes)
+        self._nursery.start(self.field.run(), "field side")
+        for bus, listening in self.field.listening.items():
+            if listening.is_can:
+                ear = await self.field.join(bus, "test")
+                self._ears.append(ear)
+                self._nursery.start(self._listen(bus, ear), f"listener on {bus}")
+
+    async def _listen(self, bus: str, ear: CanConnection) -> None:
+        try:
+            while True:
+                self.log.on_frame(bus, await ear.recv())
+        except ConnectionLost:
+            await asyncio.Event().wait()  # the bus is gone, the test may go on
+
+    async def aclose(self) -> None:
+        await self._nursery.__aexit__(None, None, None)
+        for ear in self._ears:
+            await ear.aclose()
+        await self.field.aclose()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def describe(self) -> dict[str, Any]:
+        """Where everything is: ``buses`` and ``far`` (endpoints in words), ``devices`` (bus, unit, profile, tags, what plays)."""
+        buses = {}
+        for name, listening in self.field.listening.items():
+            plant = self.system.buses[name].endpoint
+            buses[name] = endpoint_words(mapped_endpoint(plant, listening))
+        return {
+            "system": self.system.name,
+            "file": str(self.system.path),
+            "buses": buses,
+            "far": {name: endpoint_words(endpoint) for name, endpoint in self.field.far.items()},
+            "devices": {
+                name: {
+                    "bus": config.bus,
+                    "unit": config.address,
+                    "profile": config.profile.name,
+                    "tags": list(config.profile.tags),
+                    "plays": self.field.devices[name].plays,
+                }
+                for name, config in self.system.devices.items()
+                if name in self.field.devices
+            },
+        }
+
+    def alive(self) -> None:
+        """Raises what an emulator failed with since."""
+        failure = self._nursery.failure()
+        if failure is not None:
+            raise failure
+
+    def set(self, device: str, tag: str, value: Any) -> None:
+        """From now on `device` holds `value` for `tag`; None: what it says by itself again."""
+        self._tag(device, tag)
+        self.field.faults.set_value(device, tag, value)
+
+    def held(self, device: str, tag: str) -> Any:
+        """What `device` holds for `tag` now, in engineering units; None while it never held anything."""
+        found = self._tag(device, tag)
+        config = self.system.devices[device]
+        emulated = self.field.devices[device]
+        raw = next((h.raw for h in reversed(list(emulated.journal.since(0))) if h.tag == tag), None)
+        if raw is None:
+            return None
+        little = self.system.buses[config.bus].endpoint.is_can
+        value = (decode_little if little else decode)(found, raw, 0).value
+        return value.hex() if isinstance(value, bytes) else value
+
+    def _tag(self, device: str, tag: str) -> Tag:
+        if device not in self.field.devices:
+            raise UsageError(f"no emulated device {device!r}", expected=", ".join(self.field.devices))
+        tags = self.system.devices[device].profile.tags
+        if tag not in tags:
+            raise UsageError(f"{device} has no tag {tag!r}", expected=", ".join(tags))
+        return tags[tag]
+
+    def fault(self, said: Mapping[str, Any]) -> str:
+        """Put a fault in; its id. Times in it count from now."""
+        self.field.faults.start_ns = self.field._clock.monotonic_ns()
+        return self.field.faults.inject(said)
+
+
+def new_folder() -> Path:
+    """A folder for a bench, with a path short enough for sockets and links."""
+    return Path(tempfile.mkdtemp(prefix="ft-test-"))

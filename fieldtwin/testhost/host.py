@@ -1,0 +1,227 @@
+"""The process behind a test run: emulated devices, whole field sides and stepped programs, made and ended as tests ask.
+
+It speaks the control channel's protocol over its own input and output (docs/testing.md has the verbs), so it may run in another
+virtual environment or in an image, and ends when whoever started it ends. Nothing of a test runner is known here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.testhost.bench import Bench, new_folder
+from fieldtwin.testhost.one_device import Wanted, write_system
+from fieldtwin.testhost.stepped_program import SteppedProgram
+from gateway.core.control import MAX_LINE, ControlServer
+from gateway.core.errors import UsageError
+from gateway.wallclock import WallClock
+from twin.data_files import find
+from twin.field_process import FieldConfig, resolve_files
+from twin.prototype_file import Prototype
+from twin.system import System
+
+MOST = 1_000
+"""Benches and programs at once: who forgets to end them is told."""
+
+
+class Host:
+    """``await Host().serve()`` until our input ends."""
+
+    def __init__(self) -> None:
+        self._clock = WallClock()
+        self._benches: dict[int, Bench] = {}
+        self._programs: dict[int, SteppedProgram] = {}
+        self._number = 0
+
+    async def serve(self) -> int:
+        loop = asyncio.get_running_loop()
+        reader = asyncio.StreamReader(limit=MAX_LINE)
+        try:
+            await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin.buffer)
+            transport, protocol = await loop.connect_write_pipe(
+                lambda: asyncio.streams.FlowControlMixin(loop=loop), os.fdopen(os.dup(1), "wb")
+            )
+        except ValueError as e:
+            raise UsageError("nobody to talk to", expected="pipes, as a test run gives them", got="a file") from e
+        writer = asyncio.StreamWriter(transport, protocol, None, loop)
+        server = ControlServer(self.verbs())
+        try:
+            await server.serve_pipe(reader, writer)
+        finally:
+            await server.aclose()
+            await self.aclose()
+        return 0
+
+    async def aclose(self) -> None:
+        """End everything that was not ended."""
+        while self._benches:
+            _, bench = self._benches.popitem()
+            await bench.aclose()
+
+    def verbs(self) -> dict[str, Any]:
+        return {
+            "hello": self._hello,
+            "device": self._device,
+            "system": self._system,
+            "end": self._end,
+            "set": self._set,
+            "held": self._held,
+            "fault": self._fault,
+            "clear": self._clear,
+            "exchanges": self._exchanges,
+            "program": self._program,
+            "input": self._input,
+            "scan": self._scan,
+            "report": self._report,
+        }
+
+    # -- field sides ----------------------------------------------------------------------------------------------------
+
+    async def _hello(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"fieldtwin": __version__, "pid": os.getpid()}
+
+    async def _device(self, args: dict[str, Any]) -> dict[str, Any]:
+        """One device: what `Wanted` says, `profiles` (folders), `beside` (the test's folder)."""
+        wanted = _wanted(args)
+        beside = Path(args["beside"]) if args.get("beside") else None
+        profiles = tuple(map(Path, args.get("profiles") or ()))
+        folder = new_folder()
+        try:
+            path = write_system(wanted, folder, profiles, beside)
+            return await self._open(folder, *resolve_files(FieldConfig(str(path), str(folder))))
+        except BaseException:
+            folder_gone(folder)
+            raise
+
+    async def _system(self, args: dict[str, Any]) -> dict[str, Any]:
+        """The field side of `system`; `prototype`, `profiles`, `recordings`, `speed` and `listen` as `FieldConfig` has them."""
+        name, beside = str(args.get("system", "")), str(args.get("beside") or ".")
+        folder = new_folder()
+        try:
+            own = Path(beside) / name
+            path = own if own.is_file() else find("systems", name)
+            config = FieldConfig(
+                system=str(path.resolve()),
+                run_dir=str(folder),
+                prototype=str((Path(beside) / args["prototype"]).resolve()) if args.get("prototype") else "",
+                profiles=tuple(args.get("profiles") or ()),
+                recordings=dict(args.get("recordings") or {}),
+                speed=float(args.get("speed") or 0.0),
+                listen=dict(args.get("listen") or {}),
+            )
+            return await self._open(folder, *resolve_files(config))
+        except BaseException:
+            folder_gone(folder)
+            raise
+
+    async def _open(self, folder: Path, system: System, prototype: Prototype) -> dict[str, Any]:
+        number = self._next()
+        bench = Bench(system, prototype, self._clock, folder)
+        try:
+            await bench.open()
+        except BaseException:
+            await bench.aclose()
+            raise
+        self._benches[number] = bench
+        return {"id": number, **bench.describe()}
+
+    def _next(self) -> int:
+        if len(self._benches) + len(self._programs) >= MOST:
+            raise UsageError(f"{MOST} at once", hint="end those that are no longer used")
+        self._number += 1
+        return self._number
+
+    def _bench(self, args: dict[str, Any]) -> Bench:
+        bench = self._benches.get(args.get("id", 0))
+        if bench is None:
+            raise UsageError(f"no field side {args.get('id')!r}", expected="the id that `device` or `system` gave")
+        bench.alive()
+        return bench
+
+    async def _end(self, args: dict[str, Any]) -> dict[str, Any]:
+        number = args.get("id", 0)
+        self._programs.pop(number, None)
+        bench = self._benches.pop(number, None)
+        if bench is not None:
+            await bench.aclose()
+        return {}
+
+    async def _set(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._bench(args).set(str(args.get("device", "")), str(args.get("tag", "")), args.get("value"))
+        return {}
+
+    async def _held(self, args: dict[str, Any]) -> Any:
+        return self._bench(args).held(str(args.get("device", "")), str(args.get("tag", "")))
+
+    async def _fault(self, args: dict[str, Any]) -> str:
+        said = args.get("fault")
+        if not isinstance(said, dict):
+            raise UsageError("a fault", expected='{"name": ..., "device": ...}', got=repr(said)[:60])
+        return self._bench(args).fault(said)
+
+    async def _clear(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._bench(args).field.faults.clear(str(args.get("fault", "")))
+        return {}
+
+    async def _exchanges(self, args: dict[str, Any]) -> dict[str, Any]:
+        log = self._bench(args).log
+        found = log.since(int(args.get("since") or 0))
+        return {"exchanges": found, "last": log.number}
+
+    # -- programs -------------------------------------------------------------------------------------------------------
+
+    async def _program(self, args: dict[str, Any]) -> dict[str, Any]:
+        number = self._next()
+        folders = tuple(map(str, args.get("folders") or ()))
+        program = SteppedProgram(str(args.get("source", "")), folders, float(args.get("cycle_ms") or 10.0))
+        self._programs[number] = program
+        return {"id": number, "values": program.values()}
+
+    def _stepped(self, args: dict[str, Any]) -> SteppedProgram:
+        program = self._programs.get(args.get("id", 0))
+        if program is None:
+            raise UsageError(f"no program {args.get('id')!r}", expected="the id that `program` gave")
+        return program
+
+    async def _input(self, args: dict[str, Any]) -> dict[str, Any]:
+        program = self._stepped(args)
+        for name, value in dict(args.get("values") or {}).items():
+            program.set(name, value, str(args.get("quality") or "good"))
+        return {}
+
+    async def _scan(self, args: dict[str, Any]) -> dict[str, Any]:
+        program = self._stepped(args)
+        if args.get("seconds") is not None:
+            scans = max(1, round(float(args["seconds"]) * 1e9 / program.cycle_ns))
+        else:
+            scans = int(args.get("scans") or 1)
+        program.scan(scans)
+        return {"values": program.values(), "scans": program.scans, "t_s": program.now_ns / 1e9}
+
+    # -- reports --------------------------------------------------------------------------------------------------------
+
+    async def _report(self, args: dict[str, Any]) -> dict[str, Any]:
+        from fieldtwin.testhost.report import write_report
+
+        write_report(args)
+        return {}
+
+
+def _wanted(args: dict[str, Any]) -> Wanted:
+    known = Wanted.__dataclass_fields__
+    said = {key: value for key, value in args.items() if key in known and value is not None}
+    unknown = set(args) - set(known) - {"profiles", "beside"}
+    if unknown or not said.get("device"):
+        raise UsageError("a device", expected="device=NAME, and of " + ", ".join(known), got=", ".join(sorted(unknown)))
+    return Wanted(**said)
+
+
+def folder_gone(folder: Path) -> None:
+    """Remove what a bench that never opened has left."""
+    import shutil
+
+    shutil.rmtree(folder, ignore_errors=True)

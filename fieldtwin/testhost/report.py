@@ -1,0 +1,42 @@
+"""A test run's results as one HTML page with its requirement matrix: what the plugin collected, by the report of scenarios."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.report.html import write_html
+from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
+from gateway.core.errors import UsageError
+
+_VERDICTS = {verdict.value: verdict for verdict in Verdict}
+
+
+def write_report(args: dict[str, Any]) -> None:
+    """Write ``file`` from ``tests`` (name, verdict, requirements, text, took_s, reproduce, file, line), ``title``, ``reproduce``,
+    ``versions``. Raises `UsageError` for a verdict that there is not."""
+    results = []
+    for test in args.get("tests") or ():
+        verdict = _VERDICTS.get(str(test.get("verdict")))
+        if verdict is None:
+            raise UsageError("a verdict", expected=", ".join(_VERDICTS), got=repr(test.get("verdict")))
+        text = str(test.get("text") or "")
+        checks = [CheckResult("1", text.splitlines()[-1] if text else "", verdict, got=text)] if text else []
+        results.append(
+            ScenarioResult(
+                str(test.get("name")),
+                verdict,
+                checks if verdict is not Verdict.PASSED else (),
+                tuple(map(str, test.get("requirements") or ())),
+                file=str(test.get("file") or ""),
+                line=int(test.get("line") or 0),
+                reason=text if verdict is Verdict.SKIPPED else "",
+                reproduce=str(test.get("reproduce") or ""),
+                took_s=float(test.get("took_s") or 0.0),
+            )
+        )
+    versions = {str(k): str(v) for k, v in dict(args.get("versions") or {}).items()}
+    report = Report(
+        str(args.get("title") or "tests"), results, reproduce=str(args.get("reproduce") or ""), versions=versions
+    )
+    write_html(report, Path(str(args["file"])))

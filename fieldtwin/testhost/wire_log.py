@@ -1,0 +1,96 @@
+"""What was exchanged on the wires of a field side, decoded: requests with their answers, messages; numbered and bounded.
+
+Fed with bytes by the emulators' ends, with frames by a listener on a CAN bus. Knows no test.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+from fieldtwin.decoding.decoder import Decoder
+from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import Clock
+from twin.system import System
+
+MOST = 20_000
+AT_ONCE = 5_000
+MAX_CONNECTIONS = 256
+QUIET_NS = 50_000_000
+"""A request that has no answer for so long is shown as one without; should one come after all, it is a stray."""
+
+
+@dataclass
+class _Line:
+    decoder: Decoder
+    end: object
+    last_ns: int = 0
+
+
+class WireLog:
+    """The latest `MOST` exchanges of a system's buses."""
+
+    def __init__(self, system: System, clock: Clock) -> None:
+        self._system = system
+        self._clock = clock
+        self._start_ns = clock.monotonic_ns()
+        self._lines: dict[tuple[str, int], _Line] = {}
+        self._kept: deque[tuple[int, Exchange]] = deque(maxlen=MOST)
+        self.number = 0
+        """Of the latest exchange; they count from 1."""
+
+    def on_bytes(self, bus: str, end: object, reply: bool, data: bytes) -> None:
+        """A chunk on a line or socket; `end` tells connections apart."""
+        way = "received" if reply else "sent"
+        self._feed(bus, end, {"dir": way, "bytes": data.hex()})
+
+    def on_frame(self, bus: str, frame: CanFrame) -> None:
+        """A frame on a CAN bus, whoever sent it."""
+        data: dict[str, Any] = {"dir": "received", "id": frame.can_id, "bytes": frame.data.hex()}
+        data |= {key: True for key, on in (("ext", frame.extended), ("rtr", frame.remote), ("err", frame.error)) if on}
+        self._feed(bus, None, data)
+
+    def _feed(self, bus: str, end: object, data: dict[str, Any]) -> None:
+        key = bus, hash(end) if isinstance(end, tuple) else id(end)
+        line = self._lines.get(key)
+        if line is None:
+            if len(self._lines) >= MAX_CONNECTIONS:
+                oldest = min(self._lines, key=lambda k: self._lines[k].last_ns)
+                self._take(self._lines.pop(oldest).decoder.finish())
+            line = self._lines[key] = _Line(Decoder(self._system), end)  # `end` is kept, so that its id stays its own
+        line.last_ns = self._clock.monotonic_ns()
+        self._take(line.decoder.feed(Event(line.last_ns - self._start_ns, Kind.FRAME, bus, data)))
+
+    def _take(self, exchanges: list[Exchange]) -> None:
+        for exchange in exchanges:
+            self.number += 1
+            self._kept.append((self.number, exchange))
+
+    def since(self, number: int) -> list[dict[str, Any]]:
+        """Those after `number`, the oldest first, `AT_ONCE` at most, as plain data with their number, times (s since the log
+        began) and words. Of secrets there is no value."""
+        now_ns = self._clock.monotonic_ns()
+        for line in self._lines.values():
+            if now_ns - line.last_ns >= QUIET_NS:
+                self._take(line.decoder.finish())
+        found = [(n, e) for n, e in self._kept if n > number][:AT_ONCE]
+        return [_plain(n, e) for n, e in found]
+
+
+def _plain(number: int, exchange: Exchange) -> dict[str, Any]:
+    return {
+        "number": number,
+        "t_s": exchange.t_ns / 1e9,
+        "bus": exchange.bus,
+        **exchange.describe(),
+        "access": exchange.access,
+        "address": exchange.address,
+        "count": exchange.count,
+        "text": exchange.text,
+        "reply_text": exchange.reply_text,
+        "request": "" if exchange.secrets else exchange.request.hex(),
+        "reply": "" if exchange.secrets else exchange.reply.hex(),
+    }

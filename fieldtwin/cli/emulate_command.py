@@ -94,6 +94,7 @@ def command(
     fieldtwin emulate drive-cia402 --on can:fieldtwin/127.0.0.1:29536     a drive on a software CAN bus, made or joined
     fieldtwin emulate drive.eds --node 5 --on can:fieldtwin/127.0.0.1:0   a CANopen node from its data sheet
     fieldtwin emulate site.jsonl --on rtu:/tmp/ttyV0                 what was recorded, answered again, no profile needed
+    fieldtwin emulate bus.log --node 5 --on can:fieldtwin/127.0.0.1:29536   a node of a log of candump, no data sheet needed
     """
     kind, path = _kind(what, tuple(Path(p) for p in profiles))
     if kind != "recording" and (unknown or at_end):
@@ -141,6 +142,12 @@ def command(
 
         log = Path(recordings[0]) if recordings else None
         return run_loop(run_data_sheet(path, endpoints, node, bitrate, log))
+    if kind == "log":
+        if unit is not None or recordings:
+            raise UsageError("a log is its own recording, and has no unit id", expected="--node")
+        from fieldtwin.running.data_sheet_here import run_log
+
+        return run_loop(run_log(path, endpoints, node, bitrate))
     if unit is not None and node is not None:
         raise UsageError("a device has a unit id or a node id, not both")
     unit = node if unit is None else unit
@@ -156,10 +163,12 @@ def command(
 
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
-    """What `what` names: ("system" | "device" | "recording" | "data sheet", file)."""
+    """What `what` names: ("system" | "device" | "recording" | "log" | "data sheet", file)."""
     direct = Path(what)
     if direct.suffix.lower() in (".eds", ".dcf"):
         return "data sheet", direct
+    if direct.suffix == ".log":
+        return "log", direct
     if direct.suffix == ".jsonl":
         shipped = data_root() / "recordings" / what
         return "recording", direct if direct.is_file() else shipped

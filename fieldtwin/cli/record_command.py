@@ -255,7 +255,9 @@ class _Job:
             return 4 if silent else 0
         names = {"bytes_sent": "bytes to the device", "bytes_received": "bytes back", "lost_here": "frames lost here"}
         text = ", ".join(
-            f"{v} {names.get(k, k)}" for k, v in said.items() if isinstance(v, int) and (v or k == "exchanges")
+            f"{v} {names.get(k, k)}"
+            for k, v in said.items()
+            if isinstance(v, int) and (v or k in ("exchanges", "frames"))
         )
         data.print(f"{said.get('recording', self._out)}: {text or 'nothing'}", soft_wrap=True, markup=False)
         for profile in said.get("profiles", ()):

@@ -1,8 +1,10 @@
-"""A CANopen node from nothing but its data sheet: what `fieldtwin emulate FILE.eds --on can:...` runs."""
+"""A CANopen node from nothing but its data sheet, or a log: what `fieldtwin emulate FILE.eds|FILE.log --on can:...` runs."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from emulators.canopen.dictionary import Dictionary, load_eds
 from emulators.canopen.lss import UNCONFIGURED
@@ -13,10 +15,14 @@ from emulators.models.by_profile import model_for
 from emulators.replay.can_log import CanLog
 from emulators.replay.objects import recorded_objects
 from fieldtwin.cli.talk import talk
+from fieldtwin.formats.candump import read_log
+from fieldtwin.recording.log_sheet import LogSheet, nodes_of
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.until_stopped import until_stopped
+from gateway.core.canframe import CanFrame
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 
@@ -49,6 +55,26 @@ async def run_data_sheet(
         for thing in reversed(closing):
             await thing.aclose()
     return 0
+
+
+async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, bitrate: int | None = None) -> int:
+    """As `run_data_sheet`, for a log alone: the data sheet is made from it, so that the node has what the log has and no more."""
+
+    def frames() -> Iterator[tuple[int, CanFrame]]:
+        return ((t_ns, frame) for t_ns, _, frame in read_log(path))
+
+    there = nodes_of(frames())
+    if node_id is None and len(there) != 1:
+        if not there:
+            raise UsageError(f"{path.name} holds nothing of any node")
+        raise UsageError(f"{path.name}: which node?", expected=f"--node, one of {', '.join(map(str, there))}")
+    node_id = node_id or there[0]
+    text = LogSheet(frames(), node_id).eds(path.stem)
+    talk.print(f"node {node_id} has what {path.name} has of it; of names and meanings nothing is known", soft_wrap=True)
+    with TemporaryDirectory(prefix="fieldtwin-") as folder:
+        sheet = Path(folder) / f"{path.stem}.eds"
+        sheet.write_text(text, encoding="utf-8")
+        return await run_data_sheet(sheet, endpoints, node_id, bitrate, path)
 
 
 def _node(dictionary: Dictionary, node_id: int, log: Path | None) -> CanopenNode:

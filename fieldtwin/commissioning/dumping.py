@@ -23,7 +23,7 @@ from fieldtwin.commissioning.wire_log import WireLog
 from gateway.core.clock import Clock
 from gateway.core.connection import Connector
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.profile import RegisterRange, resolve_gap
 from gateway.wallclock import WallClock
 
@@ -144,6 +144,8 @@ async def dump(
     `resume` with a file that is complete does nothing but further passes.
     """
     clock = clock or WallClock()
+    if out.exists() and not resume:
+        raise FileInvalid("there is such a file already", path=str(out), hint="--resume goes on with it")
     earlier = load_dump(out, keep_lines=True) if resume and out.exists() and out.stat().st_size else None
     if earlier is not None:
         check_resumable(job, earlier)

@@ -89,15 +89,15 @@ async def identify_modbus(
         url, timeout_s=timeout_s, spacing_s=1 / per_s, echo=echo, taps=taps, connector=connector, clock=clock
     ) as client:
         asker = _Asker(client, unit, result)
-        on_progress("function 2Bh/0Eh, device identification")
-        await asker.identification()
         on_progress("function 11h, server id")
         reply = await asker.ask("11", ReportServerId())
         result.clues.server_id = reply.raw if reply is not None else None
         on_progress("SunSpec header")
         await asker.sunspec()
-        if not result.answers:
-            on_progress("register 0")
+        on_progress("function 2Bh/0Eh, device identification")
+        await asker.identification()
+        if "no answer" in result.clues.silence.values() or not result.answers:
+            on_progress("register 0")  # also for servers that swallow what follows a function that they do not know
             await asker.ask("03", ReadRegisters("holding", 0, 1))
         if result.answers:
             for profile in profiles:
@@ -159,8 +159,6 @@ class _Asker:
                 self._result.clues.sunspec = await self._models(base)
                 return
             other = other or reply is not None
-            if not self._result.answers:
-                return
         if other:
             self._result.clues.silence["sunspec"] = "no header"
 

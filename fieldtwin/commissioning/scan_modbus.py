@@ -28,6 +28,10 @@ from gateway.wallclock import WallClock
 
 SHARED_QUIET_NS = 30 * NS_PER_MS
 """On a line with another master: so much silence before each question."""
+QUICK_TIMEOUT_S, LINE_TIMEOUT_S, SOCKET_TIMEOUT_S = 0.2, 0.6, 1.0
+"""For each reply, where nobody says otherwise. libmodbus's servers take what follows a question to another unit within
+500 ms for its answer, and never hear a question that comes sooner: a sweep that is to find them has to be so slow."""
+MANY_FAILURES = 3
 MOST_BREAKS = 3
 """A far end that hangs up so often in a row over one unit is not asked for it again."""
 
@@ -99,8 +103,9 @@ class ModbusScanner:
         self._tell, self._stop = on_progress, stop
         self._taps, self._connector, self._clock = taps, connector, clock or WallClock()
         serial = self._endpoint.is_serial
-        timeout_s = self._options.timeout_s or (0.2 if serial else 1.0)
+        timeout_s = self._options.timeout_s or (LINE_TIMEOUT_S if serial else SOCKET_TIMEOUT_S)
         self._pace = Pace(timeout_s, 1 / self._options.per_s, self._framing == "ascii")
+        self._quick = replace(self._pace, timeout_s=self._options.timeout_s or QUICK_TIMEOUT_S)
         self._units = self._options.units or (plan.SERIAL_UNITS if serial else plan.TCP_UNITS)
         if serial and not all(1 <= u <= 247 for u in self._units):
             raise UsageError("units of a serial line", expected="1 to 247", got=str(self._units))
@@ -114,10 +119,19 @@ class ModbusScanner:
                 await self._scan_line()
             else:
                 await self._scan_socket()
+            self._doubt()
         finally:
             self.result.took_s = (self._clock.monotonic_ns() - began_ns) / NS_PER_S
             self.result.stopped = self._stop()
         return self.result
+
+    def _doubt(self) -> None:
+        """Any exception is a presence; one is no proof of it."""
+        failures = [f.answer.unit for f in self.result.units if f.answer.exception == 4]
+        if len(failures) >= MANY_FAILURES:
+            self.result.notes.append(
+                f"{len(failures)} units answer with exception 04h only: some servers say so of units that they do not have"
+            )
 
     # -- a serial line --------------------------------------------------------------------------------------------
 
@@ -144,6 +158,8 @@ class ModbusScanner:
             self._pace, plan.likely_settings(ascii_mode=ascii_mode), self._units, self._options.quick_s
         )
         done = await self._steps(steps, "likely settings", until_found=not self._options.every_setting)
+        if self._quick != self._pace:
+            done = []  # asked too quickly for some: they are asked again
         found = {f.settings for f in self.result.units}
         if found:
             await self._steps(plan.full_pass(self._pace, list(found), self._units, done), "every unit")
@@ -303,6 +319,7 @@ class ModbusScanner:
         result = self.result
         result.asked += sweep.asked
         result.echo = result.echo or sweep.echo
+        result.units = [f for f in result.units if f.settings != settings or f.answer.unit not in sweep.found]
         result.units += [FoundUnit(sweep.found[u], settings) for u in sorted(sweep.found)]
         result.damaged += [(settings, u) for u in sorted(sweep.damaged)]
         result.behind_gateway |= sweep.behind_gateway

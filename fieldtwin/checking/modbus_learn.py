@@ -57,21 +57,23 @@ async def learn(wire: ModbusWire, given: dict[str, int]) -> None:
 async def _table(wire: ModbusWire, function: int, given: dict[str, int]) -> tuple[bytes, bytes] | None:
     """Look for a cell of one table. A request that was refused, with its reply, where that is all there is."""
     table, refusal, silent = TABLE[function], None, 0
+    counts = (1, 2) if function in (0x03, 0x04) else (1,)  # some have no odd counts (MB-048)
     for address in [given[table]] if table in given else STARTS:
-        pdu = read_of(function, address, 1)
-        answer = (await wire.ask(pdu)).first
-        if answer is None or answer.unit != wire.unit or answer.refusal in GATEWAY_SAYS_NO:
-            silent += 1
-            if silent == 2:  # once may be a lost frame
+        for count in counts:
+            pdu = read_of(function, address, count)
+            answer = (await wire.ask(pdu)).first
+            if answer is None or answer.unit != wire.unit or answer.refusal in GATEWAY_SAYS_NO:
+                silent += 1
+                if silent == 2:  # once may be a lost frame
+                    return refusal
+                continue
+            if values_of(answer, function, count) is not None:
+                wire.readable[function] = (address, count)
+                return None
+            refusal = pdu, answer.pdu
+            wire.refused[function] = answer.refusal
+            if answer.refusal == 0x01:  # it has no such table
                 return refusal
-            continue
-        if values_of(answer, function, 1) is not None:
-            wire.readable[function] = (address, 1)
-            return None
-        refusal = pdu, answer.pdu
-        wire.refused[function] = answer.refusal
-        if answer.refusal == 0x01:  # it has no such table
-            break
     return refusal
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from gateway.core.errors import UsageError
     help="The document, HTML.",
 )
 @click.option("--site", default="", help="What the place is called.  [default: the name of the folder]")
-@click.option("--by", default="", help="Who carried it out.  [default: the name you are logged in by]")
+@click.option("--by", default="", help="Who carried it out.  [default: as the files say]")
 @click.option("--for", "customer", default="", help="Who it is for; stands at the signature.")
 @click.option("--remarks", default="", help="What else is to be said.")
 @click.option(
@@ -61,9 +62,12 @@ def command(
 
     folder = next((path for path in files if path.is_dir()), files[0].parent)
     document, left_out = read_site(
-        files, site=site or folder.resolve().name, by=by or who(), customer=customer, remarks=remarks,
+        files, site=site or folder.resolve().name, by=by, customer=customer, remarks=remarks,
         prepared=datetime.now(UTC).isoformat(timespec="seconds"),
     )  # fmt: skip
+    if not by:
+        named_ones = {source.by for source in document.sources if source.by}
+        document = replace(document, by=named_ones.pop() if len(named_ones) == 1 else who())
     for text, what in [(text, "label") for text in labels] + [(text, "serial_said") for text in serials]:
         name, said = next(iter(pairs((text,), "device").items()))
         named = [d for d in document.devices if name in (str(d.number), d.name, f"{d.name} on {d.endpoint}")]

@@ -83,6 +83,8 @@ def read_piece(path: Path) -> Piece:
             head = file.readline(1 << 20)
             if b'"fieldtwin_dump"' in head:
                 return dump_piece(path)
+            if head.startswith(b'{"started"'):
+                raise NotTaken("a log of what was sent", path=str(path))
             raw = head + file.read(MOST_BYTES)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
@@ -151,11 +153,13 @@ def _case(case: dict[str, Any], weight: Weight) -> Deviation:
 def compare_piece(data: dict[str, Any]) -> Piece:
     """The JSON of `fieldtwin compare`: a device against a recording."""
     about, found = data["about"], data["differences"]
-    deviations = [_difference(d) for d in found[:MOST_ROWS]]
-    if len(found) > MOST_ROWS:
-        deviations.append(
-            Deviation("deviation", "further differences", "none", f"{len(found) - MOST_ROWS} more, in the file")
-        )
+    alike_ones: dict[tuple[str, ...], list[dict[str, Any]]] = {}
+    for each in found:
+        alike_ones.setdefault((each["what"], each["where"], each["request"]), []).append(each)
+    deviations = [_difference(same) for same in list(alike_ones.values())[:MOST_ROWS]]
+    if len(alike_ones) > MOST_ROWS:
+        more = f"{len(alike_ones) - MOST_ROWS} more kinds, in the file"
+        deviations.append(Deviation("deviation", "further differences", "none", more))
     slow = [row for row in data["latency"] if not row["alike"]]
     deviations += [
         Deviation("deviation", "latency differs", _ms(row["recorded_s"]), _ms(row["other_s"]), str(row["service"]))
@@ -178,11 +182,13 @@ def compare_piece(data: dict[str, Any]) -> Piece:
     return _headed("comparison", about, "met" if data["met"] else "not met", summary, facts, deviations, tables)
 
 
-def _difference(found: dict[str, Any]) -> Deviation:
-    what, recorded, other, where = (str(found[key]) for key in ("what", "recorded", "other", "where"))
-    return Deviation(
-        "deviation", f"{what} differs: {found['request']}", recorded, other, where, f"at {found['t_s']:.1f} s"
-    )
+def _difference(same: list[dict[str, Any]]) -> Deviation:
+    """What differed in one place, however often: the first time as an example."""
+    first = same[0]
+    what, request, recorded, other, where = (str(first[k]) for k in ("what", "request", "recorded", "other", "where"))
+    often = f", {len(same)} times, first" if len(same) > 1 else ","
+    source = f"{request}{often} at {first['t_s']:.1f} s"
+    return Deviation("deviation", f"{what} differs", recorded, other, where, source)
 
 
 def _ms(quantiles: list[float]) -> str:

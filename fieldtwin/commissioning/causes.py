@@ -20,6 +20,8 @@ from gateway.core.endpoint import SerialSettings
 MANY = 0.2
 """A share of errors that is no accident."""
 HEALTHY = 0.97
+ENOUGH_TEXT = 12
+"""Fewer readable bytes are chance."""
 _EDGES = frozenset({0x00, 0x80, 0xC0, 0xE0, 0xF0, 0xF8, 0xFC, 0xFE, 0xFF})
 """What a receiver makes of bits that are many times longer than its own."""
 
@@ -89,7 +91,7 @@ def serial_causes(e: SerialEvidence) -> list[Cause]:
     if not e.heard.bytes:
         answered = e.probe is not None and e.probe.answer == "good"
         found += [] if answered else _of_silence(e)
-    elif e.heard.share < HEALTHY or not e.heard.sure:
+    elif e.heard.share < HEALTHY or not e.heard.sure or _elsewhere(e) or _many_errors(e):
         found += _of_garbage(e)
     if e.heard.sure:
         found += _of_talk(e.heard)
@@ -103,6 +105,16 @@ def serial_causes(e: SerialEvidence) -> list[Cause]:
     if e.probe is not None:
         found += _of_probe(e.probe, e)
     return ranked(found)
+
+
+def _elsewhere(e: SerialEvidence) -> bool:
+    """Whether traffic proved other settings."""
+    return e.verdict is not None and e.verdict.sure and e.settings not in (e.verdict.settings, *e.verdict.others)
+
+
+def _many_errors(e: SerialEvidence) -> bool:
+    """Whether the port counts errors though the frames are whole: bits are right and their parity is not, for one."""
+    return e.errors is not None and e.errors.parity + e.errors.frame > (1 - HEALTHY) * e.heard.bytes
 
 
 def _of_silence(e: SerialEvidence) -> list[Cause]:
@@ -171,7 +183,7 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
     framing = errors.frame / total if errors is not None else 0.0
     edges = sum(n for value, n in heard.values.items() if value in _EDGES) / total
     text = sum(n for value, n in heard.values.items() if 0x20 <= value < 0x7F or value in (0x0A, 0x0D)) / total
-    if text > 0.9 and heard.framing == "rtu":
+    if text > 0.9 and total >= ENOUGH_TEXT and heard.framing == "rtu":
         colons = heard.values.get(0x3A, 0)
         what = "Modbus ASCII, perhaps" if colons and heard.values.get(0x0D) else "no Modbus RTU"
         causes.append(Cause("another protocol", 90, f"{text:.0%} of it is readable text: {what}", "try ascii:PORT"))
@@ -210,7 +222,7 @@ def _of_garbage(e: SerialEvidence) -> list[Cause]:
         causes.append(
             Cause("termination or noise", 30, "no whole frame", "is there a sender at all, or only an open line?")
         )
-        if not text > 0.9:
+        if text <= 0.9:
             causes.append(Cause("another protocol", 25, "no whole frame", "what should speak here?"))
     return causes
 

@@ -103,10 +103,10 @@ class Device:
 
     @property
     def type(self) -> str:
-        """Maker and product, as far as it says."""
+        """Maker and product, as far as it says; else the profile by which it was read."""
         said = self.identity
         words = [said.get(name, "") for name in ("vendor", "product", "name", "product code", "model", "server id")]
-        return ", ".join(dict.fromkeys(word for word in words if word))
+        return ", ".join(dict.fromkeys(word for word in words if word)) or said.get("profile", "")
 
     @property
     def revision(self) -> str:

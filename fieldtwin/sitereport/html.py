@@ -109,7 +109,7 @@ def _grid(columns: tuple[str, ...], rows: list[list[object]], widths: tuple[int,
 def _devices(document: Document) -> Markup:
     rows: list[list[object]] = []
     for device in document.devices:
-        done = [f"{HEADINGS[p.kind].lower()} {p.verdict}, {day(p.when)}" for p in device.pieces]
+        done = [f"{HEADINGS[p.kind].lower()}: {p.verdict}" for p in device.pieces]
         found = sum(v.weight == "deviation" for p in device.pieces for v in p.deviations)
         rows.append(
             [

@@ -48,6 +48,8 @@ def dump_piece(path: Path) -> Piece:
 def identity(dump: Dump) -> dict[str, str]:
     """What the device says of itself: a CANopen node in its objects, a Modbus device by functions 2B/0E and 11."""
     said: dict[str, str] = {}
+    if dump.header.get("profile"):
+        said["profile"] = str(dump.header["profile"])
     for each in dump.passes:
         for key, name in NUMBERS.items():
             if (raw := each.cells.get(key)) is not None:

@@ -1,0 +1,131 @@
+"""The verbs as a person calls them: an emulator in another process is recorded, emulated, compared; what is said, and exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from fieldtwin.cli.compare_command import command as compare
+from fieldtwin.cli.export_command import command as export
+from fieldtwin.cli.record_command import command as record
+from gateway.core.errors import FileInvalid, NotAllowed, Unreachable, UsageError
+from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, encode_exchange, encode_header
+
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def emulated(*words: str) -> Iterator[None]:
+    """`fieldtwin emulate` with these words, once it serves."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    emulate = [sys.executable, "-m", "fieldtwin", "emulate", *words]
+    process = subprocess.Popen(emulate, stderr=subprocess.PIPE, cwd=ROOT, env=environment)
+    assert process.stderr is not None
+    try:
+        while line := process.stderr.readline():
+            if b" on " in line:
+                break
+        yield
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.stderr.read()
+        process.stderr.close()
+        assert process.wait() == 0
+
+
+def called(command: Any, *words: object) -> tuple[int, dict[str, Any]]:
+    """The exit code, and what was printed with --json."""
+    done = CliRunner().invoke(command, [*map(str, words), "--json"], standalone_mode=False)
+    if done.exception is not None:
+        raise done.exception
+    return done.return_value, json.loads(done.stdout.splitlines()[-1])
+
+
+@pytest.mark.slow
+def test_a_device_is_recorded_emulated_and_compared(tmp_path: Path) -> None:
+    device, twin, out = (
+        f"rtu:{tmp_path}/dev?baudrate=115200",
+        f"rtu:{tmp_path}/twin?baudrate=115200",
+        tmp_path / "r.jsonl",
+    )
+    with emulated("delta-vfd-e", "--on", device):
+        code, said = called(
+            record, device, "--profile", "delta-vfd-e", "--rounds", 3, "--every", "10ms", "--emulated", "-o", out
+        )
+    assert (code, said["rounds"], said["exchanges"], said["unanswered"]) == (0, 3, 9, 0)
+    with RecordingReader(out) as reader:
+        header = reader.header
+        assert (header.device, header.source, header.prototype) == ("delta/vfd-e", "measured", True)
+        assert all(e.latency_s > 0 for e in reader.exchanges())
+    with emulated(str(out), "--on", twin):
+        code, said = called(compare, out, twin, "--profile", "delta-vfd-e", "--latency", "any")
+    assert (code, said["met"], said["compared"], said["values"]) == (0, True, 9, 1.0)
+    assert 0 < said["timing"] <= 1
+    changed = tmp_path / "changed.jsonl"
+    lines = out.read_bytes().splitlines(keepends=True)
+    changed.write_bytes(b"".join([*lines[:-1], lines[-1].replace(b'"rep":"03', b'"rep":"83')]))
+    code, said = called(compare, out, changed)
+    assert (code, said["met"]) == (1, False)
+    code, said = called(compare, out, changed, "--least", 80, "--latency", "any")
+    assert (code, said["met"]) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (("-o", "x.jsonl"), "what is to be recorded"), (("tcp://127.0.0.1:1", "-o", "x.jsonl"), "what is to be asked"),
+        (("--tap", "rtu:a", "can:socketcan/can0", "-o", "x.jsonl"), "a line is tapped between bytes"),
+        (("can:socketcan/can0", "--like", "w.jsonl", "-o", "x.log"), "--like is for Modbus"),
+        (("tcp://127.0.0.1:1", "--like", "w.jsonl", "-o", "x.jsonl"), "asks nothing that may be asked again"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_recorded_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], error: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _write(tmp_path / "w.jsonl", "0600010005")
+    with pytest.raises(UsageError, match=error):
+        called(record, *words)
+
+
+def _write(path: Path, *requests: str) -> Path:
+    header = RecordingHeader(version=1, device="a/b", kind="exchanges", source="measured")
+    lines = [encode_exchange(Exchange(0.0, 1, bytes.fromhex(r), bytes.fromhex(r))) for r in requests]
+    path.write_bytes(encode_header(header) + b"".join(lines))
+    return path
+
+
+def test_a_plant_is_not_written_to_by_the_way(tmp_path: Path) -> None:
+    path, nobody = _write(tmp_path / "w.jsonl", "0600010005"), "tcp://127.0.0.1:1"
+    with pytest.raises(NotAllowed, match="were not allowed"):
+        called(compare, path, nobody, "--writes")
+    with pytest.raises(Unreachable):
+        called(compare, path, nobody, "--writes", "--yes")
+    restart = _write(tmp_path / "d.jsonl", "0800010000")
+    with pytest.raises(NotAllowed, match="diagnostics"):
+        called(compare, restart, nobody, "--writes", "--yes")
+
+
+def test_tolerances_that_are_none_and_files_that_are_not_there(tmp_path: Path) -> None:
+    path = _write(tmp_path / "w.jsonl", "0300010001")
+    for tolerance in ("x", "-1", "nan%", "1,5"):
+        with pytest.raises(UsageError, match="tolerance"):
+            called(compare, path, path, f"--tolerance={tolerance}")
+    with pytest.raises(UsageError, match="one tolerance for all"):
+        called(compare, path, path, "--tolerance=1", "--tolerance=2")
+    with pytest.raises(FileInvalid, match="cannot read"):
+        called(compare, path, tmp_path / "no.jsonl")
+    with pytest.raises(UsageError, match="cannot export"):
+        called(export, path, tmp_path / "x.xls")
+    code, said = called(compare, path, path)
+    assert (code, said["compared"], said["values"], said["timing"], said["differences"]) == (0, 1, 1.0, 1.0, [])

@@ -1,4 +1,4 @@
-"""The verbs as a person calls them: an emulator in another process is recorded, emulated, compared; what is said, and exit codes."""
+"""The verbs as a person calls them: a device is recorded, emulated and compared; what is said, and with what exit code."""
 
 from __future__ import annotations
 

@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ HELD_AT_ONCE = 5_000
 
 class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What the process is told. `recordings` maps a device to a file, `listen` a bus to an endpoint, over the prototype
-    file; `control` is ``HOST:PORT`` for a TCP control channel, or empty."""
+    file; `seed` None: the prototype file's; `control` is ``HOST:PORT`` for a TCP control channel, or empty."""
 
     system: str
     run_dir: str
@@ -43,6 +44,7 @@ class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     listen: dict[str, str] = {}
     control: str = ""
     token: str = ""
+    seed: int | None = None
 
 
 def resolve(config: FieldConfig) -> DigitalTwinPrototype:
@@ -60,6 +62,8 @@ def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
         prototype = prototype.with_recording(device, Path(path))
     if config.speed:
         prototype = prototype.with_speed(config.speed)
+    if config.seed is not None:
+        prototype = replace(prototype, seed=config.seed)
     for bus, url in config.listen.items():
         if bus not in prototype.buses:
             raise UsageError(f"no bus {bus!r}", expected=", ".join(prototype.buses))

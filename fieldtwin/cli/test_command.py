@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 
 import click
@@ -14,6 +15,7 @@ from rich.table import Table
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import data
+from fieldtwin.conformance.case import Danger
 from gateway.core.errors import UsageError
 
 SUFFIX = ".scenario.yaml"
@@ -22,7 +24,30 @@ _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "
 
 @click.command("test")
 @click.argument("files", nargs=-1, type=click.Path(exists=True))
-@click.option("--target", type=click.Choice(["virtual"]), default="virtual", help="Where; default: virtual.")
+@click.option(
+    "--target",
+    type=click.Choice(["virtual", "local", "compose", "real"]),
+    default="virtual",
+    show_default=True,
+    help="Virtual time; processes on this host; containers; a plant.",
+)
+@click.option(
+    "--allow",
+    type=click.Choice([danger.value for danger in Danger]),
+    default=Danger.READ.value,
+    show_default=True,
+    help="With --target real: what steps may do at most.",
+)
+@click.option("--instance", default="", help="With compose, real: what runs on this host under that name.")
+@click.option("--field", "field_host", default="field", metavar="HOST[:PORT]", help="With compose: the field side.")
+@click.option("--token", default="", help="Token of that field side's control channel.")
+@click.option("--far", default="", metavar="ENDPOINT", help="With real: where the far modem is, for `send`.")
+@click.option(
+    "--capture",
+    type=click.Path(exists=True, dir_okay=False),
+    help="With --instance: the file that its wires are captured to.",
+)
+@click.option("--waivers", type=click.Path(exists=True, dir_okay=False), help="Failures that somebody answers for.")
 @click.option("--seed", type=int, default=None, help="Another seed than the scenario's.")
 @click.option("--junit", type=click.Path(dir_okay=False), help="JUnit XML to this file.")
 @click.option("--html", type=click.Path(dir_okay=False), help="One page with verdicts and diagrams to this file.")
@@ -34,6 +59,13 @@ _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "
 def command(
     files: tuple[str, ...],
     target: str,
+    allow: str,
+    instance: str,
+    field_host: str,
+    token: str,
+    far: str,
+    capture: str | None,
+    waivers: str | None,
     seed: int | None,
     junit: str | None,
     html: str | None,
@@ -44,18 +76,30 @@ def command(
     """Run the scenarios in FILES (*.scenario.yaml; of a folder all that are in it; without FILES those of this folder).
 
     The exit code is 0 when all passed and 1 otherwise: a scenario that was skipped or stayed inconclusive has not passed.
+
+    
+    --target local       gateway, PLC and emulators as processes, on ptys and sockets of this host
+    --target compose     what runs already, judged beside it: docker compose exec controller fieldtwin test ...
+    --target real        the plant: no faults, nothing set, read-only without --allow write
     """
-    from fieldtwin.report.model import Report, ScenarioResult, Verdict
-    from fieldtwin.running.virtual_scenario import run_virtual
+    from fieldtwin.conformance.waivers import Waivers, load_waivers
+    from fieldtwin.report.model import Report, ScenarioResult
+    from fieldtwin.running.scenario_targets import Target, run_scenario
     from fieldtwin.scenarios.form import load_scenario
+    from fieldtwin.scenarios.waiving import all_well, ids_of, waive
 
     paths = _found(files)
     if trace and len(paths) != 1:
         raise UsageError("--trace belongs to one scenario", got=f"{len(paths)} of them")
+    _check(target, allow, instance, far, capture)
     scenarios = [load_scenario(path, tuple(map(Path, profiles))) for path in paths]
+    known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
+    waived = load_waivers(Path(waivers), known) if waivers else Waivers()
+    where = Target(target, seed, instance, field_host, token, far, Path(capture) if capture else None, Danger(allow))
     results: list[ScenarioResult] = []
     for scenario in scenarios:
-        results.append(run_virtual(scenario, seed, Path(trace) if trace else None))
+        result = run_scenario(scenario, where, Path(trace) if trace else None)
+        results.append(waive(result, waived, datetime.now(UTC).date()))
         if not as_json:
             _show(results[-1])
     report = Report(
@@ -82,7 +126,18 @@ def command(
     else:
         counts = ", ".join(f"{n} {verdict.value}" for verdict, n in report.counts.items() if n)
         data.print(f"[bold]{counts}[/bold]")
-    return 0 if report.verdict is Verdict.PASSED else 1
+    return 0 if all_well(results) else 1
+
+
+def _check(target: str, allow: str, instance: str, far: str, capture: str | None) -> None:
+    if target != "real" and (far or allow != Danger.READ.value):
+        raise UsageError("--far and --allow go with --target real", got=f"--target {target}")
+    if target in ("virtual", "local") and instance:
+        raise UsageError("--instance names what runs already", expected="--target compose or real")
+    if capture and target != "compose" and not instance:
+        raise UsageError(
+            "--capture is of what runs already", expected="--target compose, or --target real --instance NAME"
+        )
 
 
 def _found(files: tuple[str, ...]) -> list[Path]:

@@ -27,5 +27,11 @@ class RunOptions:
     commands: tuple[int, ...] = ()
     capture: Path | None = None
     cold: bool = False
+    thread: str = ""
+    """Where the plant's side of a digital thread goes (`twin.thread_place`), empty for none."""
+    thread_store: str = ""
+    """What keeps its log; a file of the instance where nothing is said."""
+    seed: int | None = None
+    """Of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()
     """As `emulators.faults.schema.load_faults` gives them."""

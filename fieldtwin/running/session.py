@@ -30,6 +30,7 @@ from twin.controller import ControllerConfig
 from twin.instance import Instance
 from twin.mapping import mapping_to_json
 from twin.physical import PhysicalTwin
+from twin.plant_thread import PlantThreadConfig
 from twin.system import System, load_system
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ class RunSession:
         self.plc_status: dict[str, Any] | None = None
         self.field_status: dict[str, Any] | None = None
         self.outputs_confirmed_safe: bool | None = None
+        self.thread_place = ""
         self.started_ns = 0
         self.stopped = asyncio.Event()
         self._stack = AsyncExitStack()
@@ -121,11 +123,27 @@ class RunSession:
         )
         await self._start_child("gateway", "twin.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
+        if self.options.thread:
+            await self._start_thread(run_dir)
         self.started_ns = self.clock.monotonic_ns()
         if self._field is not None:
             for fault in self.options.faults:  # each knows its time
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
         self._start_watching()
+
+    async def _start_thread(self, run_dir: Path) -> None:
+        """The plant's side of the digital thread, a watcher of the process image."""
+        o = self.options
+        config = PlantThreadConfig(
+            system=str(self.system.path.resolve()),
+            run_dir=str(run_dir),
+            place=o.thread,
+            store=o.thread_store or str(run_dir / "knowledge.sqlite"),
+            prototype=o.prototype,
+            profiles=tuple(str(p.resolve()) for p in o.profiles),
+        )
+        client = await self._start_child("thread", "twin.plant_thread", self._write("thread.json", config))
+        self.thread_place = str((await client.call("get"))["place"])
 
     def _field_config(self, run_dir: Path) -> FieldConfig:
         from twin.field_process import FieldConfig
@@ -142,6 +160,7 @@ class RunSession:
             recordings={d: str(Path(p).resolve()) for d, p in o.recordings.items()},
             speed=o.speed,
             listen=listen,
+            seed=o.seed,
         )
 
     def _write(self, name: str, config: msgspec.Struct) -> Path:

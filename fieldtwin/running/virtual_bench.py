@@ -5,21 +5,24 @@ A `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `Virtua
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
 from emulators.virtual.loop import VirtualLoop
+from fieldtwin.conformance.case import Danger
+from fieldtwin.running.probes import Probes
 from fieldtwin.running.shore import Scripted, Shore
 from fieldtwin.running.states import state_words
 from fieldtwin.scenarios.bench import Can, Reading
+from fieldtwin.scenarios.probe_form import Probe
 from fieldtwin.scenarios.trace import Kind, Trace
 from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
+from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from gateway.core.errors import Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.values import Quality, Reason, TagValue
 from plc.publishing import Change
@@ -48,6 +51,7 @@ class VirtualBench:
         seed: int | None = None,
         commands: list[Scripted] | None = None,
         far_end: bool = True,
+        probes: Sequence[Probe] = (),
     ) -> None:
         self.system = system
         self.trace = trace
@@ -58,6 +62,10 @@ class VirtualBench:
         self.shore: Shore | None = None
         self._commands = commands or []
         self._far_end = far_end
+        self._probe = probes
+        if probes and all(probe.endpoint is None for probe in probes):  # nothing else is in memory
+            self.can = self.can | {Can.PROBE}
+        self._probes: Probes | None = None
         self._updates: dict[str, int] = {}
         self._words = {
             f"{p}.state": words for p, words in state_words(self.run.twin.ecs.layout, system.plc.programs).items()
@@ -65,6 +73,7 @@ class VirtualBench:
         self._stack = AsyncExitStack()
 
     target = "virtual"
+    allowed = Danger.DISRUPT
     can = frozenset(
         {
             Can.INJECT_FAULT,
@@ -84,7 +93,26 @@ class VirtualBench:
             self.shore = Shore(self.system, device, self.run.field.far[device], self.run.clock, self.run.net)
             nursery = await self._stack.enter_async_context(Nursery())
             nursery.start(self.shore.run(self._commands), "far end")
+        if Can.PROBE in self.can:
+            await self._all_served()
+            self._probes = Probes(self._probe, self.run.clock, self._served, self.run.net)
+            self._probes.on_change = self.note
+            nursery = await self._stack.enter_async_context(Nursery())
+            nursery.start(self._probes.run(), "probes")
         return self
+
+    async def _all_served(self) -> None:
+        """Until the gateway serves what probes ask for, at most a second."""
+        until_ns = self.loop.now_ns + NS_PER_S
+        while any(server.front.bound is None for server in self.run.gateway.servers) and self.loop.now_ns < until_ns:
+            await self.run.clock.sleep_until_ns(self.loop.now_ns + NS_PER_MS)
+
+    def _served(self, name: str) -> Endpoint:
+        """Where the gateway serves what the system file calls `name`."""
+        for server in self.run.gateway.servers:
+            if server.config.name == name and server.front.bound is not None:
+                return server.front.bound
+        raise Unreachable(f"the gateway does not serve {name!r}")
 
     async def __aexit__(self, *exc: object) -> None:
         await self._stack.aclose()
@@ -131,9 +159,12 @@ class VirtualBench:
             raise failure
 
     def names(self) -> list[str]:
-        return [*self.run.gateway.tags.names, *self.run.plc.outputs.last()]
+        probed = self._probes.names if self._probes is not None else []
+        return [*self.run.gateway.tags.names, *self.run.plc.outputs.last(), *probed]
 
     def reading(self, name: str) -> Reading | None:
+        if self._probes is not None and name in self._probes.names:
+            return self._probes.reading(name)
         outputs = self.run.plc.outputs.last()
         if name in outputs and name not in self.run.gateway.tags.names:
             value = self._named(name, outputs[name])
@@ -153,6 +184,9 @@ class VirtualBench:
         )
 
     def late_ms(self) -> float:
+        return 0.0
+
+    def host_late_s(self, since_s: float) -> float:
         return 0.0
 
     async def send(self, period_s: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from twin.prototype_file import load_prototype
 
 def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | None = None) -> ScenarioResult:
     """Run it. `seed` before the scenario's own and the prototype file's."""
-    prototype = load_prototype(scenario.system, _prototype(scenario))
+    prototype = load_prototype(scenario.system, prototype_of(scenario))
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else prototype.seed
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
@@ -35,7 +36,9 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
         trace.listeners.append(collector.feed)
 
         async def main() -> ScenarioResult:
-            async with VirtualBench(scenario.system, prototype, loop, Path(folder), trace, seed=chosen) as bench:
+            async with VirtualBench(
+                scenario.system, prototype, loop, Path(folder), trace, seed=chosen, probes=scenario.probes
+            ) as bench:
                 return await Runner(scenario, bench).run()
 
         try:
@@ -61,12 +64,19 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
     return replace(
         result,
         seed=chosen,
-        reproduce=f"fieldtwin test {scenario.path} --seed {chosen}",
+        reproduce=reproduce(scenario, "--seed", str(chosen)),
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),
     )
 
 
-def _prototype(scenario: Scenario) -> Path | None:
+def reproduce(scenario: Scenario, *more: str) -> str:
+    """The one line that runs a scenario again."""
+    profiles = [word for folder in scenario.profiles for word in ("--profiles", str(folder))]
+    return shlex.join(["fieldtwin", "test", str(scenario.path), *more, *profiles])
+
+
+def prototype_of(scenario: Scenario) -> Path | None:
+    """The prototype file that it names, if it names one."""
     named = scenario.form.prototype
     return None if named is None else scenario.path.parent / named

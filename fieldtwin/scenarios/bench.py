@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
 
+from fieldtwin.conformance.case import Danger
 from fieldtwin.scenarios.trace import Trace
 
 
@@ -51,6 +52,12 @@ class Bench(Protocol):
     def can(self) -> frozenset[Can]: ...
 
     @property
+    def allowed(self) -> Danger:
+        """What steps may do to it at most: `expect`, `wait` and `pause` observe, probes read, `send` and `set` write, `fault`
+        and `clear` disrupt."""
+        ...
+
+    @property
     def trace(self) -> Trace: ...
 
     def now_s(self) -> float:
@@ -71,6 +78,10 @@ class Bench(Protocol):
 
     def late_ms(self) -> float:
         """How late the last scan was by the host's own making; 0 in virtual time."""
+        ...
+
+    def host_late_s(self, since_s: float) -> float:
+        """The longest that the host, by its own load, kept us or a scan waiting since `since_s`; 0 in virtual time."""
         ...
 
     async def send(self, period_s: int) -> None:

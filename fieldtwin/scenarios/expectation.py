@@ -103,14 +103,16 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
     if expect.requests_per_s is not None:
         took_s = max(watched.bench.now_s() - since_s, 0.001)
         rate = len(seen) / took_s
-        if not _inside(rate, expect.requests_per_s):
-            return f"{_bounds(expect.requests_per_s)} requests/s to {expect.wire}", f"{rate:.3g} in {took_s:g} s"
+        if not inside(rate, expect.requests_per_s):
+            return f"{bounds_text(expect.requests_per_s)} requests/s to {expect.wire}", f"{rate:.3g} in {took_s:g} s"
         return None
     times = expect.times if expect.times is not None else Bounds(min=1)
     wanted = times if isinstance(times, Bounds) else Bounds(min=times, max=times)
-    if not _inside(len(seen), wanted):
+    if not inside(len(seen), wanted):
         window = f" within {seconds(expect.within):g} s" if expect.within is not None else ""
-        return f"{_bounds(wanted)} times{window}", f"{len(seen)}: " + ("; ".join(x.text for x in seen[:5]) or "none")
+        return f"{bounds_text(wanted)} times{window}", f"{len(seen)}: " + (
+            "; ".join(x.text for x in seen[:5]) or "none"
+        )
     return None
 
 
@@ -124,11 +126,13 @@ def _matches(expect: Expect, exchange: Exchange) -> bool:
     return expect.value is None or exchange.tags.get(expect.register_ or "") == expect.value
 
 
-def _inside(number: float, bounds: Bounds) -> bool:
+def inside(number: float, bounds: Bounds) -> bool:
+    """Whether a number is within bounds."""
     return (bounds.min is None or number >= bounds.min) and (bounds.max is None or number <= bounds.max)
 
 
-def _bounds(bounds: Bounds) -> str:
+def bounds_text(bounds: Bounds) -> str:
+    """Bounds in words: ``at least 1 and at most 3``."""
     if bounds.min == bounds.max:
         return f"{bounds.min:g}" if bounds.min is not None else "any"
     parts = [f"at least {bounds.min:g}"] if bounds.min is not None else []

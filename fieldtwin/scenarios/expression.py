@@ -38,6 +38,17 @@ _ARITHMETIC: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
     ast.Div: operator.truediv,
 }
 
+
+class NotUnderstood(UsageError):
+    """What is no expression, or names what is not known, and where in its text: `at_column` characters behind its begin."""
+
+    at_column = 0
+
+    def __init__(self, message: str, at_column: int, *, expected: str = "", got: str = "", hint: str = "") -> None:
+        super().__init__(message, expected=expected, got=got, hint=hint)
+        self.at_column = at_column
+
+
 Look = Callable[[str, str], Any]
 """``look(function, name)``: what is known of a tag or variable now; None where nothing is."""
 
@@ -48,18 +59,43 @@ class Expression:
     def __init__(self, text: str, known: Collection[str]) -> None:
         self.text = text
         self.names: list[str] = []
+        self.times_s = [float(m[2]) * _UNIT_S[m[3]] for m in _TOKEN.finditer(text) if m[2] is not None]
+        """The times that stand in it."""
+        self.asks_lateness = False
+        """Whether it is about ``plc.late``."""
         self._known = known
         if len(text) > LONGEST:
             raise UsageError("too long an expression", expected=f"at most {LONGEST} characters")
+        self._lead = len(text) - len(text.lstrip())
+        self._plain = _TOKEN.sub(_plain, text[self._lead :]).rstrip()
         try:
-            self._tree = ast.parse(_TOKEN.sub(_plain, text).strip(), mode="eval").body
+            self._tree = ast.parse(self._plain, mode="eval").body
         except (SyntaxError, ValueError, RecursionError) as e:
-            raise UsageError("no expression", got=text, hint="for example: relay.state == 'ACTIVE'") from e
+            at = (e.offset or 1) - 1 if isinstance(e, SyntaxError) and (e.lineno or 1) == 1 else 0
+            hint = "for example: relay.state == 'ACTIVE'"
+            raise NotUnderstood("no expression", self._column(at), got=text, hint=hint) from e
         self._check(self._tree, 0)
 
     def evaluate(self, look: Look) -> Any:
         """Its value now. What compares with something unknown is False, but `!=`, which is True."""
         return _value(self._tree, look)
+
+    def _column(self, at: int) -> int:
+        """Where in `text` stands what is at character `at` of what Python's parser got."""
+        grown = 0
+        for match in _TOKEN.finditer(self.text, self._lead):
+            begins = match.start() - self._lead + grown
+            longer = len(_plain(match)) - len(match.group())
+            if at < begins:
+                break
+            if at < begins + len(match.group()) + longer:
+                return match.start()
+            grown += longer
+        return min(self._lead + at - grown, len(self.text))
+
+    def _at(self, node: ast.expr) -> int:
+        """Python counts bytes of UTF-8."""
+        return self._column(len(self._plain.encode()[: node.col_offset].decode(errors="ignore")))
 
     def _check(self, node: ast.expr, depth: int) -> None:
         if depth > DEEPEST:
@@ -78,30 +114,43 @@ class Expression:
         elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float | str):
             return
         elif isinstance(node, ast.Name | ast.Attribute):
-            self._check_name(_dotted(node))
+            self._check_name(self._name(node), node)
             return
         else:
-            raise UsageError(
-                "not understood", got=ast.unparse(node), expected="names, numbers, texts, comparisons, and, or, not"
+            raise NotUnderstood(
+                "not understood",
+                self._at(node),
+                got=ast.unparse(node),
+                expected="names, numbers, texts, comparisons, and, or, not",
             )
         for part in parts:
             self._check(part, depth + 1)
 
     def _check_call(self, node: ast.Call) -> None:
-        name = _dotted(node.func)
+        name = self._name(node.func)
         if name not in FUNCTIONS or len(node.args) != 1 or node.keywords:
             near = difflib.get_close_matches(name, FUNCTIONS, n=1)
             hint = f"did you mean {near[0]!r}?" if near else ""
-            raise UsageError(f"no function {name!r}", expected=", ".join(f"{f}(TAG)" for f in FUNCTIONS), hint=hint)
-        self._check_name(_dotted(node.args[0]))
+            raise NotUnderstood(
+                f"no function {name!r}", self._at(node), expected=", ".join(f"{f}(TAG)" for f in FUNCTIONS), hint=hint
+            )
+        self._check_name(self._name(node.args[0]), node.args[0])
 
-    def _check_name(self, name: str) -> None:
+    def _name(self, node: ast.expr) -> str:
+        try:
+            return _dotted(node)
+        except UsageError as e:
+            raise NotUnderstood(e.message, self._at(node), got=e.got) from e
+
+    def _check_name(self, name: str, node: ast.expr) -> None:
         if name in ("true", "false", "plc.late", "command_pending"):
+            self.asks_lateness |= name == "plc.late"
             return
         if name not in self._known:
             near = difflib.get_close_matches(name, self._known, n=1, cutoff=0.5)
             hint = f"did you mean {near[0]!r}?" if near else ""
-            raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE", hint=hint)
+            expected = "DEVICE.TAG or PROGRAM.VARIABLE"
+            raise NotUnderstood(f"no tag or variable {name!r}", self._at(node), expected=expected, hint=hint)
         self.names.append(name)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,8 +12,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from emulators.faults.schema import checked, parse_fault, seconds
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.expression import Expression
-from gateway.core.errors import UsageError
+from fieldtwin.scenarios.expression import Expression, NotUnderstood
+from fieldtwin.scenarios.probe_form import Probe, ProbeForm, read_probe
+from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.fault_aims import target
 from twin.system import System, load_system
@@ -92,6 +94,35 @@ class Step(_Form):
     pause: Time | None = None
 
 
+class Within(_Form):
+    """Each time that `after` becomes true, `then` is so `within` a time."""
+
+    after: str
+    then: str
+    within: Time
+
+
+class Rate(_Form):
+    """How often a tag is published, or a device asked, in any stretch of `over`; `while` says when it counts."""
+
+    tag: str | None = None
+    updates_per_s: Bounds | None = None
+    wire: str | None = None
+    requests_per_s: Bounds | None = None
+    over: Time = 10
+    while_: str | None = Field(default=None, alias="while")
+
+
+class Cycle(_Form):
+    """How far apart the changes of a tag or variable are; or, without one, how late a scan of the PLC may begin."""
+
+    changes_of: str | None = None
+    min: Time | None = None
+    max: Time | None = None
+    late: Time | None = None
+    while_: str | None = Field(default=None, alias="while")
+
+
 class ScenarioForm(_Form):
     scenario: str = Field(min_length=1, max_length=200)
     about: str = ""
@@ -102,6 +133,10 @@ class ScenarioForm(_Form):
     needs: list[str] = []
     always: list[str] = []
     never: list[str | WireForm] = []
+    within: list[Within] = []
+    rate: list[Rate] = []
+    cycle: list[Cycle] = []
+    probes: dict[str, ProbeForm] = {}
     steps: list[Step] = Field(min_length=1, max_length=10_000)
 
 
@@ -128,6 +163,12 @@ class Scenario:
     needs: tuple[Can, ...]
     always: tuple[Expression, ...]
     never: tuple[Expression | WireForm, ...]
+    known: tuple[str, ...] = ()
+    """What expressions may name."""
+    probes: tuple[Probe, ...] = ()
+    profiles: tuple[Path, ...] = ()
+    used: set[str] = field(default_factory=set, compare=False)
+    """The tags and variables that it is about."""
 
     def line(self, *loc: Key) -> str:
         """FILE:LINE of a part of it."""
@@ -137,9 +178,26 @@ class Scenario:
     def expression(self, text: str, *loc: Key) -> Expression:
         """`text` as an expression. Raises `FileInvalid` at its spot."""
         try:
-            return Expression(text, names_of(self.system))
+            expression = Expression(text, self.known)
         except UsageError as e:
-            raise self.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+            error = self.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint)
+            raise self._inside(error, text, e.at_column if isinstance(e, NotUnderstood) else 0) from e
+        self.used.update(expression.names)
+        return expression
+
+    def _inside(self, error: FileInvalid, text: str, offset: int) -> FileInvalid:
+        """The error where it is inside the expression, if that stands in one line as it is."""
+        try:
+            line = self.path.read_text(encoding="utf-8").splitlines()[(error.line or 1) - 1]
+        except (OSError, IndexError):
+            return error
+        begins = line.find(text, (error.column or 1) - 1)
+        if begins < 0:
+            return error
+        return FileInvalid(
+            error.message, path=error.path, line=error.line, column=begins + 1 + offset, expected=error.expected,
+            got=error.got, hint=error.hint,
+        )  # fmt: skip
 
 
 def names_of(system: System) -> list[str]:
@@ -162,7 +220,14 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
     form = validate(file, ScenarioForm)
     beside = path.parent / form.system
     system = load_system(str(beside) if beside.exists() else form.system.removesuffix(".yaml"), list(profiles))
-    scenario = Scenario(path, form, file, system, _needs(file, form), (), ())
+    served = [one.name for one in system.serving.serve]
+    probes = tuple(read_probe(file, name, one, served) for name, one in form.probes.items())
+    own = names_of(system)
+    for probe in probes:
+        if probe.name in system.devices or probe.name in system.plc.programs:
+            raise file.error(("probes", probe.name), f"{probe.name!r} is a device or program of the system already")
+    known = tuple(dict.fromkeys([*own, *(name for probe in probes for name in probe.names)]))
+    scenario = Scenario(path, form, file, system, _needs(file, form), (), (), known, probes, profiles)
     always = tuple(scenario.expression(text, "always", n) for n, text in enumerate(form.always))
     never: list[Expression | WireForm] = []
     for n, one in enumerate(form.never):
@@ -176,7 +241,8 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
             if one.unless is not None:
                 scenario.expression(one.unless, "never", n, "unless")
             never.append(one)
-    scenario = Scenario(path, form, file, system, scenario.needs, always, tuple(never))
+    scenario = replace(scenario, always=always, never=tuple(never))
+    _check_whole_run(scenario)
     faults: list[str] = []
     for n, step in enumerate(form.steps):
         _check_step(scenario, step, n)
@@ -192,6 +258,10 @@ def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
     for n, need in enumerate(form.needs):
         _known(file, ("needs", n), "need", need, words)
     asked = [Can(need) for need in form.needs]
+    if form.probes:
+        asked.append(Can.PROBE)
+    if any(isinstance(one, WireForm) for one in form.never) or any(one.wire is not None for one in form.rate):
+        asked.append(Can.SEE_WIRE)
     for step in form.steps:
         word = word_of(step) if any(getattr(step, w) is not None for w in WORDS) else ""
         implied = {"send": Can.SEND_COMMAND, "set": Can.SET_VALUE, "fault": Can.INJECT_FAULT, "clear": Can.INJECT_FAULT}
@@ -199,6 +269,8 @@ def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
             asked.append(implied[word])
         if step.expect is not None and step.expect.wire is not None:
             asked.append(Can.SEE_WIRE)
+        if step.expect is not None and step.expect.like is not None:
+            asked.append(Can.SEE_HELD)
     return tuple(dict.fromkeys(asked))
 
 
@@ -242,7 +314,8 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
     if expect.like is not None and (expect.tag or "").partition(".")[0] not in scenario.system.devices:
         raise scenario.file.error((*loc, "like"), "only what a device holds can be like it", expected="tag: DEVICE.TAG")
     if expect.tag is not None:
-        _known(scenario.file, (*loc, "tag"), "tag", expect.tag, names_of(scenario.system))
+        _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known)
+        scenario.used.add(expect.tag)
     if expect.wire is not None:
         devices = scenario.system.devices
         _known(scenario.file, (*loc, "wire"), "device", expect.wire, list(devices))
@@ -255,7 +328,51 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
             seconds(time)
 
 
-def _known(file: YamlFile, loc: tuple[Key, ...], what: str, name: str, known: list[str]) -> None:
+def _check_whole_run(scenario: Scenario) -> None:
+    """What holds over the whole run: `within`, `rate`, `cycle`."""
+    file, form = scenario.file, scenario.form
+    for n, within in enumerate(form.within):
+        scenario.expression(within.after, "within", n, "after")
+        scenario.expression(within.then, "within", n, "then")
+        _time(file, ("within", n, "within"), within.within)
+    for n, rate in enumerate(form.rate):
+        loc: tuple[Key, ...] = ("rate", n)
+        ours = (rate.tag is not None, rate.updates_per_s is not None, rate.wire is None, rate.requests_per_s is None)
+        if len(set(ours)) != 1:
+            expected = "tag and updates_per_s, or wire and requests_per_s"
+            raise file.error(loc, "a rate is one of a tag or of a wire", expected=expected)
+        if rate.tag is not None:
+            _known(file, (*loc, "tag"), "tag", rate.tag, scenario.known)
+            scenario.used.add(rate.tag)
+        if rate.wire is not None:
+            _known(file, (*loc, "wire"), "device", rate.wire, list(scenario.system.devices))
+        if _time(file, (*loc, "over"), rate.over) <= 0:
+            raise file.error((*loc, "over"), "a rate is one of some time", expected="over: 10s")
+        if rate.while_ is not None:
+            scenario.expression(rate.while_, *loc, "while")
+    for n, cycle in enumerate(form.cycle):
+        loc = ("cycle", n)
+        bounds = (cycle.min is not None or cycle.max is not None) and cycle.changes_of is not None
+        if bounds == (cycle.late is not None):
+            raise file.error(loc, "a cycle has bounds", expected="changes_of: NAME with min or max; or late: 5ms")
+        if cycle.changes_of is not None:
+            _known(file, (*loc, "changes_of"), "tag or variable", cycle.changes_of, scenario.known)
+            scenario.used.add(cycle.changes_of)
+        for key in ("min", "max", "late"):
+            if getattr(cycle, key) is not None:
+                _time(file, (*loc, key), getattr(cycle, key))
+        if cycle.while_ is not None:
+            scenario.expression(cycle.while_, *loc, "while")
+
+
+def _time(file: YamlFile, loc: tuple[Key, ...], text: Time) -> float:
+    try:
+        return seconds(text)
+    except UsageError as e:
+        raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+
+
+def _known(file: YamlFile, loc: tuple[Key, ...], what: str, name: str, known: Sequence[str]) -> None:
     if name in known:
         return
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)

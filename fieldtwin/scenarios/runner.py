@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from emulators.faults.schema import seconds
+from fieldtwin.conformance.case import Danger
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
@@ -20,22 +21,32 @@ from fieldtwin.scenarios.expectation import Watched, is_secret, judge_tag, judge
 from fieldtwin.scenarios.expression import Expression
 from fieldtwin.scenarios.form import Expect, Scenario, Step, WireForm, word_of
 from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.scenarios.whole_run import WholeRun
 from gateway.core.errors import UsageError
 
 TICK_S = 0.02
 """How often is looked while something is waited for."""
 PENDING_S = 5.0
+RECENT_S = 2.0
+"""How long ago the host's lateness may have been and still show in what is looked at now."""
 KEPT = 20_000
+LATE_SHARE = 0.1
+"""A host that was late by more than this part of the time that a check is about has proved nothing."""
+DANGER = {"send": Danger.WRITE, "set": Danger.WRITE, "fault": Danger.DISRUPT, "clear": Danger.DISRUPT}
+"""Of steps; all others observe."""
 _NS = 1_000_000_000
 
 
 @dataclass
 class _Broken(Exception):
-    """A check that says no: the verdict, what was expected, what came."""
+    """A check that says no: the verdict, what was expected, what came. `bound_s`: the time that it is about, 0 for none;
+    `since_s`: from when on the host's lateness counts, where that is not the step's begin."""
 
     verdict: Verdict
     expected: str
     got: str
+    bound_s: float = 0.0
+    since_s: float | None = None
 
 
 class Runner:
@@ -58,20 +69,35 @@ class Runner:
         self._sent_s = -PENDING_S
         self._watched: deque[Exchange] = deque()
         self._excused: list[bool] = []
+        self._whole = WholeRun(scenario, bench, self._look)
         bench.trace.listeners.append(self._on_event)
 
     def missing(self) -> list[Can]:
         """What the scenario needs and the bench cannot do."""
         return [need for need in self.scenario.needs if need not in self.bench.can]
 
+    def _refused(self) -> str:
+        """Why the bench cannot, or may not, do what the scenario is made of; empty when it can."""
+        lacking = self.missing()
+        if lacking:
+            return f"the target {self.bench.target} cannot {', '.join(need.value for need in lacking)}"
+        asked = [
+            (DANGER.get(word_of(step), Danger.OBSERVE), f"step {n}")
+            for n, step in enumerate(self.scenario.form.steps, 1)
+        ]
+        asked += [(Danger.READ, f"the probe {probe.name}") for probe in self.scenario.probes]
+        for danger, what in asked:
+            if danger.rank > self.bench.allowed.rank:
+                return f"{what} may {danger.value} on the target {self.bench.target}: --allow {danger.value}"
+        return ""
+
     async def run(self) -> ScenarioResult:
         """All steps. Never raises for what the system does; raises what a bench raises that is gone."""
         scenario, form = self.scenario, self.scenario.form
-        lacking = self.missing()
+        refused = self._refused()
         verdict, reason = Verdict.PASSED, ""
-        if lacking:
-            verdict = Verdict.SKIPPED
-            reason = f"the target {self.bench.target} cannot {', '.join(need.value for need in lacking)}"
+        if refused:
+            verdict, reason = Verdict.SKIPPED, refused
         else:
             for n, step in enumerate(form.steps):
                 result = await self._step(n, step)
@@ -80,7 +106,7 @@ class Runner:
                     verdict, reason = result.verdict, f"step {result.number}: {result.text}"
                     break
             if verdict is Verdict.PASSED:
-                verdict, reason = self._hold_to_the_end()
+                verdict, reason = await self._hold_to_the_end()
         return ScenarioResult(
             form.scenario,
             verdict,
@@ -110,7 +136,7 @@ class Runner:
             names = await self._do(n, word, step) or []
             self._look_at_all()
         except _Broken as broken:
-            verdict, expected, got = broken.verdict, broken.expected, broken.got
+            verdict, expected, got = self._judged_on_time(broken, since_s)
         except UsageError as e:
             verdict, got = Verdict.ERROR, str(e)
         result = CheckResult(
@@ -126,6 +152,14 @@ class Runner:
         )
         self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text, "verdict": verdict.value})
         return result
+
+    def _judged_on_time(self, broken: _Broken, since_s: float) -> tuple[Verdict, str, str]:
+        """What is broken; where the host itself was late by a good part of the time that it is about, nobody knows."""
+        late_s = self.bench.host_late_s(since_s if broken.since_s is None else broken.since_s)
+        if broken.verdict is Verdict.FAILED and broken.bound_s and late_s > LATE_SHARE * broken.bound_s:
+            got = f"{broken.got}; but this host was {late_s * 1000:.0f} ms late by itself"
+            return Verdict.INCONCLUSIVE, broken.expected, got
+        return broken.verdict, broken.expected, broken.got
 
     async def _do(self, n: int, word: str, step: Step) -> list[str] | None:
         bench = self.bench
@@ -155,7 +189,10 @@ class Runner:
         deadline_s = self.bench.now_s() + within_s
         while not expression.evaluate(self._look):
             if self.bench.now_s() >= deadline_s:
-                raise _Broken(Verdict.FAILED, f"{expression.text} within {within_s:g} s", self._seen(expression.names))
+                got = self._seen_of(expression)
+                raise _Broken(
+                    Verdict.FAILED, f"{expression.text} within {within_s:g} s", got, self._bound(expression, within_s)
+                )
             await self._tick(deadline_s)
 
     async def _expect(self, n: int, expect: Expect) -> list[str]:
@@ -176,7 +213,7 @@ class Runner:
                 )
             said = judge_wire(expect, watched)
             if said is not None:
-                raise _Broken(Verdict.FAILED, *said)
+                raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
             return [expect.wire]
         assert expect.tag is not None
         if expect.updates_per_s is not None:
@@ -184,14 +221,15 @@ class Runner:
         deadline_s = self.bench.now_s() + within_s
         while (said := await judge_tag(expect, watched)) is not None:
             if self.bench.now_s() >= deadline_s or expect.updates_per_s is not None:
-                raise _Broken(Verdict.FAILED, *said)
+                raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
             await self._tick(deadline_s)
         if expect.updates_per_s is None:
             end_s = self.bench.now_s() + during_s
             while self.bench.now_s() < end_s:  # and it stays so
                 await self._tick(end_s)
                 if (said := await judge_tag(expect, watched)) is not None:
-                    raise _Broken(Verdict.FAILED, *said)
+                    raise _Broken(Verdict.FAILED, *said, during_s)
+            self._looked_all_the_time(end_s - during_s, during_s)
         return [expect.tag]
 
     async def _throughout(self, expression: Expression, during_s: float) -> None:
@@ -199,7 +237,26 @@ class Runner:
         while self.bench.now_s() < end_s:
             await self._tick(end_s)
             if not expression.evaluate(self._look):
-                raise _Broken(Verdict.FAILED, f"{expression.text} for {during_s:g} s", self._seen(expression.names))
+                got = self._seen_of(expression)
+                raise _Broken(
+                    Verdict.FAILED, f"{expression.text} for {during_s:g} s", got, self._bound(expression, during_s)
+                )
+        self._looked_all_the_time(end_s - during_s, during_s)
+
+    def _looked_all_the_time(self, since_s: float, during_s: float) -> None:
+        """What lasts must have been looked at: not while this host did something else."""
+        late_s = self.bench.host_late_s(since_s)
+        if during_s and late_s > LATE_SHARE * during_s:
+            raise _Broken(
+                Verdict.INCONCLUSIVE,
+                f"looked at for {during_s:g} s",
+                f"this host was {late_s * 1000:.0f} ms late by itself",
+            )
+
+    @staticmethod
+    def _bound(expression: Expression, limit_s: float = 0.0) -> float:
+        """The shortest time that a check is about."""
+        return min([t for t in (limit_s, *expression.times_s) if t > 0], default=0.0)
 
     # -- time, and what holds all the time --------------------------------------------------------------------------------
 
@@ -218,13 +275,20 @@ class Runner:
                 continue  # nothing is known of it yet
             self._judged.add(number)
             if not expression.evaluate(self._look):
-                late = "plc.late" in text and Can.EXACT_TIME not in self.bench.can
+                seen, bound_s = self._seen_of(expression), self._bound(expression)
                 raise _Broken(
-                    Verdict.INCONCLUSIVE if late else Verdict.FAILED, f"{number}: {text}", self._seen(expression.names)
+                    self._of_lateness(expression.asks_lateness), f"{number}: {text}", seen, bound_s, self._recently()
                 )
         for n, one in self._never:
             if isinstance(one, Expression) and one.evaluate(self._look):
-                raise _Broken(Verdict.FAILED, f"never {n}: {one.text}", self._seen(one.names))
+                seen, bound_s = self._seen_of(one), self._bound(one)
+                raise _Broken(
+                    self._of_lateness(one.asks_lateness), f"never {n}: {one.text}", seen, bound_s, self._recently()
+                )
+        if (said := self._whole.look()) is not None:
+            verdict = self._of_lateness("plc.late" in said.names)
+            since_s = self.bench.now_s() - said.bound_s - RECENT_S
+            raise _Broken(verdict, f"{said.number}: {said.expected}", said.got, said.bound_s, since_s)
         excused = [self._is_excused(one) for _, one in self._never]
         while self._watched:
             exchange = self._watched.popleft()
@@ -232,6 +296,14 @@ class Runner:
                 if isinstance(one, WireForm) and not (now or before) and self._forbidden(one, exchange):
                     raise _Broken(Verdict.FAILED, f"never {n}: {_said(one)}", exchange.text)
         self._excused = excused
+
+    def _of_lateness(self, asked: bool) -> Verdict:
+        """The verdict on a check that asks how late scans are: a plant answers for it, a host that plays one does not."""
+        ours = asked and Can.EXACT_TIME not in self.bench.can and self.bench.target != "real"
+        return Verdict.INCONCLUSIVE if ours else Verdict.FAILED
+
+    def _recently(self) -> float:
+        return self.bench.now_s() - RECENT_S
 
     def _is_excused(self, one: Expression | WireForm) -> bool:
         """Whether `unless` holds: what was seen since the last look may be older than this moment."""
@@ -248,8 +320,18 @@ class Runner:
             return False
         return form.value is None or exchange.tags.get(form.register_ or "") == form.value
 
-    def _hold_to_the_end(self) -> tuple[Verdict, str]:
+    async def _hold_to_the_end(self) -> tuple[Verdict, str]:
         """What held all the time is said so, once; what could never be judged makes the scenario inconclusive."""
+        since_s = self.bench.now_s()
+        try:
+            while self._whole.pending_until_s:
+                await self._tick(self._whole.pending_until_s)
+        except _Broken as broken:
+            verdict, expected, got = self._judged_on_time(broken, since_s)
+            number = expected.partition(":")[0]
+            now_ns = self._now_ns()
+            self.results.append(CheckResult(number, expected, verdict, now_ns, round(since_s * _NS), expected, got))
+            return verdict, f"{expected}: {got}"
         now_ns, verdict, reason = self._now_ns(), Verdict.PASSED, ""
         for number, text, expression, _ in self._always:
             found = Verdict.PASSED if number in self._judged else Verdict.INCONCLUSIVE
@@ -259,11 +341,18 @@ class Runner:
         for n, one in self._never:
             text = one.text if isinstance(one, Expression) else _said(one)
             self.results.append(CheckResult(f"never {n}", text, Verdict.PASSED, now_ns, 0))
+        for number, text, seen, known in self._whole.summary():
+            found = Verdict.PASSED if known else Verdict.INCONCLUSIVE
+            if not known:
+                verdict, reason = found, f"{number}: {text}: nothing was there to judge"
+            self.results.append(CheckResult(number, text, found, now_ns, 0, got=seen))
         return verdict, reason
 
     def _on_event(self, event: Event) -> None:
+        self._whole.hear(event)
         if event.kind is Kind.FRAME:
             for exchange in self._decoder.feed(event):
+                self._whole.requests[exchange.device] += 1
                 self._dropped += len(self.exchanges) == KEPT
                 self.exchanges.append(exchange)
                 if any(isinstance(one, WireForm) for _, one in self._never):
@@ -285,6 +374,10 @@ class Runner:
         if function == "age":
             return reading.age_s
         return getattr(reading, function)
+
+    def _seen_of(self, expression: Expression) -> str:
+        late = [f"scans up to {self.bench.late_ms():.3g} ms late"] if expression.asks_lateness else []
+        return "; ".join([*late, *([self._seen(expression.names)] if expression.names else [])])
 
     def _seen(self, names: Iterable[str]) -> str:
         told = []

@@ -1,0 +1,100 @@
+"""``probes:`` of a scenario: registers of any controller that are watched through Modbus, under names for expressions.
+
+    probes:
+      crane: {endpoint: "tcp://192.0.2.7:502", unit: 1, every: 200ms, registers: {height: {at: 30001, type: float32}}}
+
+Registers are written as the tags of a device profile (docs/files.md); they are read, never written.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from emulators.faults.schema import seconds
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+from gateway.core.profile import DeviceProfile, resolve
+from gateway.core.yaml_file import Key, Position, YamlFile
+
+MIN_EVERY_S = 0.01
+
+
+class ProbeForm(BaseModel):
+    """A probe. `endpoint`, or `serve`: what the system's own gateway serves under that name."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    endpoint: str | None = None
+    serve: str | None = None
+    unit: Annotated[int, Field(ge=0, le=255)] = 1
+    every: str | float | int = 0.2
+    timeout: str | float | int = 1
+    numbering: Literal["printed", "sent"] = "printed"
+    order: str = "ABCD"
+    type: str = "uint16"
+    registers: dict[str, Any] = Field(min_length=1, max_length=1000)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A probe, checked. Its registers are the tags of `profile`; an expression calls them ``NAME.REGISTER``."""
+
+    name: str
+    profile: DeviceProfile
+    endpoint: Endpoint | None
+    serve: str
+    unit: int
+    every_s: float
+    timeout_s: float
+
+    @property
+    def names(self) -> list[str]:
+        return [f"{self.name}.{register}" for register in self.profile.tags]
+
+
+def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) -> Probe:
+    """Raises `FileInvalid` at what is wrong. `served` are the names of what the system serves."""
+    loc: tuple[Key, ...] = ("probes", name)
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        raise file.error(loc, "a probe's name", expected="small letters, digits and _", got=name)
+    if (form.endpoint is None) == (form.serve is None):
+        raise file.error(loc, "a probe asks at one place", expected="endpoint: tcp://HOST:PORT, or serve: NAME")
+    if form.serve is not None and form.serve not in served:
+        raise file.error(
+            (*loc, "serve"), f"the system serves no {form.serve!r}", expected=", ".join(served) or "nothing"
+        )
+    try:
+        endpoint = Endpoint.parse(form.endpoint) if form.endpoint is not None else None
+        every_s, timeout_s = seconds(form.every), seconds(form.timeout)
+    except UsageError as e:
+        raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+    if endpoint is not None and (endpoint.is_can or endpoint.scheme in ("pty", "udp")):
+        raise file.error((*loc, "endpoint"), "a probe asks over Modbus", expected="tcp://, rtu+tcp://, rtu: or ascii:")
+    if every_s < MIN_EVERY_S or timeout_s <= 0:
+        raise file.error(loc, "too often", expected=f"every {MIN_EVERY_S:g} s at most, and a timeout above 0")
+    return Probe(name, _profile(file, loc, name, form), endpoint, form.serve or "", form.unit, every_s, timeout_s)
+
+
+def _profile(file: YamlFile, loc: tuple[Key, ...], name: str, form: ProbeForm) -> DeviceProfile:
+    """The registers as a profile of their own, whose every line stands in the scenario."""
+    data = {
+        "device": f"probe/{name.replace('_', '-')}",
+        "source": "a scenario",
+        "protocol": "modbus",
+        "numbering": form.numbering,
+        "defaults": {"type": form.type, "order": form.order},
+        "tags": form.registers,
+    }
+    registers = (*loc, "registers")
+    here = file.positions.get(loc, (1, 1))
+    positions: dict[tuple[Key, ...], Position] = {(): here}
+    for key, position in file.positions.items():
+        if key[: len(registers)] == registers:
+            positions["tags", *key[len(registers) :]] = position
+        elif key[:-1] == loc and key[-1] in ("type", "order"):
+            positions["defaults", key[-1]] = position
+    return resolve(YamlFile(file.path, data, positions))

@@ -1,0 +1,45 @@
+"""Waivers of scenarios, in the form of `fieldtwin.conformance.waivers`.
+
+The id is a file's name without .scenario.yaml, or what the scenario calls itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+from fieldtwin.conformance.waivers import Waivers
+from fieldtwin.report.model import ScenarioResult, Verdict
+
+SUFFIX = ".scenario.yaml"
+_WAIVED = "waived: "
+
+
+def ids_of(path: Path, name: str) -> tuple[str, str]:
+    """What a waiver may call a scenario."""
+    return path.name.removesuffix(SUFFIX), name
+
+
+def waive(result: ScenarioResult, waivers: Waivers, today: date) -> ScenarioResult:
+    """Under its waiver a failure is SKIPPED, and says why; under one that expired everything is a failure."""
+    waiver = waivers.of(*ids_of(Path(result.file), result.name))
+    if waiver is None:
+        return result
+    found = f"; {result.verdict.value}: {result.reason}" if result.reason else ""
+    if waiver.expired(today):
+        reason = f"its waiver expired on {waiver.expires} ({waiver.reason}){found}"
+        return replace(result, verdict=Verdict.FAILED, reason=reason)
+    if result.verdict is Verdict.FAILED:
+        reason = f"{_WAIVED}{waiver.reason}, until {waiver.expires} (failed: {result.reason})"
+        return replace(result, verdict=Verdict.SKIPPED, reason=reason)
+    return result
+
+
+def all_well(results: Iterable[ScenarioResult]) -> bool:
+    """Whether every scenario passed, or failed under a waiver, and one at least passed."""
+    found = list(results)
+    waived = [r.verdict is Verdict.SKIPPED and r.reason.startswith(_WAIVED) for r in found]
+    passed = [r.verdict is Verdict.PASSED for r in found]
+    return any(passed) and all(a or b for a, b in zip(passed, waived, strict=True))

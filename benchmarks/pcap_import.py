@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Importing a capture of Modbus TCP: packets a second, from the file to recordings and draft profiles. Against tshark.
+"""Importing captures: packets a second, from the file to recordings and draft profiles. Against tshark.
 
     benchmarks/pcap_import.py [--runs 3] [--packets 200000] [--quick]
 
-The capture has four clients that poll four servers, ten registers a request, an acknowledgement behind every other packet, some
-requests in two segments. tshark, where it is installed, only counts the same packets with its Modbus dissector. Runs are
+Modbus TCP: four clients that poll four servers, ten registers a request, an acknowledgement behind each reply, some requests in two
+segments. RTU over TCP: the same, on another port. CAN: frames of a SocketCAN capture. tshark, where it is installed, only counts the same packets with its Modbus dissector. Runs are
 interleaved; times are medians. Exit status 1 when a goal is missed.
 """
 
@@ -17,12 +17,14 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 from statistics import median
 
 from peers import Goals
 
 from fieldtwin.recording.from_packets import PacketImport
+from gateway.protocols.modbus.crc import with_crc
 
 PACKETS_PER_S = 50_000
 SERVERS = 4
@@ -36,8 +38,18 @@ def segment(source: int, target: int, ports: tuple[int, int], sequence: int, ack
     return bytes(12) + b"\x08\x00" + ip + tcp + data
 
 
-def make(path: Path, packets: int) -> int:
-    """Write the capture; how many packets it has."""
+def make_can(path: Path, packets: int) -> int:
+    """Write a capture of a CAN bus; how many packets it has."""
+    with path.open("wb") as file:
+        file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65535, 227))
+        for i in range(packets):
+            frame = struct.pack(">IBxxx", 0x180 + i % 100, 8) + i.to_bytes(8)
+            file.write(struct.pack("<IIII", 1_700_000_000 + i // 1000, i % 1000 * 1000, len(frame), len(frame)) + frame)
+    return packets
+
+
+def make(path: Path, packets: int, *, rtu: bool = False) -> int:
+    """Write a capture of Modbus TCP, or of RTU over TCP; how many packets it has."""
     made = 0
     sequences = [[1, 1] for _ in range(SERVERS)]
     with path.open("wb") as file:
@@ -56,6 +68,8 @@ def make(path: Path, packets: int) -> int:
             s, ports = sequences[server], (50_000 + server, 502)
             request = struct.pack(">HHHBBHH", number & 0xFFFF, 0, 6, 1, 3, number % 40 * 10, 10)
             reply = struct.pack(">HHHBBB", number & 0xFFFF, 0, 23, 1, 3, 20) + number.to_bytes(20)
+            if rtu:
+                request, reply, ports = with_crc(request[6:]), with_crc(reply[6:]), (50_000 + server, 4001)
             cut = 5 if number % 8 == 0 else len(request)
             for piece in (request[:cut], request[cut:]):
                 if piece:
@@ -87,21 +101,25 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="few packets, one run: does it work at all?")
     options = parser.parse_args()
     runs, wanted = (1, 20_000) if options.quick else (options.runs, options.packets)
-    times: list[float] = []
-    peer: list[float] = []
-    with tempfile.TemporaryDirectory(prefix="fieldtwin-bench-") as name:
-        folder = Path(name)
-        packets = make(folder / "capture.pcap", wanted)
-        for run in range(runs):
-            times.append(ours(folder / "capture.pcap", folder, run))
-            if shutil.which("tshark"):
-                peer.append(theirs(folder / "capture.pcap"))
-    print(f"{packets} packets, {runs} runs")
-    print(f"{'import':<10} {median(times):8.2f} s   {packets / median(times):>10.0f} packets/s")
-    if peer:
-        print(f"{'tshark':<10} {median(peer):8.2f} s   {packets / median(peer):>10.0f} packets/s")
+    kinds: dict[str, Callable[[Path], int]] = {
+        "Modbus TCP": lambda path: make(path, wanted),
+        "RTU over TCP": lambda path: make(path, wanted, rtu=True),
+        "CAN": lambda path: make_can(path, wanted),
+    }
     goals = Goals()
-    goals.least("packets imported", packets / median(times), PACKETS_PER_S, "a second")
+    for kind, write in kinds.items():
+        times: list[float] = []
+        peer: list[float] = []
+        with tempfile.TemporaryDirectory(prefix="fieldtwin-bench-") as name:
+            folder = Path(name)
+            packets = write(folder / "capture.pcap")
+            for run in range(runs):
+                times.append(ours(folder / "capture.pcap", folder, run))
+                if shutil.which("tshark"):
+                    peer.append(theirs(folder / "capture.pcap"))
+        against = f"   tshark {packets / median(peer):.0f}" if peer else ""
+        print(f"{kind:<14} {packets} packets, {runs} runs: {packets / median(times):.0f} packets/s{against}")
+        goals.least(f"packets imported, {kind}", packets / median(times), PACKETS_PER_S, "a second")
     return goals.verdict()
 
 

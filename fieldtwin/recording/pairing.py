@@ -14,10 +14,15 @@ from dataclasses import dataclass
 from fieldtwin.decoding.modbus_frames import Expected, Frame, splitter
 from fieldtwin.decoding.modbus_pdu import parse_request
 from gateway.core.recording import Exchange, ExchangeError
+from gateway.protocols.modbus.crc import crc16
+from gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 
 MAX_OPEN = 64
 """Requests without an answer on one connection; an older one is taken as unanswered."""
 MAX_ADU = 260
+MAX_REMEMBERED = 4096
+"""Requests of which it is remembered how long their reply is."""
+_LAST_UNIT = 247
 _DIGITS = 6
 """Times are kept to the microsecond."""
 
@@ -191,11 +196,16 @@ class SerialPairer(Pairer):
     def __init__(self, framing: str, zero_ns: int, on_bad: OnBad | None = None) -> None:
         super().__init__(zero_ns, on_bad)
         self._requests, self._replies = splitter(framing), splitter(framing)
+        self._rtu = framing == "rtu"
+        self._reply_bytes: dict[bytes, int] = {}
         self._asked: _Asked | None = None
 
     def feed(self, sent: bool, data: bytes, t_ns: int) -> list[Exchange]:
         found: list[Exchange] = []
-        if sent:
+        if self._rtu and self._is_frame(sent, data):
+            frame = Frame(t_ns, data[0], data[1:-2], data)
+            (self._take_requests if sent else self._take_replies)([frame], found)
+        elif sent:
             self._take_requests(self._requests.feed(data, t_ns), found)
         else:
             if self._requests.pending:
@@ -208,6 +218,20 @@ class SerialPairer(Pairer):
         self._take_requests(self._requests.flush(), found)
         self._settle(found)
         return found
+
+    def _is_frame(self, sent: bool, data: bytes) -> bool:
+        """Whether a chunk is one frame and no more, as it mostly is; and nothing of another is waiting for its rest."""
+        size = len(data)
+        if self._requests.pending or self._replies.pending or not MIN_FRAME <= size <= MAX_FRAME or crc16(data):
+            return False
+        asked = self._asked
+        if sent:
+            return data[0] <= _LAST_UNIT and size in frame_lengths(data)[0]
+        if asked is None or data[0] != asked.expected.unit:
+            return False
+        if data[1] == asked.expected.function:
+            return size == asked.expected.pdu_bytes + 3
+        return data[1] == asked.expected.function | 0x80 and size == 5
 
     @property
     def _expected(self) -> Expected | None:
@@ -225,12 +249,17 @@ class SerialPairer(Pairer):
         if frame.unit == 0:
             found.append(self._exchange(frame.t_ns, 0, frame.pdu, b"", frame.t_ns, None))
             return
-        asked = parse_request(frame.pdu)
-        self._asked = _Asked(frame, Expected(frame.unit, frame.pdu[0], asked.reply_bytes), frame.t_ns)
+        size = self._reply_bytes.get(frame.pdu)
+        if size is None:
+            if len(self._reply_bytes) >= MAX_REMEMBERED:
+                self._reply_bytes.clear()
+            size = self._reply_bytes[frame.pdu] = parse_request(frame.pdu).reply_bytes
+        self._asked = _Asked(frame, Expected(frame.unit, frame.pdu[0], size), frame.t_ns)
 
     def _settle(self, found: list[Exchange]) -> None:
         """Another request, or the end: what is left of replies is complete, or noise."""
-        self._take_replies(self._replies.flush(self._expected), found)
+        if self._replies.pending:
+            self._take_replies(self._replies.flush(self._expected), found)
         if (asked := self._asked) is not None:
             self._asked = None
             found.append(self._exchange(asked.began_ns, asked.frame.unit, asked.frame.pdu, None, 0, asked.noise))

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from gateway.wallclock import WallClock
 from twin.data_files import find
 from twin.field_process import FieldConfig, resolve_files
 from twin.prototype_file import Prototype
-from twin.system import System
+from twin.system import System, load_system
 
 MOST = 1_000
 """Benches and programs at once: who forgets to end them is told."""
@@ -104,6 +106,7 @@ class Host:
         try:
             own = Path(beside) / name
             path = own if own.is_file() else find("systems", name)
+            seed = args.get("seed")
             config = FieldConfig(
                 system=str(path.resolve()),
                 run_dir=str(folder),
@@ -113,7 +116,9 @@ class Host:
                 speed=float(args.get("speed") or 0.0),
                 listen=dict(args.get("listen") or {}),
             )
-            return await self._open(folder, *resolve_files(config))
+            system, prototype = resolve_files(config)
+            prototype = prototype if seed is None else replace(prototype, seed=int(seed))
+            return await self._open(folder, system, prototype)
         except BaseException:
             folder_gone(folder)
             raise
@@ -176,8 +181,10 @@ class Host:
 
     async def _program(self, args: dict[str, Any]) -> dict[str, Any]:
         number = self._next()
-        folders = tuple(map(str, args.get("folders") or ()))
-        program = SteppedProgram(str(args.get("source", "")), folders, float(args.get("cycle_ms") or 10.0))
+        folders, source = tuple(map(str, args.get("folders") or ())), str(args.get("source", ""))
+        if args.get("system"):
+            source, folders = _of_system(str(args["system"]), source, folders)
+        program = SteppedProgram(source, folders, float(args.get("cycle_ms") or 10.0))
         self._programs[number] = program
         return {"id": number, "values": program.values()}
 
@@ -211,6 +218,15 @@ class Host:
         return {}
 
 
+def _of_system(name: str, program: str, folders: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
+    """The source of a system's program, and where it is."""
+    own = next((path for folder in folders if (path := Path(folder) / name).is_file()), None)
+    system = load_system(str(own or name))
+    if program not in system.plc.programs:
+        raise UsageError(f"{system.name} has no program {program!r}", expected=", ".join(system.plc.programs))
+    return system.plc.programs[program].source, (str(system.path.parent),)
+
+
 def _wanted(args: dict[str, Any]) -> Wanted:
     known = Wanted.__dataclass_fields__
     said = {key: value for key, value in args.items() if key in known and value is not None}
@@ -222,6 +238,4 @@ def _wanted(args: dict[str, Any]) -> Wanted:
 
 def folder_gone(folder: Path) -> None:
     """Remove what a bench that never opened has left."""
-    import shutil
-
     shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,233 @@
+"""The pytest plugin: emulated devices, field sides, programs and scenarios as fixtures; `*.scenario.yaml` files as tests.
+
+Loaded in every test run of whoever has fieldtwin installed, so it imports pytest and nothing else until a test asks for
+something: neither pymodbus nor canopen, and none of fieldtwin but `fieldtwin.testing`. What is emulated runs in another process
+(docs/testing.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from fieldtwin.testing.handles import Device, Plc, Prototype
+    from fieldtwin.testing.outcome import Outcome
+    from fieldtwin.testing.results import Results
+    from fieldtwin.testing.runner import Runner
+    from fieldtwin.testing.scenario_file import ScenarioFile
+    from fieldtwin.testing.wire import Wire
+
+SUFFIX = ".scenario.yaml"
+MARKER = "fieldtwin"
+_RUNNER: pytest.StashKey[Runner] = pytest.StashKey()
+_RESULTS: pytest.StashKey[Results] = pytest.StashKey()
+_WIRES: pytest.StashKey[list[Wire]] = pytest.StashKey()
+_SHOWN = 20
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    group = parser.getgroup("fieldtwin", "fieldtwin: emulated field devices")
+    group.addoption(
+        "--fieldtwin-command",
+        default="",
+        metavar="CMD",
+        help="what runs fieldtwin, such as /opt/fieldtwin/bin/fieldtwin; default: FIELDTWIN_COMMAND, else this Python",
+    )
+    group.addoption("--fieldtwin-target", default="", metavar="TARGET", help="where scenarios run; default: virtual")
+    group.addoption("--fieldtwin-seed", type=int, default=None, metavar="N", help="another seed for all that has one")
+    group.addoption(
+        "--fieldtwin-html", default="", metavar="FILE", help="one page with verdicts and the requirement matrix"
+    )
+    parser.addini("fieldtwin_scenarios", f"collect *{SUFFIX} as tests", type="bool", default=True)
+    parser.addini("fieldtwin_profiles", "folders with devices/ and systems/", type="paths", default=[])
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers",
+        "fieldtwin(device=, on=, unit=, values=, recording=, system=, plc=, ...): what the fixtures device, prototype and plc "
+        "are (docs/testing.md)",
+    )
+    config.addinivalue_line("markers", "requirement(*ids): requirements that the test covers")
+    if config.getoption("--fieldtwin-html") and not hasattr(config, "workerinput"):  # with xdist, once for all workers
+        from fieldtwin.testing.results import Results
+
+        config.stash[_RESULTS] = Results(config)
+        config.pluginmanager.register(config.stash[_RESULTS], "fieldtwin results")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    runner = config.stash.get(_RUNNER, None)
+    if runner is not None:
+        runner.close()
+        del config.stash[_RUNNER]
+
+
+def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> ScenarioFile | None:
+    if not file_path.name.endswith(SUFFIX) or not parent.config.getini("fieldtwin_scenarios"):
+        return None
+    from fieldtwin.testing.scenario_file import ScenarioFile
+
+    made: ScenarioFile = ScenarioFile.from_parent(parent, path=file_path)
+    return made
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Requirements are properties of the test: JUnit XML has them, and xdist carries them."""
+    for marker in item.iter_markers("requirement"):
+        for id in marker.args:
+            note = ("requirement", str(id))
+            if note not in item.user_properties:
+                item.user_properties.append(note)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """A failure shows what was on the wires."""
+    report = yield
+    if report.failed and report.when == "call" and (wires := item.stash.get(_WIRES, None)):
+        from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable
+
+        try:
+            seen = [str(e) for wire in wires for e in wire.exchanges()]
+        except (FieldtwinRefused, FieldtwinUnavailable) as e:
+            seen = [f"not to be had: {e}"]
+        left_out = [f"({len(seen) - _SHOWN} before)"] if len(seen) > _SHOWN else []
+        report.sections.append(("on the wire", "\n".join(left_out + seen[-_SHOWN:]) or "nothing"))
+    return report
+
+
+# -- fixtures -----------------------------------------------------------------------------------------------------------
+
+
+def _runner(config: pytest.Config) -> Runner:
+    """The other process, started when it is first needed."""
+    if _RUNNER not in config.stash:
+        from fieldtwin.testing.runner import Runner, command_of
+
+        config.stash[_RUNNER] = Runner(command_of(config.getoption("--fieldtwin-command")))
+    return config.stash[_RUNNER]
+
+
+def _said(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """What the test's markers say; those nearer to the test before those of its class and module."""
+    said: dict[str, Any] = {}
+    for marker in request.node.iter_markers(MARKER):
+        for key, value in marker.kwargs.items():
+            said.setdefault(key, value)
+        if marker.args:
+            pytest.fail(f"@pytest.mark.{MARKER} takes names: device=..., system=..., plc=...", pytrace=False)
+    return said
+
+
+def _or_fail(make: Callable[[], Any]) -> Any:
+    """What `make` makes; where it cannot, the reason in one line."""
+    from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable
+
+    try:
+        return make()
+    except (FieldtwinRefused, FieldtwinUnavailable) as e:
+        pytest.fail(f"fieldtwin: {e}", pytrace=False)
+
+
+@pytest.fixture
+def emulate(request: pytest.FixtureRequest) -> Iterator[Callable[..., Device]]:
+    """Makes devices: ``emulate("ctd-reference", on="tcp", unit=3)``. They end with the test."""
+    runner, made = _runner(request.config), list[int]()
+
+    def make(device: str, **more: Any) -> Device:
+        from fieldtwin.testing.handles import Device
+
+        said = {"seed": request.config.getoption("--fieldtwin-seed"), **_places(request), **more}
+        answer = _or_fail(lambda: runner.call("device", device=device, **said))
+        made.append(answer["id"])
+        found = Device(runner, answer["id"], "device", answer)
+        request.node.stash.setdefault(_WIRES, []).append(found.wire)
+        return found
+
+    yield make
+    for id in made:
+        _or_fail(partial(runner.call, "end", id=id))
+
+
+def _places(request: pytest.FixtureRequest) -> dict[str, Any]:
+    profiles = [str(p) for p in request.config.getini("fieldtwin_profiles")]
+    return {"beside": str(request.node.path.parent), "profiles": profiles}
+
+
+@pytest.fixture
+def device(request: pytest.FixtureRequest, emulate: Callable[..., Device]) -> Device:
+    """The device that ``@pytest.mark.fieldtwin(device=...)`` names, on a wire of its own."""
+    said = {key: value for key, value in _said(request).items() if key not in ("system", "prototype", "listen", "plc")}
+    if "device" not in said:
+        pytest.fail('which device? @pytest.mark.fieldtwin(device="ctd-reference")', pytrace=False)
+    return emulate(said.pop("device"), **said)
+
+
+@pytest.fixture
+def prototype(request: pytest.FixtureRequest) -> Iterator[Prototype]:
+    """The emulated field side of the system that ``@pytest.mark.fieldtwin(system=...)`` names; no gateway, no PLC."""
+    from fieldtwin.testing.handles import Prototype
+
+    said, runner = _said(request), _runner(request.config)
+    if "system" not in said:
+        pytest.fail('which system? @pytest.mark.fieldtwin(system="observatory")', pytrace=False)
+    keys = ("system", "prototype", "recordings", "speed", "listen", "seed")
+    args = {"seed": request.config.getoption("--fieldtwin-seed"), **{key: said[key] for key in keys if key in said}}
+    answer = _or_fail(lambda: runner.call("system", **_places(request), **args))
+    made = Prototype(runner, answer)
+    request.node.stash.setdefault(_WIRES, []).append(made.wire)
+    yield made
+    _or_fail(lambda: runner.call("end", id=answer["id"]))
+
+
+@pytest.fixture
+def wire(request: pytest.FixtureRequest) -> Wire:
+    """What is exchanged on the wire of `device`, or on those of `prototype`."""
+    if "system" in _said(request) or "prototype" in request.fixturenames:
+        whole: Prototype = request.getfixturevalue("prototype")
+        return whole.wire
+    one: Device = request.getfixturevalue("device")
+    return one.wire
+
+
+@pytest.fixture
+def plc(request: pytest.FixtureRequest) -> Iterator[Plc]:
+    """The program that ``@pytest.mark.fieldtwin(plc=...)`` names: a source as in a system file, beside the test; with
+    ``system=``, a program of that system."""
+    from fieldtwin.testing.handles import Plc
+
+    said, runner = _said(request), _runner(request.config)
+    if "plc" not in said:
+        pytest.fail('which program? @pytest.mark.fieldtwin(plc="pump.st")', pytrace=False)
+    folders = (str(request.node.path.parent),)
+    made: Plc = _or_fail(
+        lambda: Plc(runner, said["plc"], folders, said.get("cycle_ms", 10.0), system=said.get("system", ""))
+    )
+    yield made
+    _or_fail(lambda: runner.call("end", id=made.id))
+
+
+@pytest.fixture
+def scenario(request: pytest.FixtureRequest) -> Callable[..., Outcome]:
+    """Runs scenario files, beside the test: ``assert scenario("pump.scenario.yaml", seed=3)``."""
+
+    def run(path: str | Path, seed: int | None = None, target: str = "") -> Outcome:
+        from fieldtwin.testing.outcome import run_scenario
+
+        config = request.config
+        return run_scenario(
+            _runner(config).command,
+            request.node.path.parent / path,
+            seed=config.getoption("--fieldtwin-seed") if seed is None else seed,
+            target=target or config.getoption("--fieldtwin-target"),
+            profiles=[str(p) for p in config.getini("fieldtwin_profiles")],
+        )
+
+    return run

@@ -1,0 +1,155 @@
+"""What fixtures give: a device, a field side (prototype), a stepped program. Handles on what runs in the other process.
+
+Standard library only: see `fieldtwin.testing.runner`.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from typing import Any
+
+from fieldtwin.testing.runner import FieldtwinRefused, Runner
+from fieldtwin.testing.wire import Wire
+
+
+class Endpoint:
+    """Where something is reached: `url`, and as far as there is one `path` (serial port), `host` and `port`, `interface` and
+    `channel` (python-can), `baudrate` and `frame`. A virtual serial port has no parity: some libraries must be told 8N1."""
+
+    def __init__(self, words: dict[str, Any]) -> None:
+        self.url: str = words["url"]
+        self._words = words
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        __tracebackhide__ = True
+        try:
+            return self._words[name]
+        except KeyError:
+            there = ", ".join(self._words)
+            raise AttributeError(f"{self.url} has no {name}; it has {there}") from None
+
+    def __repr__(self) -> str:
+        return f"<{self.url}>"
+
+
+class Device:
+    """One emulated device. `endpoint` is the wire that it is on, and its parts stand here as well: `device.path`,
+    `device.port`; `unit` its unit or node id."""
+
+    def __init__(self, runner: Runner, bench: int, name: str, description: dict[str, Any]) -> None:
+        facts = description["devices"][name]
+        self.name = name
+        self.unit: int = facts["unit"]
+        self.node: int = facts["unit"]
+        self.profile: str = facts["profile"]
+        self.tags: tuple[str, ...] = tuple(facts["tags"])
+        self.endpoint = Endpoint(description["buses"][facts["bus"]])
+        far = description["far"].get(name)
+        self.far = Endpoint(far) if far else None
+        """The far end of a transmitter's link."""
+        self.wire = Wire(runner, bench, name)
+        self._runner = runner
+        self._bench = bench
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name == "endpoint":
+            raise AttributeError(name)
+        return getattr(self.endpoint, name)
+
+    def set(self, tag: str, value: float | str | bool | None) -> None:
+        """From now on the device holds `value`, in engineering units, whatever it plays; None: what it plays again."""
+        __tracebackhide__ = True
+        self._runner.call("set", id=self._bench, device=self.name, tag=tag, value=value)
+
+    def held(self, tag: str) -> Any:
+        """What the device holds now, in engineering units: also what a driver has written. None: nothing yet."""
+        __tracebackhide__ = True
+        return self._runner.call("held", id=self._bench, device=self.name, tag=tag)
+
+    def fault(self, name: str, **more: Any) -> AbstractContextManager[str]:
+        """``with device.fault("silence"):``; see `Wire.fault`."""
+        return self.wire.fault(name, **more)
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.profile} at {self.endpoint.url}, unit {self.unit}>"
+
+
+class Prototype:
+    """The emulated field side of a system. ``prototype["ctd"]`` is a `Device`; `buses` and `far` say where things are."""
+
+    def __init__(self, runner: Runner, description: dict[str, Any]) -> None:
+        self.system: str = description["system"]
+        self.file: str = description["file"]
+        self.buses = {name: Endpoint(words) for name, words in description["buses"].items()}
+        self.far = {name: Endpoint(words) for name, words in description["far"].items()}
+        self.wire = Wire(runner, description["id"])
+        self._devices = {name: Device(runner, description["id"], name, description) for name in description["devices"]}
+
+    def __getitem__(self, name: str) -> Device:
+        """A device by its name in the system file."""
+        __tracebackhide__ = True
+        try:
+            return self._devices[name]
+        except KeyError:
+            raise KeyError(f"no emulated device {name!r}; there are {', '.join(self._devices)}") from None
+
+    def __iter__(self) -> Any:
+        return iter(self._devices)
+
+    def __len__(self) -> int:
+        return len(self._devices)
+
+    def fault(self, name: str, **more: Any) -> AbstractContextManager[str]:
+        """``with prototype.fault("silence", device="ctd"):``; see `Wire.fault`."""
+        return self.wire.fault(name, **more)
+
+
+class Plc:
+    """A PLC program that is stepped. Its time is its own: 10 s of it take milliseconds.
+
+    ``plc.set(level=10.0)`` sets inputs (None: bad), ``plc.scan()`` runs one scan, ``plc.run(2.5)`` so many seconds of them;
+    ``plc["valve"]`` is a variable after the last scan, of a message output the list of what was sent.
+    """
+
+    def __init__(
+        self, runner: Runner, source: str, folders: tuple[str, ...] = (), cycle_ms: float = 10.0, *, system: str = ""
+    ) -> None:
+        """`source` as in a system file, searched in `folders`; with `system`, the name of one of its programs."""
+        answer = runner.call("program", source=source, folders=list(folders), cycle_ms=cycle_ms, system=system)
+        self.id: int = answer["id"]
+        self.values: dict[str, Any] = answer["values"]
+        self.scans = 0
+        self.t_s = 0.0
+        self._runner = runner
+
+    def set(self, quality: str = "good", **inputs: Any) -> Plc:
+        """Inputs from the next scan on; they stay, but for messages, which are there for one."""
+        __tracebackhide__ = True
+        self._runner.call("input", id=self.id, values=inputs, quality=quality)
+        return self
+
+    def scan(self, scans: int = 1) -> Plc:
+        """So many scans."""
+        __tracebackhide__ = True
+        return self._took(self._runner.call("scan", id=self.id, scans=scans))
+
+    def run(self, seconds: float) -> Plc:
+        """As many scans as make up `seconds` at the program's cycle."""
+        __tracebackhide__ = True
+        return self._took(self._runner.call("scan", id=self.id, seconds=seconds))
+
+    def _took(self, answer: dict[str, Any]) -> Plc:
+        self.values, self.scans, self.t_s = answer["values"], answer["scans"], answer["t_s"]
+        return self
+
+    def __getitem__(self, name: str) -> Any:
+        __tracebackhide__ = True
+        try:
+            return self.values[name]
+        except KeyError:
+            raise KeyError(f"no variable {name!r}; there are {', '.join(self.values)}") from None
+
+
+__all__ = ["Device", "Endpoint", "FieldtwinRefused", "Plc", "Prototype"]

@@ -1,0 +1,89 @@
+"""A scenario run by `fieldtwin test`, in a process of its own: its verdict, and why.
+
+Standard library only: see `fieldtwin.testing.runner`.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable
+
+VERDICTS = ("passed", "failed", "error", "inconclusive", "skipped")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a scenario ended. `verdict` is one of `VERDICTS`; only the first is a pass. `checks` are its steps and checks, as
+    `fieldtwin test --json` has them."""
+
+    name: str
+    verdict: str
+    reason: str = ""
+    seed: int | None = None
+    target: str = ""
+    requirements: tuple[str, ...] = ()
+    checks: tuple[dict[str, Any], ...] = ()
+    reproduce: str = ""
+    simulated_s: float = 0.0
+    trace: str = ""
+
+    @property
+    def passed(self) -> bool:
+        return self.verdict == "passed"
+
+    def __bool__(self) -> bool:
+        """``assert scenario("file.scenario.yaml")``."""
+        return self.passed
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
+    __repr__ = __str__
+
+    def lines(self) -> list[str]:
+        """The verdict, what was expected and seen, and the line that runs it again."""
+        said = [f"{self.verdict.upper()}: {self.name}" + (f": {self.reason}" if self.reason else "")]
+        for check in self.checks:
+            if check["verdict"] != "passed":
+                said += [f"  {check['number']}: {check['text']}", f"    expected {check['expected']}"]
+                said += [f"    got      {check['got']}"] if check["got"] else []
+        return [*said, f"  again: {self.reproduce}"]
+
+
+def run_scenario(
+    command: Sequence[str],
+    path: Path,
+    *,
+    seed: int | None = None,
+    target: str = "",
+    profiles: Sequence[str] = (),
+) -> Outcome:
+    """Run one. Raises `FieldtwinRefused` for a file that is no scenario, `FieldtwinUnavailable` where nothing runs it."""
+    argv = [*command, "test", str(path), "--json"]
+    argv += ["--seed", str(seed)] if seed is not None else []
+    argv += ["--target", target] if target else []
+    for folder in profiles:
+        argv += ["--profiles", folder]
+    try:
+        done = subprocess.run(
+            argv, capture_output=True, text=True, encoding="utf-8", stdin=subprocess.DEVNULL, check=False
+        )
+    except OSError as e:
+        raise FieldtwinUnavailable(f"cannot start {command[0]!r}: {e.strerror or e}") from e
+    said = done.stderr.strip()
+    if done.returncode not in (0, 1) or not done.stdout.strip():
+        kind = FieldtwinRefused if done.returncode in (2, 3) else FieldtwinUnavailable
+        raise kind(said.removeprefix("fieldtwin: ") or f"{argv[0]} ended with status {done.returncode}")
+    try:
+        plain = json.loads(done.stdout)[0]
+    except (ValueError, LookupError, TypeError):
+        raise FieldtwinUnavailable(f"no results: {done.stdout[:200]!r} {said}") from None
+    known = {key: plain[key] for key in Outcome.__dataclass_fields__ if key in plain}
+    known |= {key: tuple(plain.get(key, ())) for key in ("requirements", "checks")}
+    return Outcome(**known)

@@ -1,0 +1,78 @@
+"""What a whole test run gave, for one HTML page (`--fieldtwin-html`): from pytest's reports, also those of xdist's workers."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, Runner, command_of
+
+
+class Results:
+    """A plugin of its own, registered where the page was asked for."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._config = config
+        self._tests: dict[str, dict[str, Any]] = {}
+        self._problem = ""
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """The worst of a test's phases counts."""
+        if report.when != "call" and report.passed:
+            return
+        properties = list(report.user_properties)
+        said = dict(properties).get("fieldtwin verdict", "")
+        ended = (
+            "passed"
+            if report.passed
+            else "skipped"
+            if report.skipped
+            else "failed"
+            if report.when == "call"
+            else "error"
+        )
+        file, line, _ = report.location
+        self._tests[report.nodeid] = {
+            "name": report.nodeid,
+            "verdict": said if said in ("inconclusive", "error") else ended,
+            "requirements": [str(value) for name, value in properties if name == "requirement"],
+            "text": "" if report.passed else _reason(report),
+            "took_s": report.duration,
+            "reproduce": shlex.join(["pytest", report.nodeid]),
+            "file": file,
+            "line": (line or 0) + 1,
+        }
+
+    def pytest_sessionfinish(self) -> None:
+        runner = Runner(command_of(self._config.getoption("--fieldtwin-command")))
+        try:
+            runner.call(
+                "report",
+                file=str(Path(self._config.getoption("--fieldtwin-html")).resolve()),
+                title=self._config.rootpath.name,
+                tests=list(self._tests.values()),
+                reproduce=shlex.join(["pytest", *self._config.invocation_params.args]),
+                versions={"pytest": pytest.__version__, "Python": platform.python_version(), "platform": sys.platform},
+            )
+        except (FieldtwinRefused, FieldtwinUnavailable) as e:
+            self._problem = str(e)
+        finally:
+            runner.close()
+
+    def pytest_terminal_summary(self, terminalreporter: Any) -> None:
+        where = self._config.getoption("--fieldtwin-html")
+        if self._problem:
+            terminalreporter.write_line(f"fieldtwin: no report: {self._problem}", red=True)
+        else:
+            terminalreporter.write_sep("-", f"report: {where}")
+
+
+def _reason(report: pytest.TestReport) -> str:
+    if report.skipped and isinstance(report.longrepr, tuple):
+        return report.longrepr[2].removeprefix("Skipped: ")
+    return report.longreprtext[-4000:]

@@ -1,0 +1,154 @@
+"""The process that runs what tests ask for, and talking to it: one for a test session, started when it is first needed.
+
+Standard library only, and no other part of fieldtwin: what is imported here is imported into the user's own test run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Sequence
+from queue import Empty, Queue
+from typing import IO, Any
+
+ANSWER_WITHIN_S = 60.0
+END_WITHIN_S = 5.0
+COMMAND_VARIABLE = "FIELDTWIN_COMMAND"
+
+
+class FieldtwinUnavailable(Exception):
+    """The process could not be started, or ended; with what it said."""
+
+
+class FieldtwinRefused(Exception):
+    """What was asked for makes no sense, or could not be done; `kind` is the error's class over there."""
+
+    def __init__(self, message: str, kind: str = "") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+def command_of(said: str = "") -> list[str]:
+    """The command `fieldtwin`: what was `said`, else FIELDTWIN_COMMAND, else this very Python's."""
+    text = said or os.environ.get(COMMAND_VARIABLE, "")
+    return shlex.split(text) if text else [sys.executable, "-m", "fieldtwin"]
+
+
+class Runner:
+    """One process ``COMMAND test-host``; starts at the first `call`. Calls may come from any thread, one at a time."""
+
+    def __init__(self, command: Sequence[str] = ()) -> None:
+        self.command = list(command) or command_of()
+        self._process: subprocess.Popen[str] | None = None
+        self._answers: Queue[str | None] = Queue()
+        self._said: IO[str] | None = None
+        self._lock = threading.Lock()
+        self._number = 0
+
+    def call(self, verb: str, **args: Any) -> Any:
+        """Ask for `verb`, and its result. Raises `FieldtwinRefused` or `FieldtwinUnavailable`."""
+        __tracebackhide__ = True
+        with self._lock:
+            process = self._started()
+            self._number += 1
+            request = {"v": 1, "id": self._number, "verb": verb, "args": args}
+            assert process.stdin is not None
+            try:
+                process.stdin.write(json.dumps(request) + "\n")
+                process.stdin.flush()
+            except OSError:
+                raise self._gone() from None
+            answer = self._answer(self._number, verb)
+        if answer.get("ok"):
+            return answer.get("result")
+        error = answer.get("error") or {}
+        raise FieldtwinRefused(str(error.get("message", "?")), str(error.get("kind", "")))
+
+    def _answer(self, number: int, verb: str) -> dict[str, Any]:
+        while True:
+            try:
+                line = self._answers.get(timeout=ANSWER_WITHIN_S)
+            except Empty:
+                raise FieldtwinUnavailable(f"no answer to {verb!r} within {ANSWER_WITHIN_S:g} s") from None
+            if line is None:
+                raise self._gone()
+            try:
+                answer = json.loads(line)
+            except ValueError:
+                raise FieldtwinUnavailable(f"{shlex.join(self.command)} said {line.strip()[:200]!r}") from None
+            if isinstance(answer, dict) and answer.get("id") == number:
+                return answer
+
+    def _started(self) -> subprocess.Popen[str]:
+        if self._process is not None:
+            return self._process
+        self._said = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed with the process
+        try:
+            process = subprocess.Popen(
+                [*self.command, "test-host"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._said,
+                text=True,
+                encoding="utf-8",
+                start_new_session=True,  # Ctrl-C is for pytest: what runs here ends when its input does
+            )
+        except OSError as e:
+            self._said.close()
+            raise FieldtwinUnavailable(
+                f"cannot start {self.command[0]!r}: {e.strerror or e}; --fieldtwin-command or {COMMAND_VARIABLE} says what to run"
+            ) from e
+        threading.Thread(target=_pump, args=(process, self._answers), daemon=True, name="fieldtwin").start()
+        self._process = process
+        return process
+
+    def _gone(self) -> FieldtwinUnavailable:
+        """Why the process is no longer there, with the end of what it said."""
+        assert self._process is not None
+        assert self._said is not None
+        try:
+            code: int | None = self._process.wait(END_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            code = None
+        self._said.seek(0)
+        last = "".join(deque(self._said, maxlen=5)).strip()
+        ended = "does not answer any more" if code is None else f"ended with status {code}"
+        hint = f"; --fieldtwin-command or {COMMAND_VARIABLE} says what to run" if "No module named" in last else ""
+        return FieldtwinUnavailable(f"{shlex.join(self.command)} test-host {ended}: {last or 'it said nothing'}{hint}")
+
+    def close(self) -> None:
+        """End the process, and with it all that it runs."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        assert process.stdin is not None
+        try:
+            process.stdin.close()
+        except OSError:
+            pass  # it had ended by itself
+        try:
+            process.wait(END_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        if process.stdout is not None:
+            process.stdout.close()
+        if self._said is not None:
+            self._said.close()
+
+
+def _pump(process: subprocess.Popen[str], answers: Queue[str | None]) -> None:
+    """Every line of its output; None when it has ended."""
+    assert process.stdout is not None
+    try:
+        for line in process.stdout:
+            answers.put(line)
+    except (OSError, ValueError):
+        pass  # closed under our hands: the end
+    answers.put(None)

@@ -27,6 +27,8 @@ CALM_S = 0.8
 """After this silence on a line no receiver waits for the rest of a frame, however slow its timers are (libmodbus: 0.5 s)."""
 PATIENCE = 3
 """So many timeouts are waited for an answer that is due before it is called silence: slow is no fault."""
+FIRST_TRANSACTION = 0x0100
+"""Ids begin anew with each case: the same case sends the same bytes, whatever was played before."""
 GATEWAY_SAYS_NO = (0x0A, 0x0B)
 """Exceptions of a gateway that has no such device: nobody is there."""
 
@@ -245,6 +247,7 @@ class ModbusWire:
                 await self.drain()
                 self._echo_left = b""
                 if not await self.still_good(at_once=True):
+                    self._transaction = FIRST_TRANSACTION
                     return True
             except Unreachable:
                 await self.pause(self.timeout_s)

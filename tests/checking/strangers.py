@@ -31,6 +31,8 @@ from gateway.core.errors import Unreachable
 PROGRAM = Path(__file__).parents[1] / "interop" / "strange_slaves.py"
 A_SERVER = 2
 """Cases that one server is asked."""
+STAGGER_S = 0.02
+"""From the beginning of one check to that of the next: what many do at once would look like a peer that thinks for long."""
 TIMEOUT_S = 0.25
 """libmodbus thinks for 0.5 s before it refuses; three timeouts are waited for an answer that is due."""
 MAY_WRITE = {"holding": (190, 10), "coil": (3, 1)}
@@ -59,10 +61,13 @@ def version_of(peer: str) -> str:
     return ".".join(str(ctypes.c_uint.in_dll(lib, f"libmodbus_version_{p}").value) for p in ("major", "minor", "micro"))
 
 
-async def check_all(peer: str, wire: str, folder: Path) -> list[DeviceResult]:
-    """Every case that `wire` (rtu, ascii or mbap) has, on as many servers as it takes, in the order of the catalogue."""
+async def check_all(
+    peer: str, wire: str, folder: Path, after_s: float = 0.0, only: frozenset[str] = frozenset()
+) -> list[DeviceResult]:
+    """Every case that `wire` (rtu, ascii or mbap) has, or these, on as many servers as it takes, in their order."""
+    await asyncio.sleep(after_s)
     traits = traits_of(Endpoint.parse({"rtu": "rtu:/x", "ascii": "ascii:/x", "mbap": "tcp://x:1"}[wire]))
-    ids = [case.id for case in CASES if not case.wires or traits & set(case.wires)]
+    ids = [case.id for case in CASES if case.chosen(only) and (not case.wires or traits & set(case.wires))]
     groups = [ids[at : at + A_SERVER] for at in range(0, len(ids), A_SERVER)]
     async with AsyncExitStack() as stack:
         lines: list[PtyEnd] = []
@@ -77,7 +82,7 @@ async def check_all(peer: str, wire: str, folder: Path) -> list[DeviceResult]:
         ]
         ports = await _serve(stack, peer, jobs)
         found = await asyncio.gather(
-            *(_check(wire, ids, ports[n], lines[n] if lines else None) for n, ids in enumerate(groups))
+            *(_check(wire, ids, ports[n], lines[n] if lines else None, n * STAGGER_S) for n, ids in enumerate(groups))
         )
     return [result for results in found for result in results]
 
@@ -97,7 +102,8 @@ async def _serve(stack: AsyncExitStack, peer: str, jobs: Sequence[dict[str, Any]
     return {int(row): int(port) for row, port in ready}
 
 
-async def _check(wire: str, ids: Sequence[str], port: int, line: PtyEnd | None) -> list[DeviceResult]:
+async def _check(wire: str, ids: Sequence[str], port: int, line: PtyEnd | None, after_s: float) -> list[DeviceResult]:
+    await asyncio.sleep(after_s)
     plan = Plan(frozenset(ids), Danger.DISRUPT, frozenset({"holding", "coil", "i-know"}))
     url = f"tcp://127.0.0.1:{port}" if line is None else f"{wire}:/line?baudrate=115200&frame=8N1"
     connector = OsConnector() if line is None else PtyConnector(line)

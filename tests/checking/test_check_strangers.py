@@ -28,13 +28,23 @@ def found_on(peer: str, wire: str) -> list[DeviceResult]:
     """Played once, all of them at the same time."""
 
     async def main(folder: Path) -> list[list[DeviceResult]]:
-        return await asyncio.gather(*(check_all(p, w, folder) for p, w in here))
+        return await asyncio.gather(*(check_all(p, w, folder, n * 0.5) for n, (p, w) in enumerate(here)))
 
     if not _found:
         here = [(p, w) for p, w in WIRES if version_of(p)]
         with tempfile.TemporaryDirectory(dir="/tmp") as folder:
             _found.update(zip(here, asyncio.run(main(Path(folder))), strict=True))
     return _found[peer, wire]
+
+
+def again(peer: str, wire: str, only: frozenset[str]) -> list[DeviceResult]:
+    """These cases alone: what they found may have been this computer's load."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        return asyncio.run(check_all(peer, wire, Path(folder), only=only))
+
+
+def not_passed(results: list[DeviceResult]) -> dict[str, str]:
+    return {r.case.id: f"{r.verdict.value}: {r.reason}" for r in results if r.verdict is not Verdict.PASSED}
 
 
 @pytest.mark.parametrize(("peer", "wire"), WIRES)
@@ -44,7 +54,9 @@ def test_verdicts_are_the_known_ones(peer: str, wire: str) -> None:
         pytest.skip(f"{peer} is not installed")
     results = found_on(peer, wire)
     known = KNOWN[peer][wire]
-    found = {r.case.id: f"{r.verdict.value}: {r.reason}" for r in results if r.verdict is not Verdict.PASSED}
+    found = not_passed(results)
+    if odd := frozenset(id for id in found | known if found.get(id) != known.get(id)):  # once more, without the crowd
+        found = {id: said for id, said in found.items() if id not in odd} | not_passed(again(peer, wire, odd))
     if here == KNOWN["versions"][peer]:
         assert found == known
     else:

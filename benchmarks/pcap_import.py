@@ -3,9 +3,9 @@
 
     benchmarks/pcap_import.py [--runs 3] [--packets 200000] [--quick]
 
-Modbus TCP: four clients that poll four servers, ten registers a request, an acknowledgement behind each reply, some requests in two
-segments. RTU over TCP: the same, on another port. CAN: frames of a SocketCAN capture. tshark, where it is installed, only counts the same packets with its Modbus dissector. Runs are
-interleaved; times are medians. Exit status 1 when a goal is missed.
+Modbus TCP: four clients that poll four servers, ten registers a request, an acknowledgement behind each reply, some requests in
+two segments. RTU over TCP: the same, on another port. CAN: frames of a SocketCAN capture. tshark, where it is installed, only
+filters the same packets. Runs are interleaved; times are medians. Exit status 1 when a goal is missed.
 """
 
 from __future__ import annotations

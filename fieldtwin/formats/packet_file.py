@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
@@ -79,14 +80,14 @@ class PacketFile:
                 return self._guarded(self._classic(*_CLASSIC[magic]))
             if magic == _SECTION:
                 return self._guarded(self._pcapng())
-        except (OSError, EOFError) as e:
+        except (OSError, EOFError, zlib.error) as e:
             raise self._invalid(f"cannot be read: {e}") from e
         raise self._invalid("neither pcap nor pcapng", expected="a1b2c3d4, d4c3b2a1 or 0a0d0d0a", got=magic.hex(), at=0)
 
     def _guarded(self, packets: Iterator[Packet]) -> Iterator[Packet]:
         try:
             yield from packets
-        except (OSError, EOFError) as e:  # gzip says so of a file that is cut off or damaged
+        except (OSError, EOFError, zlib.error) as e:  # gzip says so of a file that is cut off or damaged
             raise self._invalid(f"cannot be read on: {e}") from e
 
     def _read(self, size: int) -> bytes:

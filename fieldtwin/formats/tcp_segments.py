@@ -21,6 +21,8 @@ _VLAN = (0x8100, 0x88A8, 0x9100)
 _IP4, _IP6 = 0x0800, 0x86DD
 _TCP, _UDP = 6, 17
 _SEQUENCES = 1 << 32
+_PLAIN_IP4 = b"\x08\x00\x45"
+"""An EtherType, and an IPv4 header without options."""
 
 MAX_WAITING = 64
 """Segments of one direction that wait for an earlier one; with one more, the earlier one is taken as lost by the capture."""
@@ -110,6 +112,7 @@ class Conversation:
     client: Side | None = None
     segments: dict[Side, Segments] = field(default_factory=dict)
     last_ns: int = 0
+    ended: bool = False
     state: object = None
     """Whatever the one who listens keeps about it."""
 
@@ -132,6 +135,16 @@ class PacketCounters:
     lost_bytes: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class _Path:
+    """One direction of a connection, by the addresses and ports of its packets."""
+
+    conversation: Conversation
+    sender: Side
+    mine: Segments
+    theirs: Segments
+
+
 class Conversations:
     """All conversations of a capture. A connection that is opened anew with the same ports is another one."""
 
@@ -140,10 +153,16 @@ class Conversations:
         self._on_data, self._on_end = on_data, on_end
         self._open: dict[tuple[bool, Side, Side], Conversation] = {}
         self._fragments = Fragments()
+        self._paths: dict[bytes, _Path] = {}
 
     def packet(self, t_ns: int, link: int, data: bytes) -> None:
         """The next packet of the capture."""
         self.counters.packets += 1
+        if link == LINK_ETHERNET and len(data) >= 54 and data[12:15] == _PLAIN_IP4 and data[23] == _TCP:
+            if not self._next_segment(t_ns, data):
+                self._ip4(t_ns, data, 14)
+                self._remember(data)
+            return
         found = _network(link, data)
         if found is None:
             self.counters.others += 1
@@ -155,6 +174,41 @@ class Conversations:
             self._ip6(t_ns, data, at)
         else:
             self.counters.others += 1
+
+    def _next_segment(self, t_ns: int, data: bytes) -> bool:
+        """The way of nearly all packets: what follows in a connection that is known, with nothing missing. False: it is not."""
+        path = self._paths.get(data[26:38])
+        if (
+            path is None
+            or path.conversation.ended
+            or data[47] & 0x07
+            or data[20] & 0x3F
+            or data[21]
+            or path.theirs.waits
+        ):
+            return False
+        end = 14 + (data[16] << 8 | data[17])
+        payload = data[34 + (data[46] >> 4) * 4 : end]
+        if not payload or end > len(data) or end == 14:
+            return not payload and 14 < end <= len(data)
+        mine = path.mine
+        if mine.waits or int.from_bytes(data[38:42]) != mine.next:
+            return False
+        mine.next = (mine.next + len(payload)) % _SEQUENCES
+        self.counters.carried += 1
+        path.conversation.last_ns = t_ns
+        self._on_data(path.conversation, path.sender, payload, t_ns, 0)
+        return True
+
+    def _remember(self, data: bytes) -> None:
+        """The way of the packets that follow this one, once both sides were heard."""
+        sender, other = (data[26:30], data[34] << 8 | data[35]), (data[30:34], data[36] << 8 | data[37])
+        conversation = self._open.get(_key(False, sender, other))
+        if conversation is not None and len(conversation.segments) == 2:
+            if len(self._paths) >= 2 * MAX_CONVERSATIONS:
+                self._paths.clear()
+            segments = conversation.segments
+            self._paths[data[26:38]] = _Path(conversation, sender, segments[sender], segments[other])
 
     def finish(self) -> None:
         """The capture is over."""
@@ -279,6 +333,7 @@ class Conversations:
         conversation = self._open.pop(key, None)
         if conversation is None:
             return
+        conversation.ended = True
         for side, segments in conversation.segments.items():
             for lost, chunk in segments.flush():
                 self.counters.lost_bytes += lost

@@ -218,7 +218,11 @@ def test_a_capture_that_is_cut_off_anywhere_is_read_up_to_there(tmp_path: Path) 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_damaged_capture_is_an_error_with_its_offset_or_is_read(tmp_path: Path, data: st.DataObject) -> None:
-    whole = bytearray(data.draw(st.sampled_from([pcap(polls()), pcapng(polls()), pcap([bytes(16)] * 3, 227)])))
+    whole = bytearray(
+        data.draw(
+            st.sampled_from([pcap(polls()), pcapng(polls()), pcap([bytes(16)] * 3, 227), gzip.compress(pcap(polls()))])
+        )
+    )
     for _ in range(data.draw(st.integers(1, 6))):
         whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     out = tmp_path / "r.jsonl"

@@ -45,7 +45,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     here = Path(__file__).parent
     for item in items:
-        folder = item.path.relative_to(here).parts[0]
+        folder = item.path.relative_to(here.parent).parts[1]  # of tests/, or of examples/
         item.add_marker(pytest.mark.xdist_group("systems" if folder in WHOLE_SYSTEMS else item.path.name))
 
 

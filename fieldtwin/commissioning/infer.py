@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 from fieldtwin.commissioning.dump_file import Dump
 from fieldtwin.commissioning.infer_costs import ORDER_COST, decode_series
-from fieldtwin.commissioning.infer_fields import LIKELY, Reading, infer_run, runs_of
-from fieldtwin.commissioning.infer_marks import marked, with_scales
+from fieldtwin.commissioning.infer_fields import LIKELY, Reading, Run, infer_run, run_of, runs_of
+from fieldtwin.commissioning.infer_marks import clock_fields, marked, with_scales
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid
 
@@ -90,19 +90,39 @@ def without_repetitions(series: Series) -> Series:
 
 
 def infer(series: Series) -> Inference:
-    """What the registers probably are. Pure; takes about a millisecond a register."""
+    """What the registers probably are. Pure; takes some milliseconds a register."""
     seen = without_repetitions(series)
-    orders = _orders_kept(_look(seen, ORDER_COST))
-    readings = with_scales([_marked(r, series) for r in _look(seen, orders)])
-    return Inference(series, tuple(_supported(readings)), orders)
+    tables = [(table, seen.cells.get(table, {})) for table in REGISTER_TABLES]
+    clocks, runs = [], []
+    for table, cells in tables:
+        for address, words in runs_of(cells):
+            found = clock_fields(table, address, words, seen.times_s)
+            clocks += found
+            runs += [run_of(table, *part) for part in _between(address, words, found)]
+    orders = _orders_kept(_look(runs, ORDER_COST, seen.pairs))
+    readings = with_scales([_marked(r, series) for r in _look(runs, orders, seen.pairs)])
+    readings = sorted([*_supported(readings), *clocks], key=lambda r: (r.table, r.address))
+    return Inference(series, tuple(readings), orders)
 
 
-def _look(series: Series, orders: Mapping[str, float]) -> list[Reading]:
-    readings = []
-    for table in REGISTER_TABLES:
-        for address, words in runs_of(series.cells.get(table, {})):
-            readings += infer_run(table, address, words, orders, SINGLE_COST if table in series.pairs else 0.0)
-    return readings
+def _between(
+    address: int, words: Sequence[Sequence[int]], clocks: Sequence[Reading]
+) -> list[tuple[int, Sequence[Sequence[int]]]]:
+    """What is left of a run when its clocks are taken out."""
+    taken = {r.address - address for r in clocks}
+    parts: list[tuple[int, list[Sequence[int]]]] = []
+    for i, word in enumerate(words):
+        if i in taken:
+            continue
+        if parts and parts[-1][0] + len(parts[-1][1]) == address + i:
+            parts[-1][1].append(word)
+        else:
+            parts.append((address + i, [word]))
+    return [(first, rows) for first, rows in parts]
+
+
+def _look(runs: Sequence[Run], orders: Mapping[str, float], pairs: frozenset[str]) -> list[Reading]:
+    return [r for run in runs for r in infer_run(run, orders, SINGLE_COST if run.table in pairs else 0.0)]
 
 
 def _marked(reading: Reading, series: Series) -> Reading:
@@ -126,11 +146,21 @@ def _orders_kept(readings: Sequence[Reading]) -> dict[str, float]:
 
 
 def _supported(readings: Sequence[Reading]) -> list[Reading]:
-    """Floats that stand alone with their order are capped."""
-    flocks = Counter(r.order for r in readings if r.type.startswith("float") and r.moves and r.probability >= LIKELY)
-    return [
-        replace(r, capped=r.capped or "a single float looks like a large whole number that wavers")
-        if r.type == "float32" and flocks[r.order] < FLOCK
-        else r
-        for r in readings
-    ]
+    """What nothing else on the device supports is capped: an order that few values keep to, a float among no floats."""
+    moving = [r for r in readings if r.moves and r.probability >= LIKELY and r.type != "string"]
+    orders = Counter(r.order for r in moving if r.registers > 1)
+    floats = Counter(r.order for r in moving if r.type.startswith("float"))
+    swapped = orders["BADC"] + orders["DCBA"]
+
+    def doubt(r: Reading) -> str:
+        if r.type == "string":
+            return ""
+        if r.type == "float32" and floats[r.order] < FLOCK:
+            return "a single float looks like a large whole number that wavers"
+        if r.registers > 1 and orders[r.order] < FLOCK:
+            return "few values here keep to that order"
+        if r.registers == 1 and r.order == "BADC" and swapped < FLOCK:
+            return "nothing else here has its bytes swapped"
+        return ""
+
+    return [replace(r, capped=r.capped or doubt(r)) for r in readings]

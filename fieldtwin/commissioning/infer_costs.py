@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from itertools import pairwise
 from statistics import median
 
@@ -52,40 +53,74 @@ def orders_of(kind: str) -> tuple[str, ...]:
     return ("ABCD", "BADC") if REGISTERS_OF[kind] == 1 else ("ABCD", "CDAB", "BADC", "DCBA")
 
 
+def whole_numbers(words: Sequence[Sequence[int]], order: str) -> list[int]:
+    """Each pass's words put together in this order, as unsigned numbers."""
+    if order in ("BADC", "DCBA"):
+        words = [[w >> 8 | (w & 0xFF) << 8 for w in row] for row in words]
+    if order in ("CDAB", "DCBA"):
+        words = [row[::-1] for row in words]
+    if len(words[0]) == 1:
+        return [row[0] for row in words]
+    if len(words[0]) == 2:
+        return [row[0] << 16 | row[1] for row in words]
+    return [row[0] << 48 | row[1] << 32 | row[2] << 16 | row[3] for row in words]
+
+
 def decode_series(words: Sequence[Sequence[int]], kind: str, order: str) -> list[float] | None:
     """The raw numbers of each pass's words; None where one is none (a BCD digit above 9)."""
-    numbers: list[float] = []
-    for row in words:
-        data = reorder(b"".join(w.to_bytes(2) for w in row), order)
-        if kind == "bcd16":
-            digits = data.hex()
-            if not digits.isdigit():
-                return None
-            numbers.append(int(digits))
-        else:
-            numbers.append(struct.unpack(_FORMATS[kind], data)[0])
-    return numbers
+    return decode_numbers(whole_numbers(words, order), kind)
 
 
-def cost(words: Sequence[Sequence[int]], kind: str, order: str, orders: Mapping[str, float] = ORDER_COST) -> float:
-    """The cost of `words` (one row a pass) as a series of this type; the rarity of type and order included."""
+def decode_numbers(wholes: Sequence[int], kind: str) -> list[float] | None:
+    """Unsigned numbers as numbers of this type."""
+    if kind.startswith("uint"):
+        return list(wholes)
+    bits = 16 * REGISTERS_OF[kind]
+    if kind.startswith("int"):
+        return [x - (1 << bits) if x >> (bits - 1) else x for x in wholes]
+    if kind.startswith("bcd"):
+        digits = [f"{x:0{bits // 4}x}" for x in wholes]
+        return [int(d) for d in digits] if all(map(str.isdecimal, digits)) else None
+    count, letter = len(wholes), _FORMATS[kind][1]
+    raw = struct.pack(f">{count}{'I' if bits == 32 else 'Q'}", *wholes)
+    return list(struct.unpack(f">{count}{letter}", raw))
+
+
+def cost(words: Sequence[Sequence[int]], kind: str, order: str) -> float:
+    """The cost of `words` (one row a pass) as a series of this type, the rarity of the type included; that of the order is not
+    (`order_cost`)."""
     if kind == "string":
-        return _text_cost(words, order) + TYPE_COST[kind] + ORDER_COST[order]
-    numbers = decode_series(words, kind, order)
+        return _text_cost(words, order) + TYPE_COST[kind]
+    return cost_of(whole_numbers(words, order), kind, order)
+
+
+def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
+    """As `cost`, of numbers put together already."""
+    if not any(wholes):
+        return ZERO_COST if kind == "uint16" and order == "ABCD" else 6.0 + TYPE_COST[kind]
+    numbers = decode_numbers(wholes, kind)
     if numbers is None:
         return IMPOSSIBLE
-    if not any(map(any, words)):
-        return ZERO_COST if kind == "uint16" and order == "ABCD" else 6.0 + TYPE_COST[kind] + ORDER_COST[order]
-    rarity = TYPE_COST[kind] + orders[order]
+    rarity = TYPE_COST[kind]
     if kind in _MANTISSA_BITS:
         return rarity + _float_cost(numbers, kind)
     integers = [int(x) for x in numbers]
     bits = 16 * REGISTERS_OF[kind]
-    signed = kind.startswith("int")
     wild = WILD_COST if _is_wild(integers, bits) else 0.0
     if bits == 32 and abs(integers[0]) > LARGE and _wavers(integers):
         wild = max(wild, LARGE_COST)
+    signed = kind.startswith("int")
     return rarity + wild + _first_cost(integers[0], bits, signed=signed) + walk_cost(integers)
+
+
+def order_cost(kind: str, order: str, orders: Mapping[str, float]) -> float:
+    """What an order costs where the four have these costs. One register has no word order, only bytes that are swapped or not."""
+    if kind == "string":
+        return ORDER_COST[order]
+    if REGISTERS_OF[kind] > 1:
+        return orders[order]
+    pair = ("ABCD", "CDAB") if order == "ABCD" else ("BADC", "DCBA")
+    return -math.log(sum(math.exp(-orders[o]) for o in pair))
 
 
 def _wavers(numbers: Sequence[int]) -> bool:
@@ -136,7 +171,7 @@ def _float_cost(numbers: Sequence[float], kind: str) -> float:
     decades = 3.2 if -2 <= size <= 5 else 6.0 if -6 <= size <= 9 else 12.0
     powers = [math.frexp(x)[1] for x in numbers if x != 0]
     leaps = [abs(b - a) for a, b in pairwise(powers)]
-    decades += WILD_COST if leaps and median(leaps) > 3 else 0.0
+    decades += 3.0 * max(0.0, median(leaps) - 1) if leaps else 0.0  # it leaps over powers of two
     start = decades + (1.0 if first < 0 else 0.3) + _mantissa_cost(first, kind)
     ordered = [_ordered(x, kind) for x in numbers]
     return start + min(walk_cost(ordered), _TEMPER * _real_steps_cost(numbers, bits))
@@ -158,6 +193,7 @@ def _real_steps_cost(numbers: Sequence[float], bits: int) -> float:
     return total
 
 
+@lru_cache(maxsize=4096)
 def _mantissa_cost(value: float, kind: str) -> float:
     """The digits of a first value: few where it is round, in twos or in tens."""
     bits = _MANTISSA_BITS[kind]

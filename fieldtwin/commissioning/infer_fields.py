@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import pairwise
 
@@ -19,8 +19,11 @@ from fieldtwin.commissioning.infer_costs import (
     NUMBERS,
     ORDER_COST,
     cost,
+    cost_of,
     decode_series,
+    order_cost,
     orders_of,
+    whole_numbers,
 )
 from gateway.core.profile import REGISTERS_OF
 from gateway.devices.codec import reorder
@@ -89,23 +92,37 @@ class _Tile:
     type: str
     order: str
     cost: float
+    idle: bool = False
 
     @property
     def end(self) -> int:
         return self.start + self.size
 
 
-def infer_run(
-    table: str,
-    address: int,
-    words: Sequence[Sequence[int]],
-    orders: Mapping[str, float] = ORDER_COST,
-    single_cost: float = 0.0,
-) -> list[Reading]:
-    """The most probable tiling of a run. `words[i]` are the words of register ``address + i``, one a pass; `orders` what each
-    order costs, `single_cost` what a value of one register costs besides."""
-    count = len(words)
-    tiles = [t for start in range(count) for t in _tiles(words, start, orders, single_cost)]
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Neighbouring registers and every way to read a stretch of them. `words[i]` are those of ``address + i``, one a pass."""
+
+    table: str
+    address: int
+    words: Sequence[Sequence[int]]
+    tiles: Sequence[_Tile]
+
+
+def run_of(table: str, address: int, words: Sequence[Sequence[int]]) -> Run:
+    """All readings of a run with their costs, the dear part of inferring; takes some milliseconds a register."""
+    return Run(table, address, words, [t for start in range(len(words)) for t in _tiles(words, start)])
+
+
+def infer_run(run: Run, orders: Mapping[str, float] = ORDER_COST, single_cost: float = 0.0) -> list[Reading]:
+    """The most probable tiling of a run. `orders`: what each order costs; `single_cost`: what a value of one register costs
+    besides."""
+    count = len(run.words)
+    extra = {(t.type, t.order): order_cost(t.type, t.order, orders) for t in run.tiles}
+    tiles = [
+        replace(t, cost=t.cost + extra[t.type, t.order] + (single_cost if t.size == 1 and not t.idle else 0.0))
+        for t in run.tiles
+    ]
     by_end: list[list[_Tile]] = [[] for _ in range(count + 1)]
     by_start: list[list[_Tile]] = [[] for _ in range(count + 1)]
     for tile in tiles:
@@ -120,32 +137,41 @@ def infer_run(
     readings = []
     for tile in _best(by_end, count):
         share = min(1.0, math.exp(forward[tile.start] - tile.cost + backward[tile.end] - forward[count]))
-        readings.append(_reading(table, address, words, tile, share, covering[tile.start]))
+        readings.append(_reading(run.table, run.address, run.words, tile, share, covering[tile.start]))
     return readings
 
 
-def _tiles(words: Sequence[Sequence[int]], start: int, orders: Mapping[str, float], single_cost: float) -> list[_Tile]:
-    tiles = []
-    for kind in NUMBERS:
-        size = REGISTERS_OF[kind]
-        if start + size > len(words):
-            continue
-        rows = list(zip(*words[start : start + size], strict=True))
-        for order in orders_of(kind):
-            if order == "BADC" and size == 1 and kind == "bcd16":
-                continue
-            price = cost(rows, kind, order, orders) + (single_cost if size == 1 else 0.0)
-            if price < IMPOSSIBLE or (kind == "uint16" and order == "ABCD"):
-                tiles.append(_Tile(start, size, kind, order, price))
+def _tiles(words: Sequence[Sequence[int]], start: int) -> list[_Tile]:
+    if not any(words[start]):
+        tiles = [_Tile(start, 1, "uint16", "ABCD", cost_of(words[start], "uint16", "ABCD"), idle=True)]
+    else:
+        tiles = _number_tiles(words, start, 1)
+    for size in (2, 4):
+        if start + size <= len(words) and any(any(w) for w in words[start : start + size]):
+            tiles += _number_tiles(words, start, size)
     for size in range(2, min(MOST_TEXT_REGISTERS, len(words) - start) + 1):
         last = words[start + size - 1]
         if any(w != last[0] for w in last) or (size == 2 and any(w != words[start][0] for w in words[start])):
             break  # text stands still
-        rows = list(zip(*words[start : start + size], strict=True))
+        row = [w[0] for w in words[start : start + size]]
         for order in orders_of("string"):
-            price = cost(rows, "string", order)
+            price = cost([row] * len(last), "string", order)
             if price < IMPOSSIBLE:
                 tiles.append(_Tile(start, size, "string", order, price))
+    return tiles
+
+
+def _number_tiles(words: Sequence[Sequence[int]], start: int, size: int) -> list[_Tile]:
+    rows = list(zip(*words[start : start + size], strict=True))
+    kinds = [kind for kind in NUMBERS if REGISTERS_OF[kind] == size]
+    tiles = []
+    for order in orders_of(kinds[0]):
+        wholes = whole_numbers(rows, order)
+        for kind in kinds:
+            if kind != "bcd16" or order == "ABCD":
+                price = cost_of(wholes, kind, order)
+                if price < IMPOSSIBLE:
+                    tiles.append(_Tile(start, size, kind, order, price))
     return tiles
 
 

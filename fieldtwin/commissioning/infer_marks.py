@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from itertools import pairwise
 
 from fieldtwin.commissioning.infer_fields import FEWEST_PASSES, Reading
@@ -109,3 +110,60 @@ def _scaled(reading: Reading, floats: Sequence[Reading]) -> Reading:
                 note = f"is {other.table}:{other.address} times {scale:g}"
                 return replace(reading, scale=1 / scale, notes=(*reading.notes, note))
     return reading
+
+
+_CLOCK = ("year", "month", "day", "hour", "minute", "second")
+
+
+def clock_fields(table: str, address: int, words: Sequence[Sequence[int]], times_s: Sequence[float]) -> list[Reading]:
+    """Six registers that are the date and time of day, year first or second first, as numbers or as BCD: their readings.
+
+    It is a clock when each pass gives a date, within a day of the truth (time zones), that goes on as time does.
+    """
+    found: list[Reading] = []
+    start = 0
+    while start + 6 <= len(words):
+        stretch = words[start : start + 6]
+        for backwards in (False, True):
+            for bcd in (False, True):
+                rows = list(zip(*(reversed(stretch) if backwards else stretch), strict=True))
+                if _is_clock([_clock_s(row, bcd=bcd) for row in rows], times_s):
+                    names = _CLOCK[::-1] if backwards else _CLOCK
+                    found += [
+                        _clock_reading(table, address + start + i, n, stretch[i], bcd) for i, n in enumerate(names)
+                    ]
+                    start += 5
+                    break
+            else:
+                continue
+            break
+        start += 1
+    return found
+
+
+def _clock_s(row: Sequence[int], *, bcd: bool) -> float | None:
+    """Seconds since 1970 of year, month, day, hour, minute, second taken as UTC; None where that is no date."""
+    parts = [f"{w:x}" for w in row] if bcd else [str(w) for w in row]
+    if not all(p.isdecimal() for p in parts):
+        return None
+    year, month, day, hour, minute, second = map(int, parts)
+    try:
+        return datetime(year + 2000 if year < 100 else year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+    except (ValueError, OverflowError):
+        return None
+
+
+def _is_clock(clock_s: Sequence[float | None], times_s: Sequence[float]) -> bool:
+    shifts = [c - t for c, t in zip(clock_s, times_s, strict=True) if c is not None]
+    moved = len(set(clock_s)) > 1
+    return (
+        len(shifts) == len(times_s) >= 3 and moved and max(map(abs, shifts)) < DAY_S and max(shifts) - min(shifts) <= 3
+    )
+
+
+def _clock_reading(table: str, address: int, name: str, words: Sequence[int], bcd: bool) -> Reading:
+    kind = "bcd16" if bcd else "uint16"
+    values = tuple(int(f"{w:x}") if bcd else w for w in words)
+    return Reading(
+        table, address, 1, kind, "ABCD", 0.9999, values, marks=("timestamp",), notes=(f"the {name} of a clock",)
+    )

@@ -9,6 +9,7 @@ import random
 import struct
 from collections import Counter
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ from fieldtwin.commissioning.dumping import dump, register_spans
 from fieldtwin.commissioning.infer import Series, infer, series_of, without_repetitions
 from fieldtwin.commissioning.infer_costs import NUMBERS, cost, orders_of
 from fieldtwin.commissioning.infer_draft import checked, draft_profile
-from fieldtwin.commissioning.infer_fields import Level, Reading, infer_run
+from fieldtwin.commissioning.infer_fields import Level, Reading, infer_run, run_of
 from fieldtwin.commissioning.reading import Target, point_at
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import load_profile
@@ -143,7 +144,7 @@ def test_a_word_that_makes_sense_with_both_neighbours_is_doubtful() -> None:
     r = random.Random(3)
     low = [r.randint(0, 65535) for _ in range(12)]
     rows = [[0x4366] * 12, low, [0x4366] * 12]  # ABCD with the first, or CDAB with the last
-    found = infer_run("input", 0, rows)
+    found = infer_run(run_of("input", 0, rows))
     assert all(reading.level is not Level.CERTAIN for reading in found)
     assert any(rival[0] == "float32" for reading in found for rival in reading.rivals)
 
@@ -166,6 +167,24 @@ def test_counters_states_times_and_signs_are_marked() -> None:
     assert (signed.type, signed.sign_open) == ("int16", False)
     unsigned = one("uint16", [300, 301, 299, 300, 305, 298, 300, 302])
     assert unsigned.sign_open
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("bcd", [False, True])
+def test_a_calendar_clock_is_found_among_other_registers(backwards: bool, bcd: bool) -> None:
+    times = [START_S + 7 * i for i in range(8)]
+    rows = []
+    for t in times:
+        d = datetime.fromtimestamp(t + 7200, UTC)
+        row = [d.year % 100, d.month, d.day, d.hour, d.minute, d.second]
+        row = [int(str(x), 16) for x in row] if bcd else row
+        rows.append([500, *(row[::-1] if backwards else row), 77])
+    cells = {10 + i: [row[i] for row in rows] for i in range(8)}
+    readings = infer(Series(tuple(times), {"input": cells})).readings
+    clock = [r for r in readings if "timestamp" in r.marks]
+    assert [r.address for r in clock] == list(range(11, 17))
+    assert clock[0].type == ("bcd16" if bcd else "uint16")
+    assert ("second" if backwards else "year") in clock[0].notes[0]
 
 
 @pytest.mark.parametrize("noise", [1, 30])

@@ -1,0 +1,37 @@
+"""Every command line of docs/maps.md is one that the verbs take."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+
+from fieldtwin.cli.main import cli
+
+PAGE = (Path(__file__).parents[2] / "docs" / "maps.md").read_text(encoding="utf-8")
+BLOCKS = "\n".join(re.findall(r"```sh\n(.*?)```", PAGE, re.S))
+LINES = [line for line in BLOCKS.splitlines() if line.startswith("fieldtwin ")]
+VERBS = ("read", "write", "watch", "dump", "diff", "infer")
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_command_line_of_the_page_is_understood(line: str) -> None:
+    verb, *arguments = shlex.split(line.split("#")[0])[1:]
+    command = cli.get_command(click.Context(cli), verb)
+    assert command is not None
+    assert command.make_context(verb, arguments).params
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_option_that_the_page_names_exists(verb: str) -> None:
+    known = {
+        option
+        for name in (*VERBS, "emulate")
+        for parameter in cli.get_command(click.Context(cli), name).params  # type: ignore[union-attr]
+        for option in (*parameter.opts, *parameter.secondary_opts)
+    }
+    section = PAGE if verb == "read" else PAGE.split(f"\n## {verb}\n")[1].split("\n## ")[0]
+    assert set(re.findall(r"`(--[a-z-]+)", section)) <= known

@@ -16,6 +16,7 @@ from fieldtwin.commissioning.live import bytes_at
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, Connector, Tap
 from gateway.core.endpoint import Endpoint
+from gateway.core.errors import NotAllowed
 from gateway.protocols.modbus.framings import framing_of
 from gateway.wallclock import WallClock
 
@@ -34,7 +35,8 @@ OBJECT_NAMES = {
 @dataclass(frozen=True, slots=True)
 class ModbusOptions:
     """How to check: `given` table -> address that can be read; `may_write` table -> (address, count) of cells that are
-    lent for writing; `go_on` says why nothing more may be sent, or nothing."""
+    lent for writing; `go_on` says why nothing more may be sent, or nothing. On a serial line `listen_s` is listened first:
+    nothing is sent where somebody else talks, unless `share_bus`."""
 
     endpoint: str
     unit: int
@@ -42,6 +44,8 @@ class ModbusOptions:
     timeout_s: float = 1.0
     spacing_s: float = 0.05
     echo: bool = False
+    listen_s: float = 1.0
+    share_bus: bool = False
     given: dict[str, int] = field(default_factory=dict)
     may_write: dict[str, tuple[int, int]] = field(default_factory=dict)
     taps: Sequence[Tap] = ()
@@ -64,7 +68,7 @@ async def check_modbus(
     say: Callable[[str], None] = lambda text: None,
     tell: Callable[[DeviceResult], None] = lambda result: None,
 ) -> Checked:
-    """The whole check. Raises `Unreachable` where nobody answers."""
+    """The whole check. Raises `Unreachable` where nobody answers, `NotAllowed` where somebody else talks on the line."""
     endpoint = Endpoint.parse(options.endpoint)
     clock = options.clock or WallClock()
     began_ns = clock.monotonic_ns()
@@ -82,6 +86,13 @@ async def check_modbus(
             spacing_s=options.spacing_s, char_s=endpoint.serial.char_time_s if endpoint.is_serial else 0.0, echo=options.echo,
         )  # fmt: skip
         wire.may_write = dict(options.may_write)
+        if endpoint.is_serial and options.listen_s and not options.share_bus:
+            await wire.reopen()
+            heard = await wire.hear(0, options.listen_s)
+            if not heard.nothing:
+                raise NotAllowed(
+                    "somebody else talks on this line", got=str(heard)[:60], hint="--share-bus checks all the same"
+                )
         await learn(wire, options.given)
         say(f"the usual request is {wire.good.hex(' ').upper()}, its answer {wire.good_reply.hex(' ').upper()}")
         identity = await read_identity(wire)

@@ -32,6 +32,7 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
 )  # fmt: skip
 @click.option("--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="For each reply.")
 @click.option("--echo", is_flag=True, help="The adapter hears what it sends.")
+@click.option("--share-bus", is_flag=True, help="Also on a line on which somebody else talks.")
 @shared
 def modbus(
     endpoint: str | None,
@@ -40,6 +41,7 @@ def modbus(
     writes: tuple[str, ...],
     timeout_s: float,
     echo: bool,
+    share_bus: bool,
     **options: Any,
 ) -> int:
     """Judge a Modbus device from outside: the rows of the catalogue that a master can ask for.
@@ -66,8 +68,8 @@ def modbus(
     check = Check("modbus", endpoint, unit, options)
     plan = check.plan(CASES, set(may_write), bool(writes))
     to_do = ModbusOptions(
-        endpoint, unit, plan, timeout_s, 1 / options["rate"], echo,
-        {table: at for table, at, _ in map(_cell, reads)}, may_write,
+        endpoint, unit, plan, timeout_s, 1 / options["rate"], echo, share_bus=share_bus,
+        given={table: at for table, at, _ in map(_cell, reads)}, may_write=may_write,
     )  # fmt: skip
     on_paper = modbus_on_paper(to_do)
     if options["dry_run"]:

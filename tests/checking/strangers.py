@@ -108,6 +108,6 @@ async def _check(wire: str, ids: Sequence[str], port: int, line: PtyEnd | None, 
     url = f"tcp://127.0.0.1:{port}" if line is None else f"{wire}:/line?baudrate=115200&frame=8N1"
     connector = OsConnector() if line is None else PtyConnector(line)
     options = ModbusOptions(
-        url, 1, plan, timeout_s=TIMEOUT_S, spacing_s=0.005, may_write=MAY_WRITE, connector=connector
+        url, 1, plan, timeout_s=TIMEOUT_S, spacing_s=0.005, listen_s=0.0, may_write=MAY_WRITE, connector=connector
     )  # fmt: skip
     return (await check_modbus(options)).results

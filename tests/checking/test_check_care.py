@@ -22,6 +22,7 @@ from fieldtwin.checking.run import Plan
 from fieldtwin.cli.check_command import command
 from fieldtwin.conformance.case import Danger
 from fieldtwin.report.model import Verdict
+from gateway.core.connection import ByteConnection
 from gateway.core.errors import Bug, NotAllowed, Unreachable, UsageError
 
 URL = "tcp://127.0.0.1:0"
@@ -97,6 +98,24 @@ def test_nobody_there_is_unreachable() -> None:
             await check_modbus(ModbusOptions(url, 7, Plan(), connector=net, clock=clock))
 
     on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use)
+
+
+def test_nothing_is_sent_on_a_line_on_which_somebody_talks() -> None:
+    asked: list[bytes] = []
+
+    async def chatter(end: ByteConnection) -> None:
+        """Another master's request every 0.3 s, and an ear."""
+        while True:
+            asked.append(await end.read_within(0.3))
+            await end.write(bytes.fromhex("05 03 00 00 00 01 85 8E"))
+
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
+        options = ModbusOptions(url, 1, Plan(), connector=net, clock=clock)
+        with pytest.raises(NotAllowed, match="--share-bus"):
+            await check_modbus(options)
+
+    on_modbus("rtu:/virtual/line?baudrate=19200&frame=8N1", use, serve=chatter)
+    assert set(asked) == {b""}
 
 
 def test_a_rate_is_kept() -> None:

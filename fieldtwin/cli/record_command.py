@@ -7,7 +7,7 @@ import json
 import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -220,7 +220,8 @@ class _Job:
             stop = asyncio.Event()
             loop = asyncio.get_running_loop()
             for number in (signal.SIGINT, signal.SIGTERM):
-                loop.add_signal_handler(number, stop.set)
+                with suppress(NotImplementedError):  # Windows
+                    loop.add_signal_handler(number, stop.set)
             timer = loop.call_later(self._for_s, stop.set) if self._for_s is not None else None
             showing = asyncio.ensure_future(_shown(shown, status)) if shown is not None else None
             try:

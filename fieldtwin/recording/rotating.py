@@ -17,6 +17,8 @@ from gateway.core.recording import Exchange, RecordingHeader, RecordingReader
 
 MAX_PARTS = 9999
 MB = 1_000_000
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+"""Of the last two each system has one."""
 
 
 class RotatingFile:
@@ -80,7 +82,7 @@ class RotatingFile:
 
     def _open(self, path: Path) -> None:
         try:
-            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
+            self._fd = os.open(path, _NEW, 0o644)
         except FileExistsError:
             raise FileInvalid("the recording exists already", path=str(path), hint="choose another name") from None
         except OSError as e:

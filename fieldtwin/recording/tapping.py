@@ -11,7 +11,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import SocketEnd, SocketListener
 from fieldtwin.recording.sinks import LineSink
 from gateway.connections.os_connector import OsConnector
@@ -75,6 +74,8 @@ class LineTap:
         path = Path(self._near.path)
         if self._near.scheme in SERIAL_SCHEMES and path.is_char_device():
             return await self._connector.open_bytes(self._near)
+        from emulators.endpoints.pty import PtyEnd  # not where there are no ptys
+
         serial = Endpoint("rtu", path=self._near.path, params=self._near.params)
         return await PtyEnd.open(path, serial)
 

@@ -33,6 +33,9 @@ VERSION = 1
 MAX_LINE_BYTES = 65_536
 """Longer lines are refused: the longest Modbus exchange takes about 1,100."""
 
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+"""Of the last two each system has one."""
+
 BLOCK_BYTES = 4 * MAX_LINE_BYTES
 """What is read at once of a recording of exchanges."""
 
@@ -269,7 +272,7 @@ class RecordingWriter:
         self.records = 0
         self._size = 0
         try:
-            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
+            self._fd = os.open(path, _NEW, 0o644)
         except FileExistsError:
             raise FileInvalid("the recording exists already", path=str(path), hint="choose another name") from None
         except OSError as error:

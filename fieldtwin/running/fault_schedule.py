@@ -15,7 +15,8 @@ SHORTEST_S, LONGEST_S = 0.5, 20.0
 CALM_S = 120.0
 """Without faults at the end."""
 MOST = 500
-NOT_BY_CHANCE = frozenset({"set"})
+NOT_BY_CHANCE = frozenset({"set", "late-frame"})
+"""Nothing that goes wrong, and what no gateway could notice: no CAN frame says when its values were measured."""
 UNSEEN_ON_TCP = frozenset({"corrupt-bits", "collision", "wrong-baud", "wrong-parity", "noise", "echo"})
 """Modbus TCP has no check sum of its own, and trusts TCP's: what no gateway could notice is no fault of a socket."""
 

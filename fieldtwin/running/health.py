@@ -104,7 +104,7 @@ def _pty() -> Check:
 
 
 def _serial() -> Check:
-    from gateway.connections.serial_line import ports_here
+    from gateway.connections.serial_port import ports_here
 
     ports = ports_here()
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]

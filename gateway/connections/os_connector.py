@@ -5,6 +5,8 @@ It must never know that a prototype exists: mapping an endpoint to an emulator's
 
 from __future__ import annotations
 
+import sys
+
 from gateway.core.connection import ByteConnection, CanConnection, Connector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
@@ -22,6 +24,10 @@ class OsConnector(Connector):
         """Open one of `BYTE_SCHEMES`. Raises as `Connector` says."""
         match endpoint.scheme:
             case "rtu" | "ascii":
+                if sys.platform == "win32":  # COM ports have no descriptors
+                    from gateway.connections.serial_threads import ThreadedSerialConnection
+
+                    return await ThreadedSerialConnection.open(endpoint)
                 from gateway.connections.serial_line import SerialConnection
 
                 return await SerialConnection.open(endpoint)

@@ -1,8 +1,7 @@
-"""A serial port as a `ByteConnection`: the one file on the gateway's side that imports ``serial``.
+"""A serial port as a `ByteConnection`, where ports have descriptors (`serial_threads` is for other systems).
 
-pyserial finds, locks and configures the port (it knows the baud rates and quirks of each system); reading and writing
-are plain non-blocking descriptor work of the event loop, so no thread stands behind a port and a chunk is delivered
-when the driver has it.
+`serial_port` finds, locks and configures the port; reading and writing are plain non-blocking descriptor work of the event
+loop, so no thread stands behind a port and a chunk is delivered when the driver has it.
 
 It must never know a protocol: no frame, no gap, no unit id. A frame that arrives in five pieces, because a USB adapter
 hands over every 16 ms, is five chunks here.
@@ -11,30 +10,18 @@ hands over every 16 ms, is five chunks here.
 from __future__ import annotations
 
 import asyncio
-import errno
-import grp
 import os
-import stat
 import termios
 from typing import cast
 
-import serial
-from serial.tools import list_ports
-
 from gateway.connections.line_counters import LineCounters, read_control_lines, read_counters
-from gateway.connections.rs485 import let_driver_switch
+from gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
 from gateway.core.connection import ByteConnection, RS232Connection, closed_here
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable, UsageError
-
-CHUNK = 4096
-"""Most bytes taken in one read: the size of the kernel's own buffer of a tty."""
+from gateway.core.errors import FieldtwinError
 
 DRAIN_LIMIT_S = 1.0
 """How long closing waits for the last bytes to leave; a shutdown as a whole has 2 s."""
-
-_BUSY = (errno.EAGAIN, errno.EBUSY, errno.EWOULDBLOCK)
-_ABSENT = (errno.ENOENT, errno.ENXIO, errno.ENODEV)
 
 
 class SerialConnection(ByteConnection):
@@ -47,7 +34,7 @@ class SerialConnection(ByteConnection):
     `ConnectionLost`. The descriptor is closed at once, so that the port gets its old name back when it returns.
     """
 
-    def __init__(self, port: serial.Serial, endpoint: Endpoint, max_pending: int = 1024) -> None:
+    def __init__(self, port: Port, endpoint: Endpoint, max_pending: int = 1024) -> None:
         """Take over an open, non-blocking `port`; use `open`."""
         super().__init__(RS232Connection(), endpoint, max_pending)
         self._port = port
@@ -68,11 +55,11 @@ class SerialConnection(ByteConnection):
         `UsageError` when the port cannot do the baud rate or frame, or has no RS485 mode and is asked for it.
         """
         # In a thread: opening a USB adapter is a conversation with it, and a sick one takes seconds to answer.
-        opening = asyncio.get_running_loop().run_in_executor(None, _open_port, endpoint)
+        opening = asyncio.get_running_loop().run_in_executor(None, open_port, endpoint)
         try:
             port = await asyncio.shield(opening)
         except asyncio.CancelledError:
-            opening.add_done_callback(_close_unwanted)
+            opening.add_done_callback(close_unwanted)
             raise
         return cls(port, endpoint, max_pending)
 
@@ -92,7 +79,7 @@ class SerialConnection(ByteConnection):
                 except (BlockingIOError, InterruptedError):
                     await self._wait_for_room()
                 except OSError as e:
-                    self._fail(_lost(self.endpoint, e.strerror or str(e)))
+                    self._fail(lost(self.endpoint, e.strerror or str(e)))
                     raise self._loss() from e
 
     async def aclose(self) -> None:
@@ -124,10 +111,10 @@ class SerialConnection(ByteConnection):
         except (BlockingIOError, InterruptedError):
             return
         except OSError as e:  # EIO: the adapter was pulled, or the other side of a pty closed
-            self._fail(_lost(self.endpoint, e.strerror or str(e)))
+            self._fail(lost(self.endpoint, e.strerror or str(e)))
             return
         if not data:
-            self._fail(_lost(self.endpoint, "hung up"))
+            self._fail(lost(self.endpoint, "hung up"))
         elif not self.feed(data):
             self._reading = False
             self._loop.remove_reader(self._fd)
@@ -167,96 +154,6 @@ class SerialConnection(ByteConnection):
                 await asyncio.sleep(0.005)
         except (OSError, termios.error):
             return  # gone while it was closing: there is nothing left to wait for
-
-
-def _open_port(endpoint: Endpoint) -> serial.Serial:
-    settings = endpoint.serial
-    try:
-        port = serial.Serial(
-            port=endpoint.path,
-            baudrate=settings.baudrate,
-            bytesize=settings.data_bits,
-            parity=settings.parity,
-            stopbits=settings.stop_bits,
-            timeout=0,
-            write_timeout=0,
-            # 0 and not None gives VMIN 1: an empty port then reads EAGAIN, and b"" can only mean that it hung up
-            inter_byte_timeout=0.0,
-            exclusive=True,
-        )
-        if endpoint.rs485:
-            _set_rs485(port, endpoint)
-        return port
-    except serial.SerialException as e:
-        raise _cannot_open(endpoint, e.errno or 0, str(e)) from e
-    except (ValueError, termios.error) as e:
-        raise UsageError(
-            "the port refuses these settings",
-            got=f"{settings.baudrate} baud, {settings.frame}",
-            where=str(endpoint),
-            hint=str(e),
-        ) from e
-    except OSError as e:
-        raise _cannot_open(endpoint, e.errno or 0, str(e)) from e
-
-
-def _set_rs485(port: serial.Serial, endpoint: Endpoint) -> None:
-    try:
-        let_driver_switch(int(port.fileno()))
-    except OSError as e:
-        port.close()
-        raise UsageError(
-            "the port has no RS485 mode",
-            expected="a driver that switches the direction (ioctl TIOCSRS485)",
-            got=e.strerror or str(e),
-            where=str(endpoint),
-            hint="leave rs485=1 out where the adapter switches by itself",
-        ) from e
-
-
-def _close_unwanted(opening: asyncio.Future[serial.Serial]) -> None:
-    """Whoever asked for the port went away before it was open."""
-    if not opening.cancelled() and opening.exception() is None:
-        opening.result().close()
-
-
-def _cannot_open(endpoint: Endpoint, number: int, text: str) -> Unreachable:
-    where = str(endpoint)
-    if number in _BUSY:
-        return EndpointBusy("the port is held by another program", where=where, hint=f"fuser {endpoint.path} names it")
-    if number in _ABSENT:
-        return Unreachable("there is no such serial port", where=where, hint=_ports_hint())
-    if number in (errno.EACCES, errno.EPERM):
-        return Unreachable("no permission for the port", where=where, hint=_group_hint(endpoint.path))
-    if number == errno.ENOTTY or "Could not configure port" in text:  # pyserial gives this one no number
-        return Unreachable("this is no serial port", where=where, hint=_ports_hint())
-    return Unreachable(f"cannot open the port: {os.strerror(number) if number else text}", where=where)
-
-
-def _lost(endpoint: Endpoint, why: str) -> ConnectionLost:
-    return ConnectionLost(f"the serial port is gone: {why}", where=str(endpoint))
-
-
-def ports_here() -> list[str]:
-    """The serial ports that this computer has now, by name."""
-    return sorted(port.device for port in list_ports.comports())
-
-
-def _ports_hint() -> str:
-    names = ports_here()
-    return f"ports here: {', '.join(names[:8])}" if names else "this computer has no serial port now"
-
-
-def _group_hint(path: str) -> str:
-    """Which group may use the port: dialout on Debian, uucp elsewhere; the file itself knows."""
-    try:
-        info = os.stat(path)
-        group = grp.getgrgid(info.st_gid).gr_name
-    except (OSError, KeyError):
-        return ""
-    if not info.st_mode & stat.S_IWGRP or group == "root":
-        return f"only its owner may use {path}"
-    return f"join its group and log in again: sudo usermod -aG {group} $USER"
 
 
 def _ignored_settings(fd: int, endpoint: Endpoint) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from gateway.connections import serial_line
+from gateway.connections import serial_port
 from gateway.connections.serial_line import SerialConnection
 from gateway.core.connection import RS232Connection
 from gateway.core.endpoint import Endpoint
@@ -152,16 +152,16 @@ def test_something_that_is_no_serial_port_is_unreachable(path: str) -> None:
 
 
 def test_permission_denied_names_the_group(tmp_path: Path) -> None:
-    error = serial_line._cannot_open(Endpoint.parse("rtu:/dev/ttyS0"), errno.EACCES, "")
+    error = serial_port._cannot_open(Endpoint.parse("rtu:/dev/ttyS0"), errno.EACCES, "")
     assert isinstance(error, Unreachable)
     assert "no permission" in str(error)
     port = tmp_path / "port"
     port.touch()
     port.chmod(0o600)
-    assert "only its owner" in serial_line._group_hint(str(port))
+    assert "only its owner" in serial_port._group_hint(str(port))
     port.chmod(0o660)
     os.chown(port, -1, _some_group())
-    assert "usermod -aG" in serial_line._group_hint(str(port)) or _some_group() == 0
+    assert "usermod -aG" in serial_port._group_hint(str(port)) or _some_group() == 0
 
 
 def _some_group() -> int:

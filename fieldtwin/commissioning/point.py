@@ -12,7 +12,15 @@ from typing import Any, Protocol
 from fieldtwin.commissioning.address import AUTO
 from fieldtwin.commissioning.live import frame_of
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import CrcError, Desync, DeviceRefused, ModbusExceptionReply, ReplyTimeout, SdoAborted
+from gateway.core.errors import (
+    CrcError,
+    Desync,
+    DeviceRefused,
+    ModbusExceptionReply,
+    NotAllowed,
+    ReplyTimeout,
+    SdoAborted,
+)
 from gateway.core.profile import DeviceProfile, RegisterRange, Tag
 from gateway.core.profile_schema import Limits, ProfileForm
 from gateway.core.values import Quality, Reason, Scalar, TagValue
@@ -78,11 +86,26 @@ def encoded(tag: Tag, value: Scalar) -> bytes:
     """
     if isinstance(value, bytes):
         return value
+    if isinstance(value, str) and tag.type == "string":
+        return _text(tag, value)
     data = encode(tag, value)
     if tag.at is not None:
         return data
     big = reorder(data, tag.order)
     return big[::-1][: OBJECT_BYTES.get(tag.type, 8)]
+
+
+def _text(tag: Tag, value: str) -> bytes:
+    """Text as a device has it: in registers filled up with NULs, its bytes swapped where the order swaps bytes."""
+    if not value.isascii():
+        raise NotAllowed(f"{tag.name}: only ASCII can be written", got=repr(value))
+    raw = value.encode("ascii")
+    if tag.at is None:
+        return raw
+    if len(raw) > 2 * tag.at.count:
+        raise NotAllowed(f"{tag.name}: the text is too long", expected=f"at most {2 * tag.at.count} characters")
+    raw = raw.ljust(2 * tag.at.count, b"\0")
+    return reorder(raw, "BADC") if tag.order in ("BADC", "DCBA") else raw
 
 
 def decoded(tag: Tag, data: bytes, t_ns: int) -> TagValue:

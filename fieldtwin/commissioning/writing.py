@@ -92,6 +92,8 @@ def parse_value(tag: Tag, text: str) -> Scalar:
             return bytes.fromhex(text[4:])
         except ValueError as e:
             raise UsageError(f"{tag.name}: no bytes in hex", got=text) from e
+    if tag.type == "string":
+        return text
     lower = text.lower()
     if tag.type == "bool" and lower in (*_TRUE, *_FALSE):
         return lower in _TRUE

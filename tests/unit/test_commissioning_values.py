@@ -134,6 +134,22 @@ def test_a_value_is_put_back_and_one_that_is_not_held_is_told() -> None:
     run_virtually(main())
 
 
+@pytest.mark.parametrize(("order", "words"), [("ABCD", [0x5075, 0x6D70, 0]), ("BADC", [0x7550, 0x706D, 0])])
+def test_text_is_written_too(order: str, words: list[int]) -> None:
+    async def main() -> None:
+        made = bank([Span("holding", 0, 3)])
+        async with point_at(Target(URL, 1), connector=Wired(unit(made)), clock=loop()) as point:
+            tag = tags_of(["holding:0"], "modbus", RawForm("string", order, registers=3))[0]
+            write = plan_write(tag, "Pump")
+            await carry_out(point, write, await before(point, write))
+            assert list(made.read("holding", 0, 3, 0)) == words
+            assert (await point.read([tag]))[tag.name].value.value == "Pump"
+            with pytest.raises(NotAllowed, match="too long"):
+                plan_write(tag, "Pumping")
+
+    run_virtually(main())
+
+
 def test_a_device_that_acknowledges_and_forgets_fails_the_verification() -> None:
     async def main() -> None:
         made = bank([Span("holding", 0, 1)])

@@ -192,6 +192,7 @@ def _live(recording: Path, url: str, rules: Rules, options: dict[str, Any]) -> C
             ) as asker:
                 await compare_device(
                     exchanges_of(recording), asker, comparer, unit=options["unit"], writes=options["writes"],
+                    wearing=_wearing(target.profile),
                     most=options["most"] or 0, stop=stop, progress=progress,
                 )  # fmt: skip
 
@@ -246,6 +247,12 @@ def _allow_writes(recording: Path, url: str, options: dict[str, Any]) -> None:
         talk.print(f"  unit {exchange.unit}: {exchange.request.hex(' ')}", soft_wrap=True, markup=False)
     if not sys.stdin.isatty() or not click.confirm(f"make these {len(writes)} writes at {url}?", err=True):
         raise NotAllowed("the writes were not allowed", hint="--yes")
+
+
+def _wearing(profile: DeviceProfile | None) -> set[tuple[str, int]]:
+    """What is written once and never in loops."""
+    tags = profile.tags.values() if profile is not None else ()
+    return {(t.at.table, a) for t in tags if t.nonvolatile and t.at for a in range(t.at.address, t.at.end)}
 
 
 def _run(work: Callable[[asyncio.Event, Callable[[int], None]], Coroutine[Any, Any, None]]) -> None:

@@ -120,6 +120,10 @@ def command(
         raise UsageError(
             "what is to be asked?", expected="--profile NAME or --like RECORDING", hint="or --tap A B to ask nothing"
         )
+    if target.profile.form.trigger is not None:
+        talk.print(
+            f"{target.profile.name} measures when it is told to, and is not told: nothing is written", soft_wrap=True
+        )
     return job.polls(target, ProfileRound(target.profile, target.address, options["groups"]), target.profile.name)
 
 

@@ -6,11 +6,12 @@ It must never know a screen; what may be written is decided by who calls.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 
 from fieldtwin.commissioning.live import canopen_at
 from fieldtwin.commissioning.reading import Target
 from fieldtwin.decoding.canopen_wire import CanopenWire
+from fieldtwin.decoding.modbus_pdu import parse_request
 from fieldtwin.recording.asking import Asker, changes
 from fieldtwin.recording.comparing import Comparer, Comparison, Rules
 from fieldtwin.recording.comparing_can import Frames, compare_logs
@@ -26,6 +27,14 @@ MAX_FRAMES = 1_000_000
 """Frames of a live bus that are kept for comparing."""
 
 Progress = Callable[[int], None]
+Cell = tuple[str, int]
+"""Table and address."""
+
+
+def cells_written(request: bytes) -> set[Cell]:
+    """The registers and bits that a request writes."""
+    span = parse_request(request).write_span
+    return {(span.table, span.address + i) for i in range(span.count)} if span is not None else set()
 
 
 async def compare_device(
@@ -35,19 +44,23 @@ async def compare_device(
     *,
     unit: int | None = None,
     writes: bool = False,
+    wearing: Collection[Cell] = (),
     most: int = 0,
     stop: asyncio.Event | None = None,
     progress: Progress = lambda done: None,
 ) -> None:
     """Ask `most` (0: all) of the recorded requests again, of the recorded unit or of `unit`. What may change the device is
-    left out and counted, unless `writes`. Raises `ConnectionLost`."""
-    done = 0
+    left out and counted, unless `writes`; and what writes to a cell that is `wearing` (EEPROM) again, in any case. Raises
+    `ConnectionLost`."""
+    done, worn = 0, set[Cell]()
     for exchange in recorded:
         if (most and done >= most) or (stop is not None and stop.is_set()):
             return
-        if changes(exchange.request) and not writes:
+        written = cells_written(exchange.request).intersection(wearing) if wearing else set()
+        if (changes(exchange.request) and not writes) or not worn.isdisjoint(written):
             comparer.left_out()
             continue
+        worn |= written
         other = await asker.ask(exchange.unit if unit is None else unit, exchange.request)
         if other is None:
             comparer.left_out()

@@ -212,6 +212,27 @@ def test_only_reads_are_asked_again(tmp_path: Path) -> None:
     assert same.left_out == 2 * 5
 
 
+def test_writes_are_made_again_only_when_that_is_said_and_to_what_wears_once(tmp_path: Path) -> None:
+    write_hex, other_hex, read_hex = "0600010005", "0600020006", "0300010002"
+    exchanges = [Exchange(n, 1, bytes.fromhex(h), bytes.fromhex(h)) for n, h in enumerate([write_hex, other_hex] * 3)]
+    exchanges.append(Exchange(9, 1, bytes.fromhex(read_hex), bytes.fromhex("030400050006")))
+    original = write(tmp_path / "w.jsonl", exchanges)
+    url = f"tcp://127.0.0.1:{_free_port()}"
+
+    async def main(**how: object) -> Comparison:
+        comparer = Comparer(UNTIMED)
+        async with played(original, url), asker_at(url) as asker:
+            await compare_device(exchanges, asker, comparer, **how)  # type: ignore[arg-type]
+        return comparer.result()
+
+    assert [(r.compared, r.left_out, r.met) for r in (run(main()), run(main(writes=True)))] == [
+        (1, 6, True),
+        (7, 0, True),
+    ]
+    careful = run(main(writes=True, wearing={("holding", 1)}))
+    assert (careful.compared, careful.left_out, careful.met) == (5, 2, True)
+
+
 def test_a_device_that_is_away_for_a_while_is_recorded_again_when_it_is_back(tmp_path: Path) -> None:
     one = write(tmp_path / "one.jsonl", [Exchange(0, 1, bytes.fromhex("0300000001"), bytes.fromhex("03020001"))])
     url = f"tcp://127.0.0.1:{_free_port()}"

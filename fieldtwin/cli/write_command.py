@@ -132,14 +132,11 @@ async def _carry_out(
             talk.print(f"written; the old values come back in {hold_s:g} s")
             await asyncio.sleep(hold_s)
     except BaseException:
-        if hold_s is None:
-            for written in done[:-1]:
-                talk.print(Text("done before: ") + _told(written), soft_wrap=True)
+        told = done[:-1] if hold_s is None else await _put_back(point, done)
+        for written in told:
+            talk.print(Text("" if hold_s is not None else "before that: ") + _told(written), soft_wrap=True)
         raise
-    finally:
-        if hold_s is not None:
-            done = await _put_back(point, done)
-    return done
+    return done if hold_s is None else await _put_back(point, done)
 
 
 async def _put_back(point: Point, done: list[Written]) -> list[Written]:

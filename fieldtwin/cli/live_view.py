@@ -31,6 +31,7 @@ def print_mapping(session: RunSession) -> None:
     if not session.options.prototype:
         leave = "writes allowed" if session.options.allow_writes else "read-only"
         talk.print(f"[bold]plant[/bold] {session.system.name}: {leave}; instance {session.instance.name}")
+        _print_thread(session)
         return
     talk.print(
         f"[bold]prototype[/bold] of {session.system.name}; instance {session.instance.name} in {session.instance.dir}"
@@ -41,6 +42,12 @@ def print_mapping(session: RunSession) -> None:
         talk.print(f"  masters of bridge {bridge}  →  {cable.master}", soft_wrap=True)
     for device, endpoint in session.far.items():
         talk.print(f"  far end of {device}  →  {endpoint}", soft_wrap=True)
+    _print_thread(session)
+
+
+def _print_thread(session: RunSession) -> None:
+    if session.thread_place:
+        talk.print(f"  digital thread  ←  {session.thread_place}", soft_wrap=True)
 
 
 class LiveView:

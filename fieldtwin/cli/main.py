@@ -22,6 +22,10 @@ COMMANDS = {
         "Look into a running PLC: tags, forces, steps, reasons; draw and prove programs.",
     ),
     "shore": ("fieldtwin.cli.shore_command", "The far end of a system's transmitter: send commands, show responses."),
+    "shadow": (
+        "fieldtwin.cli.shadow_command",
+        "A digital shadow: watch a plant from elsewhere, and compare it with its model.",
+    ),
     "link": ("fieldtwin.cli.link_command", "The emulated connection on its own: a serial port carried over TCP."),
     "bridge": ("fieldtwin.cli.bridge_command", "Modbus TCP clients to units on a serial line, or the other way round."),
     "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),

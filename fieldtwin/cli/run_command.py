@@ -77,6 +77,15 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     metavar="FILE|random",
     help="With --prototype: put these faults in (fieldtwin faults); random, with --virtual: ones that the seed chooses.",
 )
+@click.option(
+    "--thread",
+    default="",
+    metavar="URL",
+    help="A digital thread for `fieldtwin shadow`: tcp://HOST:PORT to listen on, or mqtt://HOST/GROUP/NODE.",
+)
+@click.option(
+    "--thread-store", default="", metavar="FILE|URL", help="What keeps the thread's log; default: in the run directory."
+)
 @click.option("--trust", is_flag=True, help="Run control logic in Python that a template brings, without asking.")
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
@@ -104,6 +113,8 @@ def command(
     ledger: str | None,
     trace: str | None,
     faults: str,
+    thread: str,
+    thread_store: str,
     trust: bool,
     cold: bool,
     profiles: tuple[str, ...],
@@ -128,11 +139,13 @@ def command(
     if prototype and allow_writes:
         raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
     system = system_file(system, lambda template: trust or ask_about_code(template), plant=plant)
+    if thread_store and not thread:
+        raise UsageError("--thread-store goes with --thread")
     if virtual:
-        if plant or field_host or listen or can or capture:
+        if plant or field_host or listen or can or capture or thread:
             raise UsageError(
                 "--virtual is a prototype in this process, its wires in memory",
-                hint="--plant, --field, --listen, --can and --capture go with real wires; --trace FILE has the frames",
+                hint="--plant, --field, --listen, --can, --capture and --thread go with real wires; --trace FILE has the frames",
             )
         if duration_s <= 0:
             raise UsageError("--virtual needs an end", expected="--for 24h")
@@ -173,6 +186,8 @@ def command(
         commands=parse_periods(commands) if commands is not None else DEFAULT_SCRIPT,
         capture=Path(capture) if capture else None,
         cold=cold,
+        thread=thread,
+        thread_store=thread_store,
         faults=_faults(faults, system, profiles) if faults else (),
     )
     return asyncio.run(_run(options, as_json))

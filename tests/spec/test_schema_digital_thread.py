@@ -23,17 +23,10 @@ from gateway.store.event import Kind
 from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from twin.knowledge import KnowledgeWriter
 from twin.status import decode_status, encode_status
-from twin.thread import (
-    DigitalThread,
-    DigitalThreadProcess,
-    DTDigitalThreadProcess,
-    DTtoPTConnection,
-    PTDigitalThreadProcess,
-    PTtoDTConnection,
-    schema_of,
-)
+from twin.thread import DigitalThread, DTtoPTConnection, Operator, PTtoDTConnection, schema_of
 from twin.thread_end import ThreadEnd
 from twin.thread_modem import ModemCarrier
+from twin.thread_process import DigitalThreadProcess, DTDigitalThreadProcess, PTDigitalThreadProcess
 
 
 def modem() -> ModemCarrier:
@@ -93,13 +86,15 @@ def test_PTDigitalThreadProcess_shares_measurements_and_statuses_with_their_qual
 
 
 def test_DTDigitalThreadProcess_decides_which_command_is_sent() -> None:
-    process = DTDigitalThreadProcess("operator", CLOCK)
+    process = Operator("operator", CLOCK)
     process.command_period(5)
     (event,) = process.collect()
     assert event.kind == Kind.COMMAND
     assert event.value == encode_period(5).data
     assert issubclass(COMMAND, DATA)
-    assert not hasattr(PTDigitalThreadProcess, "command"), "a plant's process commands nobody"
+    assert isinstance(process, DTDigitalThreadProcess)
+    for kind in (PTDigitalThreadProcess, DTDigitalThreadProcess):
+        assert not hasattr(kind, "command"), "the others command nobody"
 
 
 @pytest.mark.parametrize(

@@ -212,6 +212,15 @@ def test_commands_of_others_are_not_taken() -> None:
     assert edge.not_taken == 1
 
 
+def test_over_a_broker_a_shadow_puts_acknowledgements_and_rebirths_and_nothing_else() -> None:
+    _, host = sides()
+    for frame in (Ack(HELLO.tag, 7), Ask(HELLO.tag), Refused(HELLO.tag, b"abcd")):
+        for message in host.messages(frame, 5):
+            assert message.topic == "spBv1.0/plants/NCMD/observatory"
+            names = {m.name for m in decode_payload(message.payload).metrics}
+            assert names in ({"fieldtwin/frame"}, {REBIRTH})
+
+
 def test_infinity_and_minus_zero_stay() -> None:
     edge, host = sides()
     over(edge.messages(HELLO, 5), host)

@@ -78,11 +78,40 @@ class ShakyCarrier(Carrier):
         await self._carrier.aclose()
 
 
+class WatchedCarrier(Carrier):
+    """Keeps what is sent: what a capture towards the other side holds."""
+
+    def __init__(self, carrier: Carrier, sent: list[Frame]) -> None:
+        self.name = carrier.name
+        self._carrier = carrier
+        self._sent = sent
+
+    async def open(self) -> Link:
+        link = await self._carrier.open()
+        send = link.send
+
+        async def watched(frame: Frame) -> None:
+            self._sent.append(frame)
+            await send(frame)
+
+        link.send = watched  # type: ignore[method-assign]
+        return link
+
+    async def aclose(self) -> None:
+        await self._carrier.aclose()
+
+
 class Twin:
     """One side. `start` and `kill` as often as a test likes; the store is on disk."""
 
     def __init__(
-        self, name: str, folder: Path, clock: Clock, carrier: Callable[[], Carrier], schema: Schema = SCHEMA
+        self,
+        name: str,
+        folder: Path,
+        clock: Clock,
+        carrier: Callable[[], Carrier],
+        schema: Schema = SCHEMA,
+        sends: bool = True,
     ) -> None:
         self.name = name
         self.origin = ""
@@ -91,6 +120,7 @@ class Twin:
         self._clock = clock
         self._carrier = carrier
         self._schema = schema
+        self._sends = sends
         self._task: asyncio.Task[None] | None = None
         self.store: SqliteKnowledge
         self.end: ThreadEnd
@@ -102,7 +132,7 @@ class Twin:
         self.carrier = self._carrier()
         self.end = ThreadEnd(
             self.store, self.carrier, self._schema, self._clock,
-            origin=self.origin, prototype=True, on_events=self._arrive,
+            origin=self.origin if self._sends else "", prototype=True, on_events=self._arrive,
         )  # fmt: skip
         self._task = asyncio.get_running_loop().create_task(self.end.run(), name=self.name)
         await asyncio.sleep(0.001)

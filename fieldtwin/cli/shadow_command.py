@@ -1,0 +1,113 @@
+"""`fieldtwin shadow`: a plant, or its prototype, watched from elsewhere by its digital shadow."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.talk import talk
+from fieldtwin.running.shadowing import Shadowing
+from gateway.core.errors import Unreachable
+from twin.instance import Instance
+from twin.mape.messages import Verdict
+from twin.system import System, load_system
+
+STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "yellow", "unreadable": "red"}
+
+
+@click.command("shadow")
+@click.argument("system")
+@click.option(
+    "--from",
+    "place",
+    required=True,
+    metavar="URL",
+    help="Where the plant's thread is: what `fieldtwin run --thread` printed, or mqtt://HOST/GROUP/NODE.",
+)
+@click.option(
+    "--store", default="", metavar="FILE|URL", help="What keeps the knowledge; default: in the run directory."
+)
+@click.option(
+    "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
+)
+@click.option("--instance", default="", help="Name of the run directory; default: the system's name and -shadow.")
+@profiles_option
+@json_option
+def command(
+    system: str, place: str, store: str, duration_s: float, instance: str, profiles: tuple[str, ...], as_json: bool
+) -> int:
+    """Shadow SYSTEM: receive what its plant sees, keep the digital model up with it, and say where the two differ.
+
+    Reports a state that is not the model's, values outside their limits, bad and stale ones, and how often and how late
+    the twins agree. A shadow sends no commands: it has nothing to send them with. Exit code 1 when the states differed.
+    """
+    loaded = load_system(system, tuple(Path(p) for p in profiles))
+    with Instance(instance or f"{loaded.name}-shadow") as here:
+        seen = asyncio.run(_run(loaded, place, here, store, duration_s, as_json))
+    if as_json:
+        json.dump(seen, sys.stdout, indent=2)
+        sys.stdout.write("\n")
+    else:
+        _print(seen)
+    if not seen["origins"]:
+        trouble = seen["thread"].get("trouble") or "nothing came"
+        raise Unreachable(f"the plant's thread: {trouble}", where=place)
+    return 0 if seen["agreed"] == seen["statuses"] else 1
+
+
+async def _run(
+    system: System, place: str, instance: Instance, store: str, duration_s: float, as_json: bool
+) -> dict[str, Any]:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    states: dict[str, str] = {}
+
+    def tell(verdict: Verdict) -> None:
+        if as_json or (verdict.finding == "agree" and states.get(verdict.subject) == verdict.text):
+            return
+        if verdict.finding == "agree":
+            states[verdict.subject] = verdict.text
+        when = datetime.fromtimestamp(verdict.t_ms / 1000, UTC).strftime("%H:%M:%S.%f")[:-3]
+        style = STYLE.get(verdict.finding, "")
+        word = f"[{style}]{verdict.finding:10}[/]" if style else f"{verdict.finding:10}"
+        subject = f"{verdict.subject}: " if not verdict.text.startswith(verdict.subject) else ""
+        talk.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
+
+    shadowing = Shadowing(system, place, instance, store=store, on_verdict=tell)
+    if not as_json:
+        talk.print(f"[bold]shadow[/bold] of {system.name}, from {escape(place)}", soft_wrap=True)
+    await shadowing.run(stop, duration_s)
+    return shadowing.describe()
+
+
+def _print(seen: dict[str, Any]) -> None:
+    if not seen["origins"]:
+        return
+    kind = "a prototype" if seen["prototype"] else "a plant"
+    lag, rate, thread = seen["lag_ms"], seen["twinning_rate_hz"], seen["thread"]
+    lines = [
+        ("model", f"{seen['state']}, period {seen['period_s']} s"),
+        ("from", f"{', '.join(seen['origins'])}, {kind}"),
+        ("statuses", f"{seen['statuses']}, {seen['agreed']} of them as the model"),
+        (
+            "twinning",
+            f"{f'{rate:.1f} reports a second' if rate else 'too few reports'}, {seen['backfilled']} backfilled",
+        ),
+        ("lag", f"median {lag['median']} ms, 95 % {lag['p95']} ms, most {lag['max']} ms" if lag else "unknown"),
+        ("thread", f"{thread['links']} links, {thread['duplicates']} events came twice"),
+    ]
+    if thread["trouble"]:
+        lines.append(("trouble", thread["trouble"]))
+    lines += [("wrong now", f"{name}: {', '.join(what)}") for name, what in seen["wrong"].items()]
+    for name, text in lines:
+        talk.print(f"  {name:10} {escape(text)}", soft_wrap=True)

@@ -1,0 +1,119 @@
+"""A digital shadow at work: the thread that brings what the plant saw, the store that keeps it, and the shadow that is given it.
+
+Here the transmitter's side is assembled, outside of `twin.shadow` (SPEC ruling 16): it acknowledges and asks for what is missing,
+and has no log of its own to send.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import secrets
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from gateway.core.clock import NS_PER_MS
+from gateway.core.nursery import Nursery
+from gateway.store.event import Event
+from gateway.store.knowledge import open_knowledge
+from gateway.wallclock import WallClock
+from twin.instance import Instance
+from twin.knowledge import KnowledgeWriter
+from twin.mape.analyze import Limits
+from twin.mape.messages import Verdict
+from twin.shadow import DigitalShadow
+from twin.system import System
+from twin.thread import schema_of, to_receivers
+from twin.thread_end import ThreadEnd
+from twin.thread_place import twin_carrier
+from twin.thread_process import ReceivingEnd
+
+STEP_MS = 50
+STALE_AFTER_MS = 30_000
+"""Three times as long as a plant is silent about what does not change."""
+
+
+def limits_of(system: System) -> dict[str, Limits]:
+    """The limits of every tag whose profile states some."""
+    return {
+        f"{d.name}.{t.name}": t.limits
+        for d in system.devices.values()
+        for t in d.profile.tags.values()
+        if t.limits is not None
+    }
+
+
+class Shadowing:
+    """``await Shadowing(...).run(stop)``. `on_verdict` is told each verdict as it is reached."""
+
+    def __init__(
+        self, system: System, place: str, instance: Instance, *, store: str = "", on_verdict: Callable[[Verdict], None]
+    ) -> None:
+        self.clock = WallClock()
+        self.receiving = ReceivingEnd("from the plant")
+        self.shadow = DigitalShadow(self.receiving, self.clock, limits=limits_of(system), stale_after_ms=STALE_AFTER_MS)
+        self.prototypes: set[str] = set()
+        """Origins that say that their field side is emulated (ruling 15)."""
+        self.origins: set[str] = set()
+        self._system = system
+        self._place = place
+        self._store = store or str(Path(instance.dir) / "knowledge.sqlite")
+        self._on_verdict = on_verdict
+        self._end: ThreadEnd | None = None
+
+    async def run(self, stop: asyncio.Event, for_s: float = 0.0) -> None:
+        """Shadow the plant until `stop`, or for so many seconds. Raises `FieldtwinError` for a store that cannot be used."""
+        system, clock = self._system, self.clock
+        store = await open_knowledge(self._store)
+        try:
+            own = await store.own("shadow", system=system.name, prototype=False, log=secrets.token_hex(4))
+            carrier = twin_carrier(self._place, system, clock)
+            self._end = ThreadEnd(store, carrier, schema_of(system), clock, on_events=self._arrived)
+            writer = KnowledgeWriter(store, own, clock)
+            try:
+                async with Nursery() as nursery:
+                    nursery.start(self._end.run(), "thread")
+                    nursery.start(writer.run(), "knowledge")
+                    nursery.start(self._work(writer), "shadow")
+                    ended = nursery.start(stop.wait(), "until stopped")
+                    waiting = asyncio.ensure_future(nursery.wait())
+                    await asyncio.wait([ended, waiting], timeout=for_s or None, return_when=asyncio.FIRST_COMPLETED)
+                    if waiting.done() and not ended.done():
+                        waiting.result()
+                    waiting.cancel()
+            finally:
+                self._step(writer)
+                await writer.flush()
+                kinds = await store.origins()
+                self.prototypes = {origin for origin in self.origins if kinds.get(origin)}
+                await carrier.aclose()
+        finally:
+            await store.aclose()
+
+    async def _arrived(self, origin: str, events: Sequence[Event]) -> None:
+        self.origins.add(origin)
+        await to_receivers(self.receiving)(origin, events)
+
+    async def _work(self, writer: KnowledgeWriter) -> None:
+        while True:
+            self._step(writer)
+            await self.clock.sleep_until_ns(self.clock.monotonic_ns() + STEP_MS * NS_PER_MS)
+
+    def _step(self, writer: KnowledgeWriter) -> None:
+        self.shadow.step()
+        for process in self.shadow.processes:
+            for event in process.collect():
+                writer.observe(event)
+        for verdict in self.shadow.verdicts.drain():
+            self._on_verdict(verdict)
+
+    def describe(self) -> dict[str, Any]:
+        """What the shadow knows, and how its thread is."""
+        thread = self._end.describe() if self._end is not None else {}
+        return {
+            "system": self._system.name,
+            "prototype": bool(self.prototypes),
+            "origins": sorted(self.origins),
+            "thread": thread,
+            **self.shadow.describe(),
+        }

@@ -1,0 +1,232 @@
+"""Schemas Monitor, Analyze, DigitalShadow."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.core.events import Consumer, Producer
+from gateway.core.statemachine import STATE_CODES, delta
+from gateway.core.values import DATA, STATUS, Quality, Reason
+from gateway.store.event import Event, Kind
+from twin.mape.messages import SeenMeasurement, SeenStatus, Verdict
+from twin.mape.monitor import Monitor
+from twin.model import DigitalModel
+from twin.shadow import DigitalShadow
+from twin.status import decode_status, encode_status
+from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+
+PERIODS = st.integers(-32768, 32767)
+NOW_MS = 1_790_000_000_000
+
+
+class Hands:
+    """A clock whose hands the test moves."""
+
+    def __init__(self) -> None:
+        self.now_ms = NOW_MS
+
+    def monotonic_ns(self) -> int:
+        return self.now_ms * 1_000_000
+
+    utc_ns = monotonic_ns
+
+    async def sleep_until_ns(self, deadline_ns: int) -> None:
+        raise AssertionError("nobody waits here")
+
+
+def status(period_s: int, state: str = "", t_ms: int = NOW_MS) -> Event:
+    """A report of the state machine `relay`; of the state that follows from the period unless another is said."""
+    return Event(1, t_ms, Kind.STATE, "relay", encode_status(state or delta(period_s).name, period_s).data)
+
+
+def value(
+    number: float | None, t_ms: int = NOW_MS, quality: Quality = Quality.GOOD, reason: Reason = Reason.NONE
+) -> Event:
+    return Event(1, t_ms, Kind.VALUE, "ctd.pressure", number, int(quality), int(reason))
+
+
+class Rig:
+    """A shadow, what it is given, and what it says."""
+
+    def __init__(self) -> None:
+        self.clock = Hands()
+        self.receiving = ReceivingEnd("from the plant")
+        self.shadow = DigitalShadow(
+            self.receiving, self.clock, limits={"ctd.pressure": (0.0, 100.0)}, stale_after_ms=30_000
+        )
+
+    def give(self, *events: Event) -> list[Verdict]:
+        for event in events:
+            self.receiving.observe("plant:1", event)
+        self.shadow.step()
+        return list(self.shadow.verdicts.drain())
+
+
+def test_Monitor_is_a_process_with_two_consumers_and_a_producer() -> None:
+    model = DigitalModel()
+    monitor = Monitor(model, Hands())
+    assert isinstance(monitor, DTDigitalThreadProcess)
+    assert type(monitor.statuses) is type(monitor.measurements) is Consumer
+    assert monitor.statuses is not monitor.measurements
+    assert type(monitor.emitter) is Producer
+    assert monitor.digital_model is model
+    assert not monitor.statuses.queue, "empty after Init"
+    assert not monitor.measurements.queue
+
+
+@given(periods=st.lists(PERIODS, min_size=1, max_size=20))
+def test_Monitor_handleState_consumes_lets_the_model_process_and_emits_each(periods: list[int]) -> None:
+    monitor = Monitor(DigitalModel(), Hands())
+    seen: Consumer[DATA] = Consumer(monitor.emitter.event)
+    monitor.emitter.subscribe(seen)
+    for period_s in periods:
+        monitor.arrived(status(period_s), NOW_MS)
+    monitor.handle_state()
+    assert [decode_status(s.data)[1] for s in seen.drain()] == periods
+    assert (monitor.digital_model.period_s, monitor.digital_model.state) == (periods[-1], delta(periods[-1]))
+    assert not monitor.statuses.queue
+
+
+@given(numbers=st.lists(st.floats(allow_nan=False), max_size=20), before=PERIODS)
+def test_Monitor_handleMeasurements_emits_each_and_leaves_the_model(numbers: list[float], before: int) -> None:
+    monitor = Monitor(DigitalModel(), Hands())
+    monitor.arrived(status(before), NOW_MS)
+    monitor.handle_state()
+    seen: Consumer[DATA] = Consumer(monitor.emitter.event)
+    monitor.emitter.subscribe(seen)
+    for number in numbers:
+        monitor.arrived(value(number), NOW_MS)
+    monitor.handle_measurements()
+    emitted = list(seen.drain())
+    assert [m.event.value for m in emitted if isinstance(m, SeenMeasurement)] == numbers
+    assert len(emitted) == len(numbers)
+    assert monitor.digital_model.period_s == before
+
+
+@pytest.mark.parametrize("data", [b"", b"\7\0\1", b"\0\0\1\0"])
+def test_Monitor_a_status_that_is_none_changes_nothing_and_is_told(data: bytes) -> None:
+    rig = Rig()
+    rig.give(status(5))
+    (told,) = rig.give(Event(2, NOW_MS, Kind.STATE, "relay", data))
+    assert told.finding == "unreadable"
+    assert rig.shadow.digital_model.period_s == 5
+
+
+@given(reported=st.sampled_from(sorted(STATE_CODES)), period_s=PERIODS)
+def test_Analyze_compares_the_reported_state_with_the_models_and_emits_the_verdict(
+    reported: str, period_s: int
+) -> None:
+    """Ruling 7: a STATUS carries state and period; a mismatch between them is itself a finding."""
+    rig = Rig()
+    (told,) = rig.give(status(period_s, reported))
+    assert told.finding == ("agree" if delta(period_s).name == reported else "mismatch")
+    assert rig.shadow.analyze.check_statuses(SeenStatus(encode_status(reported, period_s).data)) is told.fine
+    assert rig.shadow.describe()["agreement"] == (1.0 if told.fine else 0.0)
+
+
+def test_Analyze_every_status_has_its_own_verdict_against_the_model_as_it_was_then() -> None:
+    told = Rig().give(status(5), status(0), status(3, "OFF"), status(-1))
+    assert [v.finding for v in told] == ["agree", "agree", "mismatch", "agree"]
+
+
+def test_Analyze_says_what_is_outside_of_the_model_bad_or_stale_once_and_when_it_is_over() -> None:
+    rig = Rig()
+    assert rig.give(value(50.0)) == []
+    assert [v.finding for v in rig.give(value(150.0), value(151.0))] == ["outside"]
+    assert [v.finding for v in rig.give(value(99.0))] == ["inside"]
+    assert [v.finding for v in rig.give(value(None, quality=Quality.BAD, reason=Reason.TIMEOUT))] == ["bad"]
+    assert [v.finding for v in rig.give(value(99.0))] == ["good"]
+    rig.clock.now_ms += 31_000
+    assert [v.finding for v in rig.give()] == ["stale"]
+    assert rig.give() == []
+    assert [v.finding for v in rig.give(value(99.0, rig.clock.now_ms))] == ["fresh"]
+    assert rig.shadow.describe()["wrong"] == {}
+    verdicts = [e.value for e in rig.shadow.analyze.collect()]
+    assert [str(v).partition(":")[0] for v in verdicts] == ["outside", "bad", "stale"], (
+        "what is wrong becomes knowledge"
+    )
+
+
+def test_Analyze_measures_rate_and_lag_of_twinning_and_leaves_out_what_was_backfilled() -> None:
+    """Prose, row 10."""
+    rig = Rig()
+    for n in range(11):
+        rig.clock.now_ms = NOW_MS + 100 * n
+        rig.give(value(1.0, rig.clock.now_ms - 40))
+    rig.give(value(1.0, NOW_MS - 3_600_000))
+    figures = rig.shadow.describe()
+    assert figures["twinning_rate_hz"] == pytest.approx(10.0)
+    assert figures["lag_ms"] == {"median": 40, "p95": 40, "max": 40}
+    assert figures["backfilled"] == 1
+
+
+def test_DigitalShadow_has_a_model_of_its_own_processes_and_a_connection_that_only_receives() -> None:
+    """Rulings 8 and 16: it is given a queue."""
+    rig, other = Rig(), Rig()
+    assert type(rig.shadow.digital_model) is DigitalModel
+    assert rig.shadow.digital_model is not other.shadow.digital_model
+    assert all(isinstance(process, DTDigitalThreadProcess) for process in rig.shadow.processes)
+    assert type(rig.shadow.receiving) is ReceivingEnd
+    assert rig.shadow.monitor.digital_model is rig.shadow.analyze.digital_model is rig.shadow.digital_model
+
+
+def test_DigitalShadow_can_reach_nothing_that_sends() -> None:
+    """Prose, row 4, by construction: from the shadow, through every attribute, no object leads to a thread's end, a link, a
+    driver or a command. The import contract in pyproject.toml says the same of its modules."""
+    seen: set[int] = set()
+    kinds: set[str] = set()
+
+    def walk(thing: object) -> None:
+        if id(thing) in seen or isinstance(thing, type | str | bytes | int | float | None):
+            return
+        seen.add(id(thing))
+        kinds.add(type(thing).__name__)
+        if isinstance(thing, dict):
+            parts = [*thing.keys(), *thing.values()]
+        elif isinstance(thing, list | tuple | set | frozenset) or hasattr(thing, "popleft"):
+            parts = list(thing)  # type: ignore[call-overload]
+        else:
+            names = [*getattr(thing, "__dict__", {}), *getattr(type(thing), "__slots__", ())]
+            parts = [getattr(thing, name) for name in names if isinstance(name, str) and hasattr(thing, name)]
+        for part in parts:
+            walk(part)
+
+    rig = Rig()
+    rig.receiving.observe("plant:1", status(5))
+    walk(rig.shadow)
+    assert {"Monitor", "Analyze", "DigitalModel", "ReceivingEnd"} <= kinds
+    assert not kinds & {
+        "ThreadEnd",
+        "Outgoing",
+        "Link",
+        "TransmitterDriver",
+        "Operator",
+        "COMMAND",
+        "function",
+        "method",
+    }
+    source = Path(__file__).resolve().parents[2] / "twin"
+    for module in ("shadow.py", "mape/monitor.py", "mape/analyze.py"):
+        names = {n.id for n in ast.walk(ast.parse((source / module).read_text())) if isinstance(n, ast.Name)}
+        assert "COMMAND" not in names
+
+
+def test_DigitalShadow_updates_its_model_from_everything_that_it_receives() -> None:
+    """Prose, row 5."""
+    rig = Rig()
+    for period_s in (1, 2, 0, -1):
+        rig.give(status(period_s), value(1.0))
+        assert rig.shadow.digital_model.period_s == period_s
+    assert issubclass(SeenStatus, STATUS), "it reuses the physical twin's message types"
+
+
+def test_DigitalShadow_is_bounded_and_counts_what_it_drops() -> None:
+    receiving = ReceivingEnd("from the plant", capacity=3)
+    for n in range(5):
+        receiving.observe("plant:1", value(n))
+    assert ([e.value for _, e in receiving.queue], receiving.dropped) == ([2, 3, 4], 2)

@@ -1,0 +1,211 @@
+"""The plant's side of a digital thread as a process: ``python -m twin.plant_thread CONFIG.json``.
+
+It looks at the process image, as any watcher does, and shares what changes: values, states with their periods, commands that
+came, responses that went. It writes into a store of its own and sends from there. It puts nothing into the image, and takes no
+commands.
+Control verbs: ready, get, stop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import signal
+import sys
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.control import ControlServer
+from gateway.core.errors import FieldtwinError
+from gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
+from gateway.core.image_region import Snapshot
+from gateway.core.nursery import Nursery
+from gateway.core.statemachine import STATE_CODES, STATES
+from gateway.core.values import COMMAND, RESPONSE, TagValue
+from gateway.store.event import Kind
+from gateway.store.knowledge import open_knowledge
+from gateway.wallclock import WallClock, run
+from twin.knowledge import KnowledgeWriter
+from twin.physical import attached, image_layout
+from twin.status import encode_status
+from twin.system import System, load_system
+from twin.thread import PTtoDTConnection, schema_of
+from twin.thread_end import ThreadEnd
+from twin.thread_place import plant_carrier
+from twin.thread_process import PTDigitalThreadProcess
+
+LOOK_MS = 50
+REFRESH_MS = 10_000
+"""What does not change is told so often, so that a twin can tell it from silence."""
+NAMES = list(STATES)
+
+
+class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the process is told. `place` is where the thread goes (`twin.thread_place`), `store` a file or a database."""
+
+    system: str
+    run_dir: str
+    place: str
+    store: str
+    prototype: bool
+    profiles: tuple[str, ...] = ()
+
+
+class ImageProcess(PTDigitalThreadProcess):
+    """Shares what the process image shows: `look` at both regions, as often as changes are not to be missed."""
+
+    def __init__(self, system: System, layout: ImageLayout, clock: Clock) -> None:
+        super().__init__("image", clock)
+        tags = {tag.name: tag for region in layout.regions for tag in region.tags}
+        self._plain = [
+            n for n, t in tags.items() if t.kind is not TagKind.MESSAGE and n.partition(".")[0] in system.devices
+        ]
+        self._machines = {
+            p: form.outputs.get("period_s", f"{p}.period_s")
+            for p, form in system.plc.programs.items()
+            if f"{p}.state" in tags and [word for _, word in tags[f"{p}.state"].words] == NAMES
+        }
+        self._said: dict[str, tuple[object, int]] = {}
+
+    def look(self, inputs: Snapshot, outputs: Snapshot) -> None:
+        """Share what is new, and what was not shared for `REFRESH_MS`."""
+        now_ms, offset_ns = self._clock.utc_ns() // NS_PER_MS, self._clock.utc_ns() - self._clock.monotonic_ns()
+        for name in self._plain:
+            held = inputs if name in inputs.shape.index else outputs
+            if held.counter:
+                self._value(name, held.value(name), now_ms, offset_ns)
+        if outputs.counter:
+            for program, period in self._machines.items():
+                self._status(program, outputs.value(f"{program}.state"), outputs.value(period), now_ms)
+        for tag, messages in inputs.messages.items():
+            for message in messages:
+                data = COMMAND(message.data) if tag.endswith(".inbox") else RESPONSE(message.data)
+                kind = Kind.COMMAND if tag.endswith(".inbox") else Kind.PAYLOAD
+                self.share(kind, tag, data, (message.t_ns + offset_ns) // NS_PER_MS)
+        for tag, messages in outputs.messages.items():
+            if tag.endswith(".outbox"):
+                for message in messages:
+                    self.share(Kind.PAYLOAD, tag, RESPONSE(message.data), (message.t_ns + offset_ns) // NS_PER_MS)
+
+    def _value(self, name: str, value: TagValue, now_ms: int, offset_ns: int) -> None:
+        what = (value.value, value.quality, value.reason)
+        if self._due(name, what, now_ms):
+            fresh = value.t_ns and value.good and self._said.get(name, (None, 0))[0] != what
+            self._said[name] = (what, now_ms)
+            self.share(Kind.VALUE, name, value, (value.t_ns + offset_ns) // NS_PER_MS if fresh else now_ms)
+
+    def _status(self, program: str, state: TagValue, period: TagValue, now_ms: int) -> None:
+        if (
+            not isinstance(state.value, int)
+            or not isinstance(period.value, int | float)
+            or isinstance(state.value, bool)
+        ):
+            return
+        name = next((n for n, code in STATE_CODES.items() if code == state.value), "")
+        what = (name, int(period.value))
+        if name and self._due(f"{program}.", what, now_ms):
+            self._said[f"{program}."] = (what, now_ms)
+            self.share(Kind.STATE, program, encode_status(*what), now_ms)
+
+    def _due(self, name: str, what: object, now_ms: int) -> bool:
+        said, at_ms = self._said.get(name, (None, 0))
+        return said != what or now_ms - at_ms >= REFRESH_MS
+
+
+class PlantThread:
+    """The process: looks, writes, sends, until told to stop."""
+
+    def __init__(self, config: PlantThreadConfig) -> None:
+        self._config = config
+        self._clock = WallClock()
+        self._stop = asyncio.Event()
+        self._place = ""
+
+    async def run(self) -> int:
+        c, clock = self._config, self._clock
+        system = load_system(c.system, [Path(p) for p in c.profiles])
+        layout = image_layout(system)
+        async with AsyncExitStack() as stack:
+            store = await open_knowledge(c.store)
+            stack.push_async_callback(store.aclose)
+            origin = await store.own("plant", system=system.name, prototype=c.prototype, log=secrets.token_hex(4))
+            carrier, self._place = await plant_carrier(c.place, system, clock)
+            stack.push_async_callback(carrier.aclose)
+            self._end = ThreadEnd(store, carrier, schema_of(system), clock, origin=origin, prototype=c.prototype)
+            self._writer = KnowledgeWriter(
+                store, origin, clock, on_written=self._end.appended, make_room=self._end.make_room
+            )
+            process = ImageProcess(system, layout, clock)
+            connection = PTtoDTConnection(self._end, [process], self._writer, clock)
+            image = stack.enter_context(attached(layout, Path(c.run_dir) / "image"))
+            readers = image.reader(INPUTS), image.reader(OUTPUTS)
+            async with Nursery() as nursery:
+                nursery.start(self._end.run(), "thread")
+                nursery.start(self._writer.run(), "knowledge")
+                watching = nursery.start(self._look(process, connection, readers), "image")
+                await self._serve(nursery)
+                watching.cancel()
+                connection.pump()
+                await self._writer.flush()
+        return 0
+
+    async def _look(self, process: ImageProcess, connection: PTtoDTConnection, readers: Any) -> None:
+        inputs, outputs = readers
+        while True:
+            process.look(inputs.snapshot(), outputs.snapshot())
+            connection.pump()
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_MS * NS_PER_MS)
+
+    async def _serve(self, nursery: Nursery) -> None:
+        socket = Path(self._config.run_dir) / "thread.sock"
+        server = ControlServer({"ready": self._ready, "get": self._get, "stop": self._request_stop})
+        await server.listen_unix(socket)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, self._stop.set)
+        failing = asyncio.ensure_future(nursery.wait())
+        stopping = asyncio.ensure_future(self._stop.wait())
+        try:
+            await asyncio.wait([failing, stopping], return_when=asyncio.FIRST_COMPLETED)
+            if failing.done():
+                failing.result()
+        finally:
+            failing.cancel()
+            stopping.cancel()
+            await server.aclose()
+            socket.unlink(missing_ok=True)
+
+    async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"ready": True, "pid": os.getpid()}
+
+    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "place": self._place,
+            **self._end.describe(),
+            "written": self._writer.written,
+            "dropped": self._writer.dropped,
+            "store_trouble": self._writer.trouble,
+        }
+
+    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+        status = await self._get(args)
+        asyncio.get_running_loop().call_later(0.05, self._stop.set)
+        return status
+
+
+def main(argv: list[str]) -> int:
+    """Run the process; errors go to stderr as one line."""
+    try:
+        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=PlantThreadConfig)
+        return run(PlantThread(config).run())
+    except FieldtwinError as e:
+        print(e, file=sys.stderr)
+        return e.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

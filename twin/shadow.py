@@ -1,0 +1,67 @@
+"""The digital shadow: Monitor and Analyze over what arrives from the plant. It cannot send: it holds nothing that could.
+
+What it receives is a queue (SPEC ruling 16). Whoever fills that queue, acknowledges and asks for what is missing stands outside
+of this module, which import contracts keep from connections, drivers, transmitters and threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.events import Consumer
+from twin.mape.analyze import Analyze, Limits
+from twin.mape.messages import Verdict
+from twin.mape.monitor import Monitor
+from twin.model import DigitalModel
+from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+
+VERDICTS = 1000
+
+
+class DigitalShadow:
+    """SPEC row DigitalShadow: a digital model of its own, thread processes, and a connection that only receives.
+
+    `step` runs the stages, one after the other, on what has arrived. `verdicts` is a consumer for whoever wants to know.
+    """
+
+    def __init__(
+        self, receiving: ReceivingEnd, clock: Clock, *, limits: Mapping[str, Limits], stale_after_ms: int = 30_000
+    ) -> None:
+        self.digital_model = DigitalModel()
+        self.receiving = receiving
+        self.monitor = Monitor(self.digital_model, clock)
+        self.analyze = Analyze(self.digital_model, clock, limits=limits, stale_after_ms=stale_after_ms)
+        self.monitor.emitter.subscribe(self.analyze.consumer)
+        self.verdicts: Consumer[Verdict] = Consumer(self.analyze.emitter.event, VERDICTS)
+        self.analyze.emitter.subscribe(self.verdicts)
+        self._clock = clock
+
+    @property
+    def processes(self) -> tuple[DTDigitalThreadProcess, ...]:
+        """The thread processes; what they share is this side's knowledge."""
+        return (self.monitor, self.analyze)
+
+    def step(self) -> int:
+        """Take in what arrived and analyze it, one by one: each is compared with the model as it was then. How many events."""
+        count = 0
+        now_ms = self._clock.utc_ns() // NS_PER_MS
+        while self.receiving.queue:
+            _, event = self.receiving.consume()
+            self.monitor.arrived(event, now_ms)
+            self.monitor.handle_state()
+            self.monitor.handle_measurements()
+            self.analyze.compare()
+            count += 1
+        self.analyze.look()
+        return count
+
+    def describe(self) -> dict[str, Any]:
+        """The model, and the figures of twinning."""
+        return {
+            "state": self.digital_model.state.name,
+            "period_s": self.digital_model.period_s,
+            **self.analyze.figures(),
+            "dropped": self.receiving.dropped,
+        }

@@ -167,7 +167,8 @@ def _show(result: object) -> None:
             table.add_row("  expected", escape(check.expected))
             table.add_row("  got", escape(check.got))
             table.add_row("  at", f"{(check.t_ns or 0) / 1e9:.3f} s, {escape(check.where)}")
-    data.print(table)
+    if table.row_count:
+        data.print(table)
     data.print(f"  {escape(result.reproduce)}", soft_wrap=True)
 
 

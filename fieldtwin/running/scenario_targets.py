@@ -19,8 +19,9 @@ from fieldtwin.running.control_bench import ControlBench, Where
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.virtual_scenario import prototype_of, reproduce, run_virtual
+from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.form import Scenario
-from fieldtwin.scenarios.runner import Runner
+from fieldtwin.scenarios.runner import Runner, refusal
 from fieldtwin.scenarios.trace import Trace
 from gateway.core.errors import FieldtwinError
 from gateway.wallclock import WallClock
@@ -51,22 +52,17 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
         return run_virtual(scenario, target.seed, trace_file)
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
+    refused = _of_a_plant(scenario, target) if target.name == "real" else ""
     sink = trace_file.open("wb") if trace_file is not None else None
     trace = Trace(sink=sink)
     trace.listeners.append(collector.feed)
     try:
-        result = asyncio.run(_run(scenario, target, trace))
+        if refused:  # then the plant is left alone
+            result = _without_run(scenario, target, Verdict.SKIPPED, refused)
+        else:
+            result = asyncio.run(_run(scenario, target, trace))
     except FieldtwinError as e:
-        result = ScenarioResult(
-            scenario.form.scenario,
-            Verdict.ERROR,
-            requirements=tuple(scenario.form.requirements),
-            file=str(scenario.path),
-            line=1,
-            target=target.name,
-            reason=str(e),
-            trace=tuple(trace.events),
-        )
+        result = replace(_without_run(scenario, target, Verdict.ERROR, str(e)), trace=tuple(trace.events))
     finally:
         if sink is not None:
             sink.close()
@@ -78,6 +74,28 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
         counts=collector.finish(),
         trace_hash="",  # no two runs on a clock have the same
     )
+
+
+def _without_run(scenario: Scenario, target: Target, verdict: Verdict, reason: str) -> ScenarioResult:
+    return ScenarioResult(
+        scenario.form.scenario,
+        verdict,
+        requirements=tuple(scenario.form.requirements),
+        file=str(scenario.path),
+        line=1,
+        target=target.name,
+        reason=reason,
+    )
+
+
+def _of_a_plant(scenario: Scenario, target: Target) -> str:
+    """What is clear before anything of a plant is touched."""
+    can = {Can.PROBE}
+    if target.far:
+        can.add(Can.SEND_COMMAND)
+    if target.capture or not target.instance:
+        can.add(Can.SEE_WIRE)
+    return refusal(scenario, target.name, can, target.allow)
 
 
 def _words(target: Target) -> list[str]:

@@ -7,7 +7,7 @@ its host's lateness makes worthless INCONCLUSIVE, and neither ever passes.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +49,19 @@ class _Broken(Exception):
     since_s: float | None = None
 
 
+def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Danger) -> str:
+    """Why a target cannot do what the scenario is made of, or may not have it done to it; empty when all is well."""
+    lacking = [need.value for need in scenario.needs if need not in can]
+    if lacking:
+        return f"the target {target} cannot {', '.join(lacking)}"
+    asked = [(DANGER.get(word_of(step), Danger.OBSERVE), f"step {n}") for n, step in enumerate(scenario.form.steps, 1)]
+    asked += [(Danger.READ, f"the probe {probe.name}") for probe in scenario.probes]
+    for danger, what in asked:
+        if danger.rank > allowed.rank:
+            return f"{what} is of the class {danger.value}, and the target {target} allows {allowed.value}"
+    return ""
+
+
 class Runner:
     """One scenario on one bench. ``await run()`` once."""
 
@@ -72,29 +85,10 @@ class Runner:
         self._whole = WholeRun(scenario, bench, self._look)
         bench.trace.listeners.append(self._on_event)
 
-    def missing(self) -> list[Can]:
-        """What the scenario needs and the bench cannot do."""
-        return [need for need in self.scenario.needs if need not in self.bench.can]
-
-    def _refused(self) -> str:
-        """Why the bench cannot, or may not, do what the scenario is made of; empty when it can."""
-        lacking = self.missing()
-        if lacking:
-            return f"the target {self.bench.target} cannot {', '.join(need.value for need in lacking)}"
-        asked = [
-            (DANGER.get(word_of(step), Danger.OBSERVE), f"step {n}")
-            for n, step in enumerate(self.scenario.form.steps, 1)
-        ]
-        asked += [(Danger.READ, f"the probe {probe.name}") for probe in self.scenario.probes]
-        for danger, what in asked:
-            if danger.rank > self.bench.allowed.rank:
-                return f"{what} may {danger.value} on the target {self.bench.target}: --allow {danger.value}"
-        return ""
-
     async def run(self) -> ScenarioResult:
         """All steps. Never raises for what the system does; raises what a bench raises that is gone."""
         scenario, form = self.scenario, self.scenario.form
-        refused = self._refused()
+        refused = refusal(scenario, self.bench.target, self.bench.can, self.bench.allowed)
         verdict, reason = Verdict.PASSED, ""
         if refused:
             verdict, reason = Verdict.SKIPPED, refused

@@ -222,7 +222,9 @@ class _Cycle:
             self.judged += 1
             late_s = bench.late_ms() / 1000
             return (
-                None if late_s <= self._late_s else self._said(f"{late_s * 1000:g} ms at {now_s:.3f} s", ("plc.late",))
+                None
+                if late_s <= self._late_s
+                else self._said(f"{late_s * 1000:g} ms late at {now_s:.3f} s", ("plc.late",))
             )
         while self._between:
             since_s, at_s = self._between.popleft()

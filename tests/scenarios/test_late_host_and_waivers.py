@@ -1,0 +1,110 @@
+"""A host that was late has proved nothing; a failure that somebody answers for is skipped until its day."""
+
+from __future__ import annotations
+
+from datetime import date
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from emulators.virtual.loop import VirtualLoop
+from fieldtwin.cli.test_command import command
+from fieldtwin.conformance.waivers import Waiver, Waivers
+from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.scenarios.bench import Can
+from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.scenarios.runner import Runner
+from fieldtwin.scenarios.trace import Trace
+from fieldtwin.scenarios.waiving import all_well, waive
+from twin.prototype_file import load_prototype
+
+HEAD = "scenario: a test\nsystem: observatory\n"
+
+
+class LateBench(VirtualBench):
+    """Says that its host was 300 ms late just now, and scans 7 ms."""
+
+    can = VirtualBench.can - {Can.EXACT_TIME}
+
+    def host_late_s(self, since_s: float) -> float:
+        return 0.3
+
+    def late_ms(self) -> float:
+        return 7.0
+
+
+def judge(folder: Path, text: str) -> ScenarioResult:
+    path = folder / "x.scenario.yaml"
+    path.write_text(HEAD + text)
+    scenario = load_scenario(path)
+    loop = VirtualLoop()
+
+    async def main() -> ScenarioResult:
+        prototype = load_prototype(scenario.system, None)
+        async with LateBench(scenario.system, prototype, loop, folder, Trace()) as bench:
+            return await Runner(scenario, bench).run()
+
+    try:
+        return loop.run_until_complete(main())
+    finally:
+        loop.close()
+
+
+@pytest.mark.parametrize(
+    ("text", "verdict"),
+    [
+        ("steps:\n  - expect: {tag: relay.state, value: ACTIVE, within: 2s}\n", Verdict.INCONCLUSIVE),
+        ("steps:\n  - expect: {tag: relay.state, value: ACTIVE, within: 20s}\n", Verdict.FAILED),
+        ("steps:\n  - wait: {until: \"relay.state == 'ACTIVE'\", within: 2s}\n", Verdict.INCONCLUSIVE),
+        ("steps:\n  - pause: 1s\n  - expect: {that: \"relay.state == 'STANDBY'\", during: 1s}\n", Verdict.INCONCLUSIVE),
+        ("steps:\n  - pause: 1s\n  - expect: {that: \"relay.state == 'STANDBY'\", during: 4s}\n", Verdict.PASSED),
+        ("always: ['plc.late < 5 ms']\nsteps:\n  - pause: 1s\n", Verdict.INCONCLUSIVE),
+        ("never: ['plc.late > 5 ms']\nsteps:\n  - pause: 1s\n", Verdict.INCONCLUSIVE),
+        ("cycle: [{late: 5ms}]\nsteps:\n  - pause: 1s\n", Verdict.INCONCLUSIVE),
+        ("cycle: [{late: 10ms}]\nsteps:\n  - pause: 1s\n", Verdict.PASSED),
+        ("always: [\"relay.state == 'OFF'\"]\nsteps:\n  - pause: 1s\n", Verdict.FAILED),
+    ],
+)
+def test_a_late_host_proves_nothing_about_short_times(tmp_path: Path, text: str, verdict: Verdict) -> None:
+    result = judge(tmp_path, text)
+    assert result.verdict is verdict, result.checks
+    if verdict is Verdict.INCONCLUSIVE:
+        assert "late" in result.checks[-1].got
+
+
+TODAY = date(2027, 1, 10)
+
+
+@pytest.mark.parametrize(
+    ("found", "expires", "verdict", "well"),
+    [
+        (Verdict.FAILED, TODAY, Verdict.SKIPPED, True),
+        (Verdict.FAILED, date(2027, 1, 9), Verdict.FAILED, False),
+        (Verdict.PASSED, TODAY, Verdict.PASSED, True),
+        (Verdict.PASSED, date(2027, 1, 9), Verdict.FAILED, False),
+        (Verdict.INCONCLUSIVE, TODAY, Verdict.INCONCLUSIVE, False),
+        (Verdict.SKIPPED, TODAY, Verdict.SKIPPED, False),
+    ],
+)
+def test_a_waiver_holds_until_its_day(found: Verdict, expires: date, verdict: Verdict, well: bool) -> None:
+    passed = ScenarioResult("good", Verdict.PASSED, file="good.scenario.yaml")
+    result = ScenarioResult("a test", found, file="/x/ctd-silent.scenario.yaml", reason="step 3")
+    waived = waive(result, Waivers((Waiver("ctd-silent", "ticket 4711", expires),)), TODAY)
+    assert waived.verdict is verdict
+    assert all_well([passed, waived]) is well
+    assert not all_well([] if verdict is Verdict.PASSED else [waived])
+
+
+def test_waivers_are_read_and_said(tmp_path: Path) -> None:
+    path = tmp_path / "x.scenario.yaml"
+    path.write_text(HEAD + "steps:\n  - expect: {tag: relay.state, value: ACTIVE, within: 1s}\n")
+    waivers = tmp_path / "waivers.yaml"
+    waivers.write_text("waivers:\n  - {id: x, reason: ticket 4711, expires: 2999-01-01}\n")
+    ended = CliRunner().invoke(command, [str(path), "--waivers", str(waivers)], standalone_mode=False)
+    assert "waived: ticket 4711, until 2999-01-01 (failed: step 1" in " ".join(ended.output.split())
+    assert ended.return_value == 1, "nothing passed"
+    waivers.write_text("waivers:\n  - {id: y, reason: ticket 4711, expires: 2999-01-01}\n")
+    wrong = CliRunner().invoke(command, [str(path), "--waivers", str(waivers)], standalone_mode=False)
+    assert "no case 'y'" in str(wrong.exception)

@@ -1,0 +1,117 @@
+"""What a scenario wants of the whole run, and probes, in virtual time: what holds; what is broken says when and what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.running.virtual_scenario import run_virtual
+from fieldtwin.scenarios.form import load_scenario
+from gateway.core.errors import FileInvalid
+
+ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n"
+SILENT = ACTIVE + "  - fault: {id: dead, name: silence, device: ctd}\n  - pause: 5s\n"
+HMI = """probes:
+  desk:
+    serve: hmi
+    every: 100ms
+    registers:
+      pressure: {at: 30001, type: float32}
+      temperature: {at: 30005, type: float32}
+"""
+
+
+def run(folder: Path, steps: str, head: str) -> ScenarioResult:
+    path = folder / "x.scenario.yaml"
+    path.write_text(f"scenario: a test\nsystem: observatory\n{head}steps:\n{steps}")
+    return run_virtual(load_scenario(path))
+
+
+@pytest.mark.parametrize(
+    ("head", "steps", "verdict", "told"),
+    [
+        (
+            "within: [{after: \"relay.state == 'ACTIVE'\", then: \"ctd.sample_period_s == 1\", within: 3s}]\n",
+            ACTIVE,
+            Verdict.PASSED,
+            "1 times",
+        ),
+        (
+            "within: [{after: \"relay.state == 'ACTIVE'\", then: \"ctd.sample_period_s == 9\", within: 2s}]\n",
+            "  - send: {period_s: 1}\n  - wait: {until: \"relay.state == 'ACTIVE'\", within: 10s}\n",
+            Verdict.FAILED,
+            "not then until",
+        ),
+        (
+            "rate: [{tag: inclinometer.slope_long, updates_per_s: {min: 9, max: 11}, over: 2s, "
+            "while: \"quality(inclinometer.slope_long) == 'good'\"}]\n",
+            "  - pause: 6s\n",
+            Verdict.PASSED,
+            "looks",
+        ),
+        ("rate: [{tag: ctd.pressure, updates_per_s: {min: 0.5}, over: 3s}]\n", "  - pause: 6s\n", Verdict.FAILED, "0/s"),
+        ("rate: [{wire: ctd, requests_per_s: {max: 10}, over: 2s}]\n", SILENT, Verdict.PASSED, "looks"),
+        ("rate: [{wire: ctd, requests_per_s: {max: 1}, over: 2s}]\n", SILENT, Verdict.FAILED, "/s:"),
+        ("rate: [{wire: ctd, requests_per_s: {max: 1}, over: 1h}]\n", "  - pause: 2s\n", Verdict.INCONCLUSIVE, "0 looks"),
+        ("cycle: [{changes_of: ctd.sample_count, min: 0.8s, max: 1.7s}]\n", ACTIVE + "  - pause: 4s\n", Verdict.PASSED, ""),
+        ("cycle: [{changes_of: ctd.sample_count, max: 1.7s}]\n", SILENT, Verdict.FAILED, "none from"),
+        ("cycle: [{changes_of: ctd.sample_count, min: 3s}]\n", ACTIVE + "  - pause: 4s\n", Verdict.FAILED, " s, from"),
+        ("cycle: [{late: 1ms}]\n", "  - pause: 1s\n", Verdict.PASSED, "looks"),
+    ],
+)  # fmt: skip
+def test_the_whole_run_is_judged(tmp_path: Path, head: str, steps: str, verdict: Verdict, told: str) -> None:
+    result = run(tmp_path, steps, head)
+    assert result.verdict is verdict, result.checks[-1]
+    assert told in result.checks[-1].got
+
+
+def test_probes_see_what_is_served_under_their_names(tmp_path: Path) -> None:
+    steps = ACTIVE + (
+        "  - expect: {that: 'desk.pressure == ctd.pressure', within: 3s}\n"
+        "  - set: {tag: ctd.temperature, value: 50}\n"
+        "  - expect: {tag: desk.temperature, value: 50, tolerance: 0.01, quality: good, within: 5s}\n"
+    )
+    result = run(tmp_path, steps, HMI + 'always: ["age(desk.pressure) < 1 s"]\n')
+    assert result.verdict is Verdict.PASSED, result.checks[-1]
+    elsewhere = run(tmp_path, "  - pause: 1s\n", HMI.replace("serve: hmi", 'endpoint: "tcp://127.0.0.1:1"'))
+    assert elsewhere.verdict is Verdict.SKIPPED
+    assert "cannot probe" in elsewhere.reason
+
+
+@pytest.mark.parametrize(
+    ("head", "told", "line"),
+    [
+        (HMI.replace("serve: hmi", "serve: hmj"), "no 'hmj'", 5),
+        (HMI.replace("float32", "flot32"), "float32", 8),
+        (HMI.replace("at: 30001", "att: 30001"), "did you mean 'at'", 8),
+        (HMI.replace("desk:", "ctd:"), "device or program", 4),
+        (HMI.replace("    serve: hmi\n", ""), "one place", 4),
+        (HMI.replace("serve: hmi", 'endpoint: "can:socketcan/can0"'), "over Modbus", 5),
+        ("rate: [{tag: ctd.pressure, requests_per_s: {max: 1}}]\n", "of a tag or of a wire", 3),
+        ("cycle: [{changes_of: ctd.pressure}]\n", "bounds", 3),
+        ("within: [{after: 'relay.stat == 1', then: 'true', within: 1s}]\n", "did you mean 'relay.state'", 3),
+    ],
+)
+def test_a_mistake_is_named_where_it_stands(tmp_path: Path, head: str, told: str, line: int) -> None:
+    with pytest.raises(FileInvalid) as e:
+        run(tmp_path, "  - pause: 1s\n", head)
+    assert told in str(e.value)
+    assert e.value.line == line
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("age(ctd.pressure) <= 2.5 s and ctd.presure > 1", "ctd.presure"),
+        ("ctd.pressure > 100 ms or qualty(ctd.pressure) == 'good'", "qualty"),
+        ("'5 s' == '5 s' and 10 min > relay.stat", "relay.stat"),
+        ("command pending and ctd.pressure ** 2 > 1", "ctd.pressure ** 2"),
+    ],
+)
+def test_an_error_in_an_expression_has_its_own_column(tmp_path: Path, text: str, word: str) -> None:
+    with pytest.raises(FileInvalid) as e:
+        run(tmp_path, f'  - wait: {{until: "{text}", within: 1s}}\n', "")
+    line = (tmp_path / "x.scenario.yaml").read_text().splitlines()[e.value.line - 1]
+    assert line[e.value.column - 1 :].startswith(word)

@@ -155,7 +155,7 @@ class ModbusScanner:
         """Settings unknown, line silent: the likely ones first."""
         ascii_mode = self._pace.ascii
         steps = plan.quick_pass(
-            self._pace, plan.likely_settings(ascii_mode=ascii_mode), self._units, self._options.quick_s
+            self._quick, plan.likely_settings(ascii_mode=ascii_mode), self._units, self._options.quick_s
         )
         done = await self._steps(steps, "likely settings", until_found=not self._options.every_setting)
         if self._quick != self._pace:

@@ -211,3 +211,16 @@ def test_listening_to_anything_counts_it_and_never_fails(chunks: list[bytes]) ->
     heard = ear.heard
     assert heard.bytes == sum(map(len, chunks))
     assert 0 <= heard.good_bytes <= heard.bytes
+
+
+def test_the_quick_pass_takes_30_s_and_tries_likely_settings_with_likely_units() -> None:
+    async def main() -> None:
+        line = UartLine({200: meter()})
+        found = await scan(line, quick_only=True)
+        assert 28 < found.took_s < 34
+        assert found.asked >= 130
+        assert len(set(line.opened)) >= 10
+        assert found.units == []
+        assert any("--quick" in note for note in found.notes)
+
+    run_virtually(main())

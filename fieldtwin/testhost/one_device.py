@@ -94,13 +94,14 @@ def _wires(on: str, profile: DeviceProfile) -> tuple[str, str]:
 
 
 def _stand_in(wanted: Wanted, profile: DeviceProfile, path: Path, beside: Path | None) -> dict[str, Any]:
-    """What plays the device: the recording that was named, a model, or the shipped recording; with `values`, its profile."""
+    """What plays the device: the recording that was named; else its profile, whose registers take what is written to them; else,
+    where registers alone are not all of it, the shipped recording."""
     common: dict[str, Any] = {"identity": wanted.identity} if wanted.identity else {}
     if profile.inbox is not None:
         return {"model": "mailbox", "far": "tcp://127.0.0.1:0", **common}
     named = wanted.recording
     model = profile.sampled is None and profile.protocol == "modbus"
-    if not named and (not model or not wanted.values):
+    if not named and not model:
         named = _shipped(path.stem)
     if named and wanted.values and model:
         raise UsageError("a recording and values", expected="one of them, and set() for single values")

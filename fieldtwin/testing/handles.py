@@ -64,7 +64,8 @@ class Device:
         self._runner.call("set", id=self._bench, device=self.name, tag=tag, value=value)
 
     def held(self, tag: str) -> Any:
-        """What the device holds now, in engineering units: also what a driver has written. None: nothing yet."""
+        """What the device holds, in engineering units: also what a driver has written. Of a device that samples or plays a
+        recording, what it showed last; None: nothing yet."""
         __tracebackhide__ = True
         return self._runner.call("held", id=self._bench, device=self.name, tag=tag)
 

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from fieldtwin.commissioning.dump_objects import ObjectKey
 from fieldtwin.commissioning.dump_sweep import Outcome, Refused, Silent, Taken
 from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import Bug, CrcError, Desync, ModbusExceptionReply, ReplyTimeout, SdoAborted, UsageError
+from gateway.core.errors import Bug, CrcError, Desync, ModbusExceptionReply, ReplyTimeout, SdoAborted
 from gateway.core.profile import RegisterRange
 from gateway.protocols.canopen.abort_codes import TIMED_OUT
 from gateway.protocols.canopen.master import CanopenMaster
@@ -65,8 +65,6 @@ class ModbusAsker:
     def __init__(
         self, client: ModbusClient, unit: int, clock: Clock, *, retries: int = 2, spacing_s: float = 0.0
     ) -> None:
-        if unit == 0:
-            raise UsageError("unit 0 is a broadcast: nobody answers", expected="--unit from 1 on")
         self._client, self._unit, self._clock = client, unit, clock
         self._retries, self._spacing_ns = retries, round(spacing_s * NS_PER_S)
         self._free_ns = 0

@@ -208,6 +208,8 @@ def test_another_job_a_file_that_is_there_and_nobody_are_refused(tmp_path: Path)
             await dump(job(), out, words="", connector=wired(), clock=loop())
         with pytest.raises(FileInvalid, match="another job"):
             await dump(job(stride=1), out, words="", resume=True, connector=wired(), clock=loop())
+        with pytest.raises(UsageError, match="broadcast"):
+            await dump(Job(Target("rtu:/dev/ttyS99", 0)), tmp_path / "n.jsonl", words="")
         deaf = wired(mute=lambda adu, before: True)
         with pytest.raises(Unreachable, match="nobody answers"):
             await dump(job(), tmp_path / "n.jsonl", words="", connector=deaf, clock=loop())

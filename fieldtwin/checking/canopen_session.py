@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldtwin.checking.canopen_cases import CASES
-from fieldtwin.checking.canopen_wire import CanopenWire, Key, Reply
+from fieldtwin.checking.canopen_wire import SDO_REQUEST, CanopenWire, Key, Reply
 from fieldtwin.checking.checked import Checked, shown
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.run import Plan, Transcript, play
@@ -16,7 +16,7 @@ from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Connector, Direction, Tap
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
+from gateway.core.errors import NotAllowed, Unreachable
 from gateway.protocols.canopen.dictionary import load_dictionary
 from gateway.wallclock import WallClock
 
@@ -30,7 +30,8 @@ MOST_LONG = 20
 
 @dataclass(frozen=True, slots=True)
 class CanopenOptions:
-    """How to check: `may_write` are objects that are lent for writing; `go_on` as in `ModbusOptions`."""
+    """How to check: `may_write` are objects that are lent for writing; `go_on` as in `ModbusOptions`. Nothing is sent
+    where another master speaks SDO with the node, unless `share_bus`: its transfers would be broken."""
 
     endpoint: str
     node: int
@@ -40,6 +41,7 @@ class CanopenOptions:
     spacing_s: float = 0.02
     boot_s: float = 10.0
     eds: Path | None = None
+    share_bus: bool = False
     may_write: tuple[Key, ...] = ()
     taps: Sequence[Tap] = ()
     connector: Connector | None = None
@@ -64,7 +66,7 @@ async def check_canopen(
     say: Callable[[str], None] = lambda text: None,
     tell: Callable[[DeviceResult], None] = lambda result: None,
 ) -> Checked:
-    """The whole check. Raises `Unreachable` where the node does not answer."""
+    """The whole check. Raises `Unreachable` where the node does not answer, `NotAllowed` where another master speaks with it."""
     dictionary = load_dictionary(options.eds, options.node) if options.eds is not None else None
     clock = options.clock or WallClock()
     began_ns = clock.monotonic_ns()
@@ -77,6 +79,11 @@ async def check_canopen(
             connection, clock, options.node, timeout_s=options.timeout_s, spacing_s=options.spacing_s, boot_s=options.boot_s,
             may_write=options.may_write, dictionary=dictionary,
         )  # fmt: skip
+        heard = await wire.listen(LISTEN_S)
+        if not options.share_bus and any(f.can_id == SDO_REQUEST + options.node and not f.extended for f in heard):
+            raise NotAllowed(
+                f"another master speaks SDO with node {options.node}", hint="--share-bus checks all the same"
+            )
         identity = await learn(wire)
         say(f"1000h is {wire.device_type.hex(' ').upper()}")
         before = transcript.spoken
@@ -86,7 +93,6 @@ async def check_canopen(
 
 async def learn(wire: CanopenWire) -> dict[str, str]:
     """Its device type, who it is, and an object of several segments. Raises `Unreachable` where it does not answer."""
-    await wire.listen(LISTEN_S)
     found: bytes | Reply = Reply()
     for _ in range(2):  # once may be a lost frame
         found = await wire.upload((0x1000, 0))

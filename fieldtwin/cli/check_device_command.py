@@ -101,6 +101,7 @@ def modbus(
 @click.option(
     "--boot", "boot_s", type=Duration(), default="10s", show_default=True, help="For a boot-up after a reset."
 )
+@click.option("--share-bus", is_flag=True, help="Also a node that another master speaks SDO with.")
 @shared
 def canopen(
     endpoint: str | None,
@@ -110,6 +111,7 @@ def canopen(
     writes: tuple[str, ...],
     timeout_s: float,
     boot_s: float,
+    share_bus: bool,
     **options: Any,
 ) -> int:
     """Judge a CANopen node from outside: the rows of the catalogue that a master can ask for.
@@ -134,7 +136,9 @@ def canopen(
     check = Check("canopen", endpoint, node, options)
     has = ({"object"} if may_write else set()) | ({"eds"} if eds is not None else set())
     plan = check.plan(CASES, has, bool(writes))
-    to_do = CanopenOptions(endpoint, node, plan, bitrate or 0, timeout_s, 1 / options["rate"], boot_s, eds, may_write)
+    to_do = CanopenOptions(
+        endpoint, node, plan, bitrate or 0, timeout_s, 1 / options["rate"], boot_s, eds, share_bus, may_write
+    )
     on_paper = canopen_on_paper(to_do)
     if options["dry_run"]:
         return check.on_paper(on_paper)

@@ -22,7 +22,10 @@ from fieldtwin.checking.run import Plan
 from fieldtwin.conformance.case import Danger
 from fieldtwin.report.model import Verdict
 from gateway.connections.soft_bus import SoftBus
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
+from gateway.core.errors import NotAllowed
 
 ALL = Plan(at_most=Danger.DISRUPT, has=frozenset({"object", "eds", "i-know"}))
 MAY_WRITE = ((0x2000, 0), (0x2004, 0), (0x1017, 0))
@@ -66,6 +69,23 @@ def test_localnode_gets_the_verdicts_that_are_known(eds: Path) -> None:
     found = not_passed(checked)
     assert found.pop("CO-041").startswith("failed: 0 heartbeats")  # they would come from a thread of python-can
     assert found == KNOWN["known"]
+
+
+def test_nothing_is_sent_to_a_node_that_another_master_speaks_with() -> None:
+    heard: list[CanFrame] = []
+
+    async def master(connection: CanConnection, clock: VirtualClock) -> None:
+        connection.on_arrival = heard.append
+        while True:
+            await connection.send(CanFrame(0x600 + NODE, bytes.fromhex("4000100000000000")))
+            await asyncio.sleep(0.1)
+
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> None:
+        with pytest.raises(NotAllowed, match="--share-bus"):
+            await check_canopen(CanopenOptions(url, NODE, ALL, connector=net, clock=clock))
+
+    on_bus(master, use)
+    assert heard == []
 
 
 @pytest.mark.interop

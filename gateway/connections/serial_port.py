@@ -48,7 +48,7 @@ def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> 
             port=endpoint.path,
             baudrate=settings.baudrate,
             bytesize=settings.data_bits,
-            parity=settings.parity,
+            parity="N" if _is_pty(endpoint.path) else settings.parity,
             stopbits=settings.stop_bits,
             timeout=read_s,
             write_timeout=write_s,
@@ -70,6 +70,11 @@ def open_port(endpoint: Endpoint, read_s: float = 0.0, write_s: float = 0.0) -> 
         ) from e
     except OSError as e:
         raise _cannot_open(endpoint, e.errno or 0, str(e)) from e
+
+
+def _is_pty(path: str) -> bool:
+    """A pty drops parity silently, and glibc calls it an error where nothing else was to be set: 8E1 twice is refused."""
+    return os.path.realpath(path).startswith("/dev/pts/")
 
 
 def _set_rs485(port: Port, endpoint: Endpoint) -> None:

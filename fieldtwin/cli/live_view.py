@@ -314,6 +314,8 @@ def print_summary(summary: dict[str, Any]) -> None:
     if far := summary["far_end"]:
         data.print(f"  far end        commands {far['commands_sent']}, responses {far['responses']}")
     data.print(f"  logged         {summary['logged']} exchanges")
+    if thread := summary["thread"]:
+        data.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
     for name, learnt in summary["learnt"].items():
         data.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
     if acts := summary["plc"].get("acts"):
@@ -324,6 +326,13 @@ def print_summary(summary: dict[str, Any]) -> None:
     for error in summary["errors"]:
         data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+
+
+def _thread_text(thread: dict[str, Any]) -> str:
+    """What the plant's side of the digital thread kept and sent, and what is wrong with store or carrier."""
+    text = f"{thread['written']} events kept, {thread['waiting']} not confirmed by the other side"
+    troubles = [t for t in (thread["store_trouble"], thread["trouble"]) if t]
+    return "; ".join([text, *troubles])
 
 
 def _learnt_text(learnt: dict[str, Any], kind: str) -> str:

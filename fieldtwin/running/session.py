@@ -75,6 +75,7 @@ class RunSession:
         self.field_status: dict[str, Any] | None = None
         self.outputs_confirmed_safe: bool | None = None
         self.thread_place = ""
+        self.thread_status: dict[str, Any] | None = None
         self.started_ns = 0
         self.stopped = asyncio.Event()
         self._stack = AsyncExitStack()
@@ -273,6 +274,10 @@ class RunSession:
         self.gateway_status = await self._get(self._clients.get("gateway"))
         self.plc_status = await self._get(self._clients.get("plc"), brief=True)
         self.field_status = await self._get(self._field.client if self._field else None)
+        if (thread := await self._get(self._clients.get("thread"))) is not None:
+            self.thread_status = thread
+            if thread["dropped"]:
+                self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they came too fast'}")
         if self.options.field_host and self.field_status is None:
             self.note_error(f"the field side at {self.options.field_host} was lost: nobody knows what its devices held")
 

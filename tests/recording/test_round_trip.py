@@ -13,6 +13,8 @@ from collections.abc import AsyncIterator, Iterable
 from pathlib import Path
 
 import pytest
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
 from support import eventually, run
 
 from emulators.canopen.serve import serve_node
@@ -158,6 +160,30 @@ def _free_port() -> int:
         s.bind(("127.0.0.1", 0))
         found: int = s.getsockname()[1]
         return found
+
+
+def test_a_server_of_somebody_else_is_recorded_and_its_emulator_is_as_good(tmp_path: Path) -> None:
+    """pymodbus's: 100 registers that count, and exception 02 behind them."""
+    requests = ["0300000064", "0300000001", "0300630001", "0300640001", "03005f000a"]
+    wanted = write(tmp_path / "wanted.jsonl", [Exchange(0, 1, bytes.fromhex(r), b"\x83\x01") for r in requests])
+    theirs, ours = _free_port(), _free_port()
+
+    async def main() -> Comparison:
+        device = SimDevice(1, [SimData(0, count=100, values=7, datatype=DataType.REGISTERS)])
+        server = ModbusTcpServer(device, address=("127.0.0.1", theirs))
+        await server.serve_forever(background=True)
+        same = SameRequests(exchanges_of(wanted))
+        try:
+            counters = await recorded(f"tcp://127.0.0.1:{theirs}", same, tmp_path / "r.jsonl", rounds=2)
+        finally:
+            await server.shutdown()
+        assert (counters.exchanges, counters.refused, counters.unanswered) == (10, 4, 0)
+        async with played(tmp_path / "r.jsonl", f"tcp://127.0.0.1:{ours}"):
+            await recorded(f"tcp://127.0.0.1:{ours}", same, tmp_path / "again.jsonl", rounds=2)
+        return compared(tmp_path / "r.jsonl", tmp_path / "again.jsonl")
+
+    result = run(main())
+    assert (result.met, result.compared) == (True, 10)
 
 
 def test_a_planted_difference_of_each_kind_is_found(tmp_path: Path) -> None:

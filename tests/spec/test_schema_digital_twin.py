@@ -1,0 +1,158 @@
+"""Schemas Plan, Execute, DigitalTwin."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from shadow_rig import Hands, status, value
+
+from gateway.core.events import Consumer, Producer
+from gateway.core.statemachine import decode_period, delta, encode_period
+from gateway.core.values import COMMAND, DATA
+from gateway.store.event import Kind
+from twin.mape.execute import Bounds, Execute
+from twin.mape.messages import verdict
+from twin.mape.plan import Plan, Rule, RulePlanner
+from twin.model import DigitalModel
+from twin.shadow import DigitalShadow
+from twin.thread import Operator
+from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from twin.twin import DigitalTwin
+
+PERIODS = st.integers(-32768, 32767)
+RULES = (Rule("outside", "ctd.pressure", 1), Rule("inside", "ctd.pressure", 10), Rule("bad", "", -1))
+
+
+class Always:
+    """A planner in Python: whatever is found, the next of its periods."""
+
+    def __init__(self, *periods: int) -> None:
+        self._periods = deque(periods)
+
+    def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None:
+        return encode_period(self._periods.popleft()) if self._periods else None
+
+
+class Rig:
+    def __init__(self, *, bounds: Bounds = Bounds(), what_if: object = None) -> None:  # noqa: B008
+        self.clock = Hands()
+        self.receiving = ReceivingEnd("from the plant")
+        self.twin = DigitalTwin(
+            self.receiving, self.clock, RulePlanner(RULES), limits={"ctd.pressure": (0.0, 100.0)}, bounds=bounds,
+            what_if=what_if,  # type: ignore[arg-type]
+        )  # fmt: skip
+        self.sent: Consumer[COMMAND] = Consumer(self.twin.execute.transmitter.event)
+        self.twin.execute.transmitter.subscribe(self.sent)
+
+    def give(self, *events: object) -> list[int]:
+        """The periods that were commanded because of these events."""
+        for event in events:
+            self.receiving.observe("plant:1", event)  # type: ignore[arg-type]
+        self.twin.step()
+        return [decode_period(command) for command in self.sent.drain()]
+
+
+def test_Plan_and_Execute_are_processes_of_the_digital_twin_that_share_its_model() -> None:
+    twin = Rig().twin
+    for process in (twin.plan, twin.execute):
+        assert isinstance(process, DTDigitalThreadProcess)
+        assert process.digital_model is twin.digital_model
+    assert type(twin.plan.consumer) is type(twin.execute.plans) is Consumer
+    assert type(twin.plan.emitter) is type(twin.execute.transmitter) is Producer
+    assert not twin.plan.consumer.queue, "empty after Init"
+    assert not twin.execute.plans.queue
+
+
+@given(periods=st.lists(PERIODS, max_size=10))
+def test_Plan_consumes_plans_and_emits_each(periods: list[int]) -> None:
+    plan = Plan(DigitalModel(), Always(*periods), Hands())
+    emitted: Consumer[COMMAND] = Consumer(plan.emitter.event)
+    plan.emitter.subscribe(emitted)
+    for _ in periods:
+        plan.consumer.observe(verdict("outside", "x", "", 0))
+    plan.plan()
+    assert [decode_period(c) for c in emitted.drain()] == periods
+    assert not plan.consumer.queue
+
+
+def test_Plan_is_rules_over_the_analysis_of_which_the_first_that_fits_decides() -> None:
+    rig = Rig()
+    assert rig.give(value(150.0)) == [1]
+    assert rig.give(value(151.0)) == [], "what is known already is no news"
+    assert rig.give(value(50.0)) == [10]
+    planner = RulePlanner((Rule("stale", "", 5),))
+    assert planner.plan(DATA(b"no verdict"), DigitalModel()) is None
+
+
+@given(x=PERIODS, before=PERIODS)
+def test_Execute_asks_the_model_first_and_emits_the_command_if_and_only_if_it_accepts(x: int, before: int) -> None:
+    """Ruling 9, and prose, row 7: no user steps in."""
+    model = DigitalModel()
+    model.process_event(encode_period(before))
+    execute = Execute(model, Hands(), bounds=Bounds(0, 3600))
+    emitted: Consumer[COMMAND] = Consumer(execute.transmitter.event)
+    execute.transmitter.subscribe(emitted)
+    execute.plans.observe(encode_period(x))
+    execute.execute()
+    sent = [decode_period(c) for c in emitted.drain()]
+    accepted = 0 <= x <= 3600
+    assert sent == ([x] if accepted else []), "the command, not the state"
+    assert model.period_s == (x if accepted else before)
+    assert model.state is delta(model.period_s)
+    refusals = [e for e in execute.collect() if e.kind == Kind.REFUSAL]
+    assert len(refusals) == (not accepted)
+
+
+@pytest.mark.parametrize(
+    ("command", "why"), [(COMMAND(b"\0"), "expected 2 bytes"), (encode_period(9999), "allowed are -1 to 3600 s")]
+)
+def test_Execute_keeps_a_refusal_with_its_reason(command: COMMAND, why: str) -> None:
+    execute = Execute(DigitalModel(), Hands(), bounds=Bounds(-1, 3600))
+    execute.plans.observe(command)
+    execute.execute()
+    (refusal,) = execute.collect()
+    assert why in str(refusal.value)
+    assert (execute.sent, execute.refused) == (0, 1)
+
+
+def test_Execute_is_bounded_in_rate() -> None:
+    clock = Hands()
+    execute = Execute(DigitalModel(), clock, bounds=Bounds(per_minute=2))
+    for n in range(3):
+        execute.plans.observe(encode_period(n))
+    execute.execute()
+    assert (execute.sent, execute.refused) == (2, 1)
+    clock.now_ms += 60_001
+    execute.plans.observe(encode_period(7))
+    execute.execute()
+    assert execute.sent == 3
+
+
+def test_Execute_asks_what_if_when_it_was_told_to() -> None:
+    rig = Rig(what_if=lambda command: "the battery would be empty" if decode_period(command) == 1 else "")
+    assert rig.give(value(150.0)) == []
+    assert rig.twin.digital_model.period_s == 0
+    assert [e.value for e in rig.twin.execute.collect()] == ["the battery would be empty"]
+    assert rig.give(value(50.0)) == [10]
+
+
+def test_DigitalTwin_is_the_shadow_plus_plan_and_execute_and_the_way_back() -> None:
+    twin = Rig().twin
+    assert isinstance(twin, DigitalShadow)
+    assert [p.name for p in twin.processes] == ["monitor", "analyze", "plan", "execute"]
+    operator = Operator("operator", Hands())
+    assert not hasattr(DigitalShadow(ReceivingEnd("x"), Hands(), limits={}), "execute"), "a shadow has no way back"
+    assert isinstance(operator, DTDigitalThreadProcess)
+
+
+def test_DigitalTwin_changes_of_the_model_reach_the_plant_and_those_of_the_plant_the_model_without_a_user() -> None:
+    """Prose, rows 5 to 7: Monitor, Analyze, Plan and Execute run one after another in one step."""
+    rig = Rig()
+    assert rig.give(status(5), value(150.0)) == [1]
+    assert rig.twin.digital_model.period_s == 1, "the model has what was commanded"
+    assert rig.give(status(1)) == []
+    assert rig.give(status(3)) == [], "somebody at the plant: the model follows"
+    assert rig.twin.digital_model.period_s == 3

@@ -1,0 +1,56 @@
+"""The digital twin: the shadow, and the way back: Plan and Execute, and a producer whose commands go to the plant.
+
+What carries the commands is a process of the thread (`twin.thread.Operator`), which takes what `execute.transmitter` emits. Whether
+the plant obeys is the plant's to say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from gateway.core.clock import Clock
+from twin.mape.analyze import Limits
+from twin.mape.execute import Bounds, Execute, WhatIf
+from twin.mape.plan import Plan, Planner
+from twin.shadow import DigitalShadow
+from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+
+
+class DigitalTwin(DigitalShadow):
+    """SPEC row DigitalTwin. `step` runs Monitor, Analyze, Plan and Execute, one after the other, on what has arrived."""
+
+    def __init__(
+        self,
+        receiving: ReceivingEnd,
+        clock: Clock,
+        planner: Planner,
+        *,
+        limits: Mapping[str, Limits],
+        bounds: Bounds,
+        stale_after_ms: int = 30_000,
+        what_if: WhatIf | None = None,
+    ) -> None:
+        super().__init__(receiving, clock, limits=limits, stale_after_ms=stale_after_ms)
+        self.plan = Plan(self.digital_model, planner, clock)
+        self.execute = Execute(self.digital_model, clock, bounds=bounds, what_if=what_if)
+        self.analyze.emitter.subscribe(self.plan.consumer)
+        self.plan.emitter.subscribe(self.execute.plans)
+
+    @property
+    def processes(self) -> tuple[DTDigitalThreadProcess, ...]:
+        return (self.monitor, self.analyze, self.plan, self.execute)
+
+    def step(self) -> int:
+        count = super().step()
+        self.plan.plan()
+        self.execute.execute()
+        return count
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            **super().describe(),
+            "planned": self.plan.planned,
+            "sent": self.execute.sent,
+            "refused": self.execute.refused,
+        }

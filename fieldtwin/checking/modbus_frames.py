@@ -14,6 +14,8 @@ from gateway.protocols.modbus.crc import crc16, with_crc
 from gateway.protocols.modbus.frame_shapes import MAX_FRAME, frame_lengths
 
 NO_TRANSACTION = -1
+_STEP = [crc16(bytes((index ^ 0xFF,))) ^ 0xFF for index in range(256)]
+"""The check sum byte by byte, taken apart again: garbage is gone through once from each of its bytes."""
 _ASCII_FRAME = re.compile(rb":([0-9A-F]{6,512})\r\n")
 
 
@@ -88,13 +90,17 @@ def _rtu_replies(data: bytes) -> tuple[list[Answer], bytes]:
 
 
 def _rtu_length(data: bytes) -> int:
-    """Of the frame that `data` begins with, 0 if it is none: the lengths that its function can have first, then any."""
+    """Of the frame that `data` begins with, 0 if it is none: a length that its function can have, else the shortest that fits."""
     least = 5 if len(data) > 1 and data[1] & 0x80 else 4  # the CRC of 01 80 is 01 80: an exception is no shorter one
-    lengths: list[int] = [*(frame_lengths(data)[0] if len(data) >= least else ()), *range(least, len(data) + 1)]
-    for length in lengths:
-        if length <= len(data) and crc16(data[: length - 2]) == int.from_bytes(data[length - 2 : length], "little"):
-            return length
-    return 0
+    if len(data) < least:
+        return 0
+    fitting, crc = set(), 0xFFFF
+    for at, byte in enumerate(data, 1):
+        crc = crc >> 8 ^ _STEP[(crc ^ byte) & 0xFF]
+        if not crc and at >= least:  # over a whole frame it is 0
+            fitting.add(at)
+    likely = [length for length in frame_lengths(data)[0] if length in fitting]
+    return likely[0] if likely else min(fitting, default=0)
 
 
 def _ascii_replies(data: bytes) -> tuple[list[Answer], bytes]:

@@ -21,7 +21,7 @@ READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x11, 0x18, 0x2B})
 WRITES = frozenset({0x05, 0x06, 0x0F, 0x10, 0x16, 0x17})
 IDENTIFICATION = b"\x2b\x0e"
 """What may be asked by function 2B; it carries CANopen's services as well, which may write."""
-MOST_HEARD = 65_536
+MOST_HEARD = 8192
 """Bytes that a device may say at once; one that says more babbles."""
 CALM_S = 0.8
 """After this silence on a line no receiver waits for the rest of a frame, however slow its timers are (libmodbus: 0.5 s)."""

@@ -98,7 +98,7 @@ def read_piece(path: Path) -> Piece:
         raise NotTaken("not for a document", path=str(path), expected=f"a dump, {known}", got=repr(kind)[:60])
     try:
         return READERS[kind](data)
-    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as e:
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError, OverflowError) as e:
         raise FileInvalid(f"not what `{kind}` writes", path=str(path), got=f"{type(e).__name__} {e}"[:80]) from e
 
 

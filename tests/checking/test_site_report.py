@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from fieldtwin.checking.device_case import DeviceResult, Spoken
 from fieldtwin.checking.html import render_html as render_check
@@ -21,6 +23,8 @@ from fieldtwin.cli.diff_command import command as diff
 from fieldtwin.cli.report_command import command
 from fieldtwin.conformance.case import failed, inconclusive, passed, skipped
 from fieldtwin.report.junit import render_junit
+from fieldtwin.sitereport.html import render_html
+from fieldtwin.sitereport.reading import read_site
 from gateway.core.connection import Direction
 from gateway.core.errors import FileInvalid, UsageError
 
@@ -223,3 +227,53 @@ def test_junit_has_each_case_with_its_bytes() -> None:
     assert xml.count("<failure") == 1
     assert "&gt; 01 03" in xml
     assert f"--only {CASES[1].id}" in xml
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=6),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=6), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@given(
+    kind=st.sampled_from(["fieldtwin check", "fieldtwin compare", "fieldtwin diff"]),
+    keys=st.dictionaries(
+        st.sampled_from(
+            [
+                "about",
+                "cases",
+                "counts",
+                "found",
+                "notes",
+                "compared",
+                "differences",
+                "latency",
+                "values",
+                "met",
+                "timing",
+            ]
+        ),
+        JSON,
+    ),
+)
+@settings(max_examples=80, deadline=None)
+def test_whatever_a_file_says_is_a_document_or_a_clear_refusal(
+    kind: str, keys: dict[str, object], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.getbasetemp() / "fuzzed.json"
+    about = {
+        "protocol": "modbus",
+        "endpoint": "tcp://h:1",
+        "address": 1,
+        "started": "",
+        "by": "",
+        "command": "",
+        "against": "x",
+    }
+    path.write_text(json.dumps({"about": about} | keys | {"kind": kind}))
+    try:
+        document, _ = read_site([path], site="x", by="x", prepared="x")
+    except FileInvalid:
+        return
+    render_html(document)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,11 @@ from fieldtwin.cli.scan_progress import ScanProgress, duration
 from fieldtwin.cli.scan_view import can_json, modbus_json, show_can, show_modbus
 from fieldtwin.cli.stop_key import StopKey
 from fieldtwin.cli.talk import talk
+from fieldtwin.commissioning.live import frame_of
 from fieldtwin.commissioning.scan_canopen import ALL_NODES, CanScan, CanScanner, CanScanOptions
 from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
+from fieldtwin.commissioning.settings import name_of, seconds_of, with_settings
+from fieldtwin.commissioning.sweep import PROBE
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from gateway.wallclock import run as run_precise
@@ -32,7 +36,7 @@ _PART = re.compile(r"^([0-9]{1,3})(?:-([0-9]{1,3}))?$")
 @click.option("--listen", "listen_only", is_flag=True, help="Only listen: send nothing.")
 @click.option("--listen-for", type=Duration(), help="How long to listen first; default 3s, on CAN 5s.")
 @click.option("--share-bus", is_flag=True, help="Ask although somebody talks on the wire: between its exchanges.")
-@click.option("--timeout", "timeout_s", type=Duration(), help="For each reply; default 200ms, TCP 1s, CAN 100ms.")
+@click.option("--timeout", "timeout_s", type=Duration(), help="For each reply; default 600ms, TCP 1s, CAN 100ms.")
 @click.option(
     "--rate", "per_s", type=click.FloatRange(0.1, 1000), help="Questions a second, at most; default 20, CAN 10."
 )
@@ -41,20 +45,25 @@ _PART = re.compile(r"^([0-9]{1,3})(?:-([0-9]{1,3}))?$")
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s that the bus should have.")
 @click.option("--no-lss", is_flag=True, help="CAN: do not look for nodes without a node id.")
 @click.option("--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here.")
+@click.option("--dry-run", is_flag=True, help="Print what would be asked, with its time, and open nothing.")
 @json_option
-def command(endpoint: str, log: Path | None, as_json: bool, **options: Any) -> int:
+def command(endpoint: str, log: Path | None, dry_run: bool, as_json: bool, **options: Any) -> int:
     """Find the units or nodes at ENDPOINT: listen first, then ask, paced.
 
     \b
-    fieldtwin scan rtu:/dev/ttyUSB0                            settings unknown: likely ones, then all
-    fieldtwin scan 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1'  every unit at these settings
-    fieldtwin scan tcp://192.168.0.7                           every unit id behind a host
-    fieldtwin scan can:socketcan/can0                          heartbeats, then 1000h of each, then LSS
+    fieldtwin scan rtu:/dev/ttyUSB0                      likely settings, then all
+    fieldtwin scan 'rtu:COM5?baudrate=9600&frame=8N1'    every unit at these
+    fieldtwin scan tcp://192.168.0.7                     every unit id of a host
+    fieldtwin scan can:socketcan/can0                    heartbeats, 1000h, LSS
 
     q or Ctrl-C stops and keeps what was found. Exit code 1: nobody was found.
     """
     can = Endpoint.parse(endpoint).is_can
     _refuse_foreign(can, options)
+    if dry_run:
+        for line in _plan_of_can(options) if can else _plan_of_modbus(endpoint, options):
+            click.echo(line)
+        return 0
     return _can(endpoint, log, as_json, options) if can else _modbus(endpoint, log, as_json, options)
 
 
@@ -85,8 +94,49 @@ def _end(found: bool, stopped: bool, took_s: float) -> int:
     return 0 if found else 1
 
 
+def _plan_of_modbus(endpoint: str, options: dict[str, Any]) -> Iterator[str]:
+    """Phases, settings, frames: for `--dry-run`."""
+    made = _modbus_options(options)
+    if Endpoint.parse(endpoint).is_serial:
+        yield f"listen for {duration(made.listen_s)}; with traffic heard nothing is sent" + (
+            ", but between its exchanges" if made.share_bus else " without --share-bus"
+        )
+    for phase, steps in ModbusScanner(endpoint, made).planned() if not made.listen_only else ():
+        yield f"{phase}: up to {duration(seconds_of(steps))}"
+        for step in steps:
+            url = str(with_settings(Endpoint.parse(endpoint), step.settings)) if step.settings else endpoint
+            first, last = (frame_of(url, step.units[i], PROBE).hex(" ") for i in (0, -1)) if step.units else ("", "")
+            where = f"{name_of(step.settings)}, " if step.settings else ""
+            yield f"  {where}{len(step.units)} units: {first} ... {last}"
+
+
+def _plan_of_can(options: dict[str, Any]) -> Iterator[str]:
+    made = _can_options(options)
+    yield f"listen for {duration(made.listen_s)}; with traffic heard nothing is sent" + (
+        "" if made.share_bus else " without --share-bus"
+    )
+    if not made.listen_only:
+        each_s = max(made.timeout_s + 0.01, 1 / made.per_s)
+        yield f"1000h of {len(made.nodes)} nodes: up to {duration(len(made.nodes) * each_s)}"
+        yield f"  {0x600 + made.nodes[0]:03X}#4000100000000000 ... {0x600 + made.nodes[-1]:03X}#4000100000000000"
+        if made.lss:
+            yield "nodes without an id: 7E5#4C00000000000000, then LSS fastscan, 14 s for each that is there"
+
+
 async def _scan_modbus(endpoint: str, log: Path | None, options: dict[str, Any]) -> ModbusScan:
-    made = ScanOptions(
+    made = _modbus_options(options)
+    with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
+        return await ModbusScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
+
+
+async def _scan_can(endpoint: str, log: Path | None, options: dict[str, Any]) -> CanScan:
+    made = _can_options(options)
+    with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
+        return await CanScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
+
+
+def _modbus_options(options: dict[str, Any]) -> ScanOptions:
+    return ScanOptions(
         units=numbers(options["units"], 0, 255, "--units"),
         timeout_s=options["timeout_s"],
         per_s=options["per_s"] or 20.0,
@@ -96,12 +146,10 @@ async def _scan_modbus(endpoint: str, log: Path | None, options: dict[str, Any])
         every_setting=options["every_setting"],
         share_bus=options["share_bus"],
     )
-    with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
-        return await ModbusScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
 
 
-async def _scan_can(endpoint: str, log: Path | None, options: dict[str, Any]) -> CanScan:
-    made = CanScanOptions(
+def _can_options(options: dict[str, Any]) -> CanScanOptions:
+    return CanScanOptions(
         bitrate=options["bitrate"] or 0,
         nodes=numbers(options["nodes"], 1, 127, "--nodes") or ALL_NODES,
         listen_s=5.0 if options["listen_for"] is None else options["listen_for"],
@@ -111,8 +159,6 @@ async def _scan_can(endpoint: str, log: Path | None, options: dict[str, Any]) ->
         listen_only=options["listen_only"],
         share_bus=options["share_bus"],
     )
-    with logged(log) as taps, StopKey() as stop, ScanProgress(stop.listens) as show:
-        return await CanScanner(endpoint, made, on_progress=show, stop=stop.pressed, taps=taps).run()
 
 
 def numbers(text: str | None, low: int, high: int, name: str) -> tuple[int, ...] | None:

@@ -133,6 +133,22 @@ class ModbusScanner:
                 f"{len(failures)} units answer with exception 04h only: some servers say so of units that they do not have"
             )
 
+    def planned(self) -> list[tuple[str, list[Step]]]:
+        """What `run` would ask after listening, phase by phase, where nobody answers."""
+        if not self._endpoint.is_serial:
+            first = spread_over(self._units)
+            rest = [u for u in self._units if u not in first]
+            return [("some units", [self._pace.step(None, first)]), ("every unit", [self._pace.step(None, rest)])]
+        said = plan.settings_said(self._endpoint)
+        if said is not None:
+            return [("every unit", [self._pace.step(said, self._units)])]
+        likely = plan.likely_settings(self._endpoint)
+        phases = [("likely settings", plan.quick_pass(self._quick, likely, self._units, self._options.quick_s))]
+        if not self._options.quick_only:
+            every = plan.all_settings(self._endpoint)
+            phases.append(("every setting", plan.full_pass(self._pace, every, self._units)))
+        return phases
+
     # -- a serial line --------------------------------------------------------------------------------------------
 
     async def _scan_line(self) -> None:
@@ -153,10 +169,7 @@ class ModbusScanner:
 
     async def _search(self) -> None:
         """Settings unknown, line silent: the likely ones first."""
-        ascii_mode = self._pace.ascii
-        steps = plan.quick_pass(
-            self._quick, plan.likely_settings(ascii_mode=ascii_mode), self._units, self._options.quick_s
-        )
+        steps = plan.quick_pass(self._quick, plan.likely_settings(self._endpoint), self._units, self._options.quick_s)
         done = await self._steps(steps, "likely settings", until_found=not self._options.every_setting)
         if self._quick != self._pace:
             done = []  # asked too quickly for some: they are asked again
@@ -170,14 +183,14 @@ class ModbusScanner:
         await self._search_all(done)
 
     async def _search_all(self, done: list[Step]) -> None:
-        every = plan.all_settings(ascii_mode=self._pace.ascii)
+        every = plan.all_settings(self._endpoint)
         steps = plan.full_pass(self._pace, every, self._units, done)
         await self._steps(steps, "every setting", until_found=not self._options.every_setting)
 
     async def _listen(self, said: SerialSettings | None) -> bool:
         """Listen; True where questions may follow."""
         options, result = self._options, self.result
-        likely = plan.likely_settings(ascii_mode=self._pace.ascii)
+        likely = plan.likely_settings(self._endpoint)
         first = said or likely[0]
         audition = await self._audition(first, options.listen_s, whole=True)
         result.auditions.append(audition)

@@ -33,8 +33,9 @@ OPENING_S = 0.02
 
 
 def settings_said(endpoint: Endpoint) -> SerialSettings | None:
-    """The settings that the endpoint itself says, None where it leaves them open."""
-    return endpoint.serial if endpoint.is_serial and endpoint.param("baudrate") else None
+    """The settings that the endpoint itself says, None where it leaves baud rate or frame open."""
+    said = {name for name, _ in endpoint.params}
+    return endpoint.serial if endpoint.is_serial and {"baudrate", "frame"} <= said else None
 
 
 def with_settings(endpoint: Endpoint, settings: SerialSettings) -> Endpoint:
@@ -121,15 +122,28 @@ def full_pass(
     return steps
 
 
-def all_settings(*, ascii_mode: bool, frames: Sequence[str] = ()) -> list[SerialSettings]:
-    """Baud rate x parity x stop bits, likely ones first."""
-    frames = frames or (ASCII_FRAMES if ascii_mode else FRAMES)
+def all_settings(endpoint: Endpoint) -> list[SerialSettings]:
+    """Baud rate x parity x stop bits that `endpoint` leaves open, likely ones first."""
+    ascii_mode = endpoint.scheme == "ascii"
+    frames = ASCII_FRAMES if ascii_mode else FRAMES
     every = [SerialSettings(baudrate, frame) for frame in frames for baudrate in BAUDRATES]
-    return every if ascii_mode else list(dict.fromkeys([*LIKELY, *every]))
+    return _open(endpoint, every if ascii_mode else [*LIKELY, *every])
 
 
-def likely_settings(*, ascii_mode: bool) -> list[SerialSettings]:
-    """What a quick pass tries."""
-    if not ascii_mode:
-        return list(LIKELY)
-    return [SerialSettings(b, f) for f in ("7E1", "8N1") for b in (9600, 19200, 38400, 115200, 4800)]
+def likely_settings(endpoint: Endpoint) -> list[SerialSettings]:
+    """What a quick pass tries of what `endpoint` leaves open."""
+    if endpoint.scheme != "ascii":
+        return _open(endpoint, LIKELY)
+    return _open(endpoint, [SerialSettings(b, f) for f in ("7E1", "8N1") for b in (9600, 19200, 38400, 115200, 4800)])
+
+
+def _open(endpoint: Endpoint, settings: Sequence[SerialSettings]) -> list[SerialSettings]:
+    """`settings` with what the endpoint says put in, each once."""
+    said = dict(endpoint.params)
+    baudrate, frame = endpoint.serial.baudrate, endpoint.serial.frame
+    return list(
+        dict.fromkeys(
+            SerialSettings(baudrate if "baudrate" in said else s.baudrate, frame if "frame" in said else s.frame)
+            for s in settings
+        )
+    )

@@ -224,3 +224,14 @@ def test_the_quick_pass_takes_30_s_and_tries_likely_settings_with_likely_units()
         assert any("--quick" in note for note in found.notes)
 
     run_virtually(main())
+
+
+@pytest.mark.parametrize("said", ["baudrate=14400", "frame=8E1"])
+def test_what_is_said_of_the_settings_is_kept_and_the_rest_is_tried(said: str) -> None:
+    async def main() -> None:
+        line = UartLine({2: meter()}, SerialSettings(14400 if "14400" in said else 4800, "8E1"))
+        found = await scan(line, f"{PORT}?{said}", listen_s=0)
+        assert [(f.answer.unit, f.settings) for f in found.units] == [(2, line.settings)]
+        assert all(str(s.baudrate) in said or s.frame in said for s in line.opened)
+
+    run_virtually(main())

@@ -71,9 +71,9 @@ def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
             assert [(u["unit"], u["settings"][:5]) for u in found["units"]] == [(5, "19200")]
             sent = [json.loads(line) for line in log.read_text().splitlines() if '"sent"' in line]
             assert {bytes.fromhex(line["hex"])[0] for line in sent} <= {4, 5, 6}
-            code, report, talk = await fieldtwin("line", f"{url}?baudrate=19200", "--listen", "0.2", "--probe", "5")
+            code, report, talk = await fieldtwin("line", f"{url}?baudrate=19200&frame=8N1", "--listen", "0.2", "--probe", "5")
             assert (code, report["probe"]["answer"]) == (0, "good"), talk
-            code, told, talk = await fieldtwin("identify", f"{url}?baudrate=19200", "--unit", "6", "--timeout", "50ms")
+            code, told, talk = await fieldtwin("identify", f"{url}?baudrate=19200&frame=8N1", "--unit", "6", "--timeout", "50ms")
             assert (code, told["answers"]) == (4, False), talk
         await end.aclose()
 

@@ -7,19 +7,30 @@ from pathlib import Path
 
 from fieldtwin.report.model import Verdict
 from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import WORDS, load_scenario
+from fieldtwin.scenarios.form import WORDS, ScenarioForm, load_scenario
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scenarios.md").read_text()
 
+BLOCKS = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+
+
+def test_the_probe_is_one(tmp_path: Path) -> None:
+    assert len(BLOCKS) == 2
+    path = tmp_path / "x.scenario.yaml"
+    path.write_text(f"scenario: x\nsystem: observatory\n{BLOCKS[1]}steps: [{{expect: {{that: 'crane.height > 0'}}}}]\n")
+    assert load_scenario(path).probes[0].names == ["crane.height", "crane.moving"]
+
 
 def test_the_example_passes(tmp_path: Path) -> None:
-    (text,) = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
+    text = BLOCKS[0]
     path = tmp_path / "x.scenario.yaml"
     path.write_text(text)
     result = run_virtual(load_scenario(path))
     assert result.verdict is Verdict.PASSED, result.checks[-1]
 
 
-def test_every_step_is_on_the_page() -> None:
+def test_every_key_and_step_is_on_the_page() -> None:
+    for name, key in ScenarioForm.model_fields.items():
+        assert f"`{key.alias or name}" in PAGE, name
     for word in WORDS:
         assert f"`{word}: " in PAGE, word

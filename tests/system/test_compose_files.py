@@ -66,6 +66,9 @@ def test_a_service_s_command_line_and_variables_are_known_to_the_program(service
     assert command is not None
     context = command.make_context(name, list(args))  # raises for an unknown option or a file that is not there
     variables = {f"FIELDTWIN_{name.upper()}_{(p.name or '').upper()}" for p in context.command.params}
+    judging = cli.get_command(click.Context(cli), "test")  # runs in a service's container, beside it
+    assert judging is not None
+    variables |= {f"FIELDTWIN_TEST_{(p.name or '').upper()}" for p in judging.params}
     assert set(SERVICES[service]["environment"]) <= variables
     token = SERVICES[service]["environment"][f"FIELDTWIN_{name.upper()}_TOKEN"]
     assert token == "${FIELDTWIN_TOKEN:-for-demonstration-only}"

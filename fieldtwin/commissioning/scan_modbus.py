@@ -190,8 +190,8 @@ class ModbusScanner:
     async def _listen(self, said: SerialSettings | None) -> bool:
         """Listen; True where questions may follow."""
         options, result = self._options, self.result
-        likely = plan.likely_settings(self._endpoint)
-        first = said or likely[0]
+        likely = [*plan.likely_settings(self._endpoint), *plan.likely_settings(replace(self._endpoint, params=()))]
+        first = said or likely[0]  # what was said may be wrong: traffic tells
         audition = await self._audition(first, options.listen_s, whole=True)
         result.auditions.append(audition)
         result.heard = audition.heard

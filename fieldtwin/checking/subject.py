@@ -45,5 +45,5 @@ def who() -> str:
     """The name under which somebody is logged in here, empty where there is none."""
     try:
         return getpass.getuser()
-    except (KeyError, OSError):
+    except (KeyError, OSError, ImportError):
         return ""

@@ -178,18 +178,29 @@ def _float_cost(numbers: Sequence[float], kind: str) -> float:
 
 
 def _real_steps_cost(numbers: Sequence[float], bits: int) -> float:
-    """Steps as real numbers, for what crosses zero: each costs the digits that it shows beyond its scale."""
-    steps = [abs(b - a) for a, b in pairwise(numbers)]
+    """Steps as real numbers, for what crosses zero or a power of two, and for what goes evenly: each costs the digits that it
+    shows beyond its scale."""
+    steps = [b - a for a, b in pairwise(numbers)]
     if not steps or not any(steps):
         return _LEAST_STEP_COST * len(steps)
-    scale = max(median(steps), sum(steps) / len(steps) / 4)
+    fine = [2.0 ** (math.frexp(v)[1] - 1 - bits) if v != 0 else 0.0 for v in numbers[1:]]
+    usual = median(steps)
+    wandering = _real_walk([abs(s) for s in steps], fine)
+    finest = max(fine)
+    if not usual or not finest:
+        return wandering
+    return min(wandering, _real_walk([abs(s - usual) for s in steps], fine) + math.log(abs(usual) / finest + 1) + 1.0)
+
+
+def _real_walk(distances: Sequence[float], fine: Sequence[float]) -> float:
+    """Cauchy distributed, told to the resolution of each value; 0.0 is told by itself."""
+    scale = max(median(distances), sum(distances) / len(distances) / 4, 0.3 * max(fine), 1e-300)
     total = 3.0
-    for step, value in zip(steps, numbers[1:], strict=True):
-        if value == 0.0:
+    for distance, resolution in zip(distances, fine, strict=True):
+        if not resolution:
             total += 3.0
-            continue
-        resolution = 2.0 ** (math.frexp(value)[1] - 1 - bits)
-        total += max(_LEAST_STEP_COST, math.log(math.pi * scale * (1 + (step / scale) ** 2) / resolution))
+        else:
+            total += max(_LEAST_STEP_COST, math.log(math.pi * scale * (1 + (distance / scale) ** 2) / resolution))
     return total
 
 

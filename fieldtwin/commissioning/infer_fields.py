@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import pairwise
+from statistics import median
 
 from fieldtwin.commissioning.infer_costs import (
     IMPOSSIBLE,
@@ -279,7 +280,17 @@ def _cap(tile: _Tile, words: Sequence[Sequence[int]], values: Sequence[float | s
     beside = [words[i] for i in (tile.start - 1, tile.end) if 0 <= i < len(words)]
     if tile.size == 1 and any(len(set(w)) == 1 for w in beside):
         return "a register beside it never moved and may be its upper half"
+    if tile.size == 1 and any(len(set(w)) > 1 for w in beside) and (monotone or _is_regular(steps)):
+        return "it goes evenly, as half of a float that does, and a register beside it moves too"
     return ""
+
+
+def _is_regular(steps: Sequence[float]) -> bool:
+    """Whether most steps of a register are one and the same, more or less, around the end of its range too. Where a float passes
+    a power of two its steps change once."""
+    usual = median(steps)
+    off = [abs((s - usual + 0x8000) % 0x10000 - 0x8000) for s in steps]
+    return usual != 0 and sum(o <= max(2.0, 0.1 * abs(usual)) for o in off) >= 0.6 * len(off)
 
 
 def text_of(words: Sequence[int], order: str) -> str:

@@ -5,6 +5,7 @@ The test packs its values with a codec of its own: words of `struct`, put in ord
 
 from __future__ import annotations
 
+import math
 import random
 import struct
 from collections import Counter
@@ -147,6 +148,32 @@ def test_a_word_that_makes_sense_with_both_neighbours_is_doubtful() -> None:
     found = infer_run(run_of("input", 0, rows))
     assert all(reading.level is not Level.CERTAIN for reading in found)
     assert any(rival[0] == "float32" for reading in found for rival in reading.rivals)
+
+
+@pytest.mark.parametrize("order", ["ABCD", "CDAB", "BADC", "DCBA"])
+@pytest.mark.parametrize("passes", [7, 20])
+def test_smooth_waves_and_ramps_deceive_nobody(order: str, passes: int) -> None:
+    r = random.Random(passes)
+    for _ in range(4):
+        fields: list[Hidden] = []
+
+        def put(kind: str, values: list[float], into: list[Hidden] = fields) -> None:
+            address = sum(len(f.rows[0]) for f in into)
+            into.append(Hidden(address, kind, order, [words(kind, order, v) for v in values]))
+
+        for kind, centre, swing in (
+            ("float32", 1000, 0.3),
+            ("float32", 20, 0.05),
+            ("int16", 500, 0.2),
+            ("int32", 1e6, 0.4),
+        ):
+            phase, period = r.uniform(0, 6), r.uniform(5, 40)
+            wave = [centre * (1 + swing * math.sin(i * 6.28 / period + phase)) for i in range(passes)]
+            put(kind, wave)
+        for kind, start, step in (("float32", r.uniform(1, 100), 0.37), ("uint32", 70000, 37), ("uint16", 5, 3)):
+            put(kind, [start + i * step for i in range(passes)])
+        for reading in infer(series_of_fields(fields)).readings:
+            assert any(f.is_read_by(reading) for f in fields) or reading.level is not Level.CERTAIN, reading
 
 
 def one(kind: str, values: list[float], *, times_s: list[float] | None = None) -> Reading:

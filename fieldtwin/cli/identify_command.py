@@ -17,7 +17,7 @@ from fieldtwin.cli.device_options import logged
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.commissioning.identify_canopen import CanIdentity, identify_canopen
-from fieldtwin.commissioning.identify_modbus import NAMES, ModbusIdentity, identify_modbus
+from fieldtwin.commissioning.identify_modbus import NAMES, ModbusIdentity, identify_modbus, modbus_frames
 from fieldtwin.commissioning.matching import Candidate, Sureness
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
@@ -42,6 +42,7 @@ UNREACHABLE = 4
 @click.option("--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="For each reply.")
 @click.option("--rate", "per_s", type=click.FloatRange(0.1, 1000), default=20.0, help="Requests a second, at most.")
 @click.option("--echo", is_flag=True, help="Serial: what we send comes back first.")
+@click.option("--dry-run", is_flag=True, help="Print the first frames that would be sent, and open nothing.")
 @click.option("--all", "show_all", is_flag=True, help="Show the profiles that were ruled out, and why, as well.")
 @click.option("--log", type=click.Path(dir_okay=False, path_type=Path), help="Keep all that is sent and received here.")
 @profiles_option
@@ -54,6 +55,7 @@ def command(
     timeout_s: float,
     per_s: float,
     echo: bool,
+    dry_run: bool,
     show_all: bool,
     log: Path | None,
     profiles: tuple[str, ...],
@@ -67,6 +69,10 @@ def command(
     can = Endpoint.parse(endpoint).is_can
     if (unit if can else node) is not None:
         raise UsageError("a CANopen device has --node, a Modbus device --unit")
+    if dry_run:
+        for line in _first_frames(endpoint, node or 1) if can else modbus_frames(endpoint, 1 if unit is None else unit):
+            click.echo(line)
+        return 0
     known = known_profiles([Path(p) for p in profiles])
     with logged(log) as taps, _progress() as show:
         if can:
@@ -102,6 +108,15 @@ def command(
     if not result.answers:
         return UNREACHABLE
     return 0 if any(c.sureness is not Sureness.RULED_OUT for c in result.candidates) else 1
+
+
+def _first_frames(endpoint: str, node: int) -> Iterator[str]:
+    for index, sub in (
+        (0x1000, 0),
+        *((0x1018, sub) for sub in range(5)),
+        *((index, 0) for index in (0x1008, 0x1009, 0x100A)),
+    ):
+        yield f"{0x600 + node:03X}#40{index.to_bytes(2, 'little').hex().upper()}{sub:02X}00000000"
 
 
 def known_profiles(folders: list[Path]) -> list[DeviceProfile]:

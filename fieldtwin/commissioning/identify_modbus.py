@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from fieldtwin.commissioning import sunspec
-from fieldtwin.commissioning.live import modbus_at
+from fieldtwin.commissioning.live import frame_of, modbus_at
 from fieldtwin.commissioning.matching import (
     Candidate,
     ModbusClues,
@@ -31,7 +31,7 @@ from gateway.core.errors import (
 from gateway.core.profile import DeviceProfile, Tag
 from gateway.core.values import Reason
 from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.identity import ReportServerId
+from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
 from gateway.protocols.modbus.replies import Reply
 from gateway.protocols.modbus.request import Request
 from gateway.protocols.modbus.requests import ReadRegisters
@@ -57,7 +57,7 @@ class ModbusIdentity:
     @property
     def summary(self) -> str:
         if not self.answers:
-            return f"unit {self.unit} does not answer"
+            return f"unit {self.unit} does not answer (`scan` finds units and settings)"
         return summary(self.candidates)
 
     @property
@@ -107,6 +107,13 @@ async def identify_modbus(
         result.requests = client.counters.requests
     result.candidates = rank(result.candidates)
     return result
+
+
+def modbus_frames(url: str, unit: int) -> list[str]:
+    """What is sent before any profile's registers are read, for `--dry-run`."""
+    headers = [ReadRegisters("holding", base, 2) for base in sunspec.BASES]
+    questions = [ReportServerId(), *headers, *(ReadDeviceIdentification(code) for code in (1, 2, 3))]
+    return [frame_of(url, unit, question).hex(" ") for question in questions]
 
 
 class _Asker:

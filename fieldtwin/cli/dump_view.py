@@ -166,5 +166,5 @@ def _bars(buckets: list[tuple[int | None, int]], width: int = 35) -> str:
 
 def _fifth(bound: int) -> float:
     """Where in its decade a bound stands, 0 to 4."""
-    lead = bound / 10 ** (len(str(bound)) - 1)
-    return min(4, sum(lead >= step for step in (1.5, 2.4, 3.9, 6.2)))
+    lead = bound / 10.0 ** (len(str(bound)) - 1)
+    return min(4.0, float(sum(lead >= step for step in (1.5, 2.4, 3.9, 6.2))))

@@ -160,7 +160,7 @@ def diff_dictionary(dump: Dump, dictionary: ObjectDictionary) -> Differences:
             out.found.append(Difference("constant", entry.name, at, str(value), str(entry.default)))
     unknown = [c for c in last.cells if c not in dictionary.entries]
     if unknown:
-        first = ", ".join(f"{i:04X}h:{s:02X}" for i, s in sorted(unknown)[:8])  # type: ignore[str-format]
+        first = ", ".join(f"{i:04X}h:{s:02X}" for i, s in sorted(unknown)[:8])
         out.notes.append(f"{len(unknown)} objects that the EDS does not know: {first}")
     return out
 

@@ -92,12 +92,12 @@ def _tags(
     if dictionary is not None:
         entry = dictionary.find(item)
         return [tag_of_entry(entry)]
-    known = list(profile.tags) if profile is not None else []
-    near = difflib.get_close_matches(item, known, n=1)
+    names = list(profile.tags) if profile is not None else []
+    near = difflib.get_close_matches(item, names, n=1)
     raw = "holding:100 or 40101" if protocol == "modbus" else "6041h:00"
     raise UsageError(
         f"nothing is called {item!r}",
-        expected=f"{'a tag of the profile, or ' if known else ''}an address such as {raw}",
+        expected=f"{'a tag of the profile, or ' if names else ''}an address such as {raw}",
         hint=f"did you mean {near[0]!r}?" if near else "",
     )
 

@@ -108,7 +108,8 @@ def _tag(reading: Reading) -> list[str]:
 
 def _bits(series: Series) -> tuple[list[str], int]:
     """Bits that moved or were set, as many as are worth naming; and how many were not."""
-    lines, left = [], 0
+    lines: list[str] = []
+    left = 0
     for table in BIT_TABLES:
         for address, bits in series.cells.get(table, {}).items():
             if not any(bits) or len(lines) >= MOST_BITS:

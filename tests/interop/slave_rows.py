@@ -143,7 +143,8 @@ class Play:
                 return f"{self.said(found)} instead of {shown(self.row, wanted)}"
         await asyncio.sleep(SILENCE_S)
         if self.wire.heard:
-            return f"sends {shown(self.row, self.wire.heard)} unasked"  # the same words as above: it is a matter of load which one sees it
+            # The same words as above: it is a matter of load which of the two sees it.
+            return f"sends {shown(self.row, self.wire.heard)} unasked"
         return await self.afterwards() or await self.cells()
 
     def said(self, data: bytes) -> str:

@@ -26,6 +26,7 @@ COMMANDS = {
         "fieldtwin.cli.shadow_command",
         "A digital shadow: watch a plant from elsewhere, and compare it with its model.",
     ),
+    "twin": ("fieldtwin.cli.twin_command", "A digital twin: a shadow with a way back, that plans and commands."),
     "link": ("fieldtwin.cli.link_command", "The emulated connection on its own: a serial port carried over TCP."),
     "bridge": ("fieldtwin.cli.bridge_command", "Modbus TCP clients to units on a serial line, or the other way round."),
     "can-bus": ("fieldtwin.cli.can_bus_command", "A software CAN bus on a TCP port."),
@@ -60,6 +61,16 @@ COMMANDS = {
     "schema": ("fieldtwin.cli.schema_command", "Print the JSON schema of a kind of file."),
     "doctor": ("fieldtwin.cli.doctor_command", "Check what this computer can do, and say what to change."),
 }
+SECTIONS = {
+    "Run a system, or parts of it": ("run", "emulate", "with", "plc", "shore", "link", "bridge", "can-bus"),
+    "Meet a device": (
+        *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer"),
+        *("record", "import", "export", "compare", "check", "report"),
+    ),
+    "Test": ("test", "faults", "trace"),
+    "Twins": ("template", "shadow", "twin", "what-if"),
+}
+"""How the commands are shown; what stands in none comes last."""
 INTERRUPTED = 130
 BUG = 70
 
@@ -88,8 +99,12 @@ class LazyGroup(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+        shown = {name for names in SECTIONS.values() for name in names}
+        sections = {**SECTIONS, "Besides": tuple(name for name in COMMANDS if name not in shown)}
+        widest = max(map(len, COMMANDS))
+        for title, names in sections.items():
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(widest), COMMANDS[name][1]) for name in names if name in COMMANDS])
 
 
 @click.command(

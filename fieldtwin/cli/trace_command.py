@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.regression_options import tolerance_options
 from fieldtwin.cli.talk import talk
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Decoded, Exchange
@@ -27,6 +28,19 @@ NS_PER_S = 1_000_000_000
 @click.option("--from", "start_s", type=Duration(), default="0s", help="Leave out what was before.")
 @click.option("--to", "end_s", type=Duration(), help="Leave out what was later.")
 @click.option("--problems", is_flag=True, help="Only requests without a good answer.")
+@click.option(
+    "--against",
+    type=click.Path(path_type=Path),
+    help="An older run: what is otherwise, or slower? Exit code 1 if anything.",
+)
+@click.option("--as-scenario", type=click.Path(path_type=Path), help="Make a scenario of the run, with tolerances.")
+@click.option("--seed", type=int, help="With --as-scenario: the seed that the run had.")
+@click.option(
+    "--set-values",
+    is_flag=True,
+    help="With --as-scenario: set what devices said, for another prototype than the run's.",
+)
+@tolerance_options
 @click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead.")
 @json_option
 def command(
@@ -38,15 +52,40 @@ def command(
     end_s: float | None,
     problems: bool,
     vcd: Path | None,
+    against: Path | None,
+    as_scenario: Path | None,
+    seed: int | None,
+    set_values: bool,
+    tolerances: tuple[str, ...],
+    window_s: float,
+    ignored: tuple[str, ...],
     as_json: bool,
 ) -> int:
     """Show FILE, a trace (run --virtual --trace) or a capture (run --capture) of SYSTEM, frames decoded.
 
     With --json, each request with its answer, and each message, is a line.
+
+    
+    fieldtwin trace new.jsonl observatory --against old.jsonl --tolerance 1%
+    fieldtwin trace run.jsonl observatory --as-scenario run.scenario.yaml
+
+    Another run is compared by what it means: states and their order, values, qualities, latencies; never byte by byte.
     """
     from twin.system import load_system
 
     plant = load_system(system, [Path(p) for p in profiles])
+    if against is not None or as_scenario is not None:
+        from fieldtwin.cli import regression_view
+
+        if vcd is not None or only or problems or (against is not None and as_scenario is not None):
+            raise UsageError("--against and --as-scenario take the whole run, and nothing beside it")
+        allowed = regression_view.allowed_of(tolerances, window_s, ignored)
+        if against is not None:
+            return regression_view.show(regression_view.judged(plant, against, file, allowed), against, as_json=as_json)
+        assert as_scenario is not None
+        return regression_view.write_scenario(
+            plant, file, as_scenario, system, allowed=allowed, seed=seed, values=set_values
+        )
     events = read_events(file, plant)
     start_ns, end_ns = round(start_s * NS_PER_S), None if end_s is None else round(end_s * NS_PER_S)
     if vcd is not None:

@@ -1,0 +1,33 @@
+"""What may differ between two runs: options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+from fieldtwin.cli.options import Duration
+
+_OPTIONS = (
+    click.option(
+        "--tolerance",
+        "tolerances",
+        multiple=True,
+        metavar="[TAG=]AMOUNT",
+        help="What values may differ by: 2% of their size, or DEVICE.TAG=0.5. Repeatable; default: 1%.",
+    ),
+    click.option(
+        "--window", "window_s", type=Duration(), default="1s", show_default=True, help="What times may differ by."
+    ),
+    click.option(
+        "--ignore", "ignored", multiple=True, metavar="NAME", help="A tag, device, state or program. Repeatable."
+    ),
+)
+
+
+def tolerance_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """``tolerances``, ``window_s`` and ``ignored``."""
+    for option in reversed(_OPTIONS):
+        command = option(command)
+    return command

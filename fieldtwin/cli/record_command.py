@@ -70,6 +70,12 @@ REFRESH_S = 0.5
 )
 @click.option("--part-time", "part_s", type=Duration(), default=None, help="Begin a new part after so long, e.g. 1h.")
 @click.option("--keep", type=click.IntRange(1), default=None, help="Keep so many parts; the oldest are removed.")
+@click.option(
+    "--as-scenario",
+    default="",
+    metavar="SYSTEM",
+    help="ENDPOINT is a run of SYSTEM (--trace, --capture): make a scenario of it, with tolerances.",
+)
 @click.option("--emulated", is_flag=True, help="Say in the recording that the device is an emulator.")
 @device_options
 @json_option
@@ -79,6 +85,7 @@ def command(
     taps: tuple[str, str] | None,
     like: Path | None,
     for_s: float | None,
+    as_scenario: str,
     as_json: bool,
     **options: Any,
 ) -> int:
@@ -91,9 +98,12 @@ def command(
     fieldtwin record --tap tcp://127.0.0.1:1502 tcp://192.168.0.7:502 -o line.jsonl
     fieldtwin record can:socketcan/can0 -o bus.log                       listens only
     fieldtwin record can:socketcan/can0 --profile drive-cia402 --node 5 -o drive.log
+    fieldtwin record run.jsonl --as-scenario observatory -o run.scenario.yaml
 
     Play it with `fieldtwin emulate`, hold a device against it with `fieldtwin compare`.
     """
+    if as_scenario:
+        return _scenario_of(endpoint, as_scenario, out)
     job = _Job(out, for_s, as_json, options)
     if taps is not None:
         if endpoint or like or options["profile_name"]:
@@ -125,6 +135,17 @@ def command(
             f"{target.profile.name} measures when it is told to, and is not told: nothing is written", soft_wrap=True
         )
     return job.polls(target, ProfileRound(target.profile, target.address, options["groups"]), target.profile.name)
+
+
+def _scenario_of(run: str | None, system: str, out: Path) -> int:
+    """A recorded run as a scenario, with the tolerances that `fieldtwin trace --as-scenario` has by itself."""
+    from fieldtwin.cli.regression_view import write_scenario
+    from fieldtwin.regression.comparing import Allowed
+    from twin.system import load_system
+
+    if run is None:
+        raise UsageError("which run?", expected="the file of run --virtual --trace, or of run --capture")
+    return write_scenario(load_system(system), Path(run), out, system, allowed=Allowed(), seed=None, values=False)
 
 
 def _end(text: str) -> Endpoint:

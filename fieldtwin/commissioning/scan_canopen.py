@@ -223,12 +223,21 @@ class CanScanner:
             lss_s = FASTSCAN_S if options.lss else 0.0
             total_s = len(options.nodes) * each_s + lss_s
             for i, node in enumerate(options.nodes):
-                if self._stop():
+                if self._stop() or self._met_master():
                     return
                 self._tell(Progress("asking nodes", i * each_s, total_s, f"node {node}", len(self.result.nodes)))
                 await self._ask_node(master, node, each_s)
-            if options.lss:
+            if options.lss and not self._met_master():
                 await self._look_for_unconfigured(master, len(options.nodes) * each_s, total_s)
+
+    def _met_master(self) -> bool:
+        """Whether another master began to talk, which was silent while we listened."""
+        if self._options.share_bus or not self._ear.heard.has_master:
+            return False
+        note = "another master began to talk: stopped asking. --share-bus goes on, one node at a time"
+        if note not in self.result.notes:
+            self.result.notes.append(note)
+        return True
 
     async def _ask_node(self, master: CanopenMaster, node: int, each_s: float) -> None:
         clock, result = self._clock, self.result

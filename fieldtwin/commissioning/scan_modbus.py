@@ -109,6 +109,7 @@ class ModbusScanner:
         self._units = self._options.units or (plan.SERIAL_UNITS if serial else plan.TCP_UNITS)
         if serial and not all(1 <= u <= 247 for u in self._units):
             raise UsageError("units of a serial line", expected="1 to 247", got=str(self._units))
+        self._met_master = False
         self.result = ModbusScan(url)
 
     async def run(self) -> ModbusScan:
@@ -132,6 +133,11 @@ class ModbusScanner:
             self.result.notes.append(
                 f"{len(failures)} units answer with exception 04h only: some servers say so of units that they do not have"
             )
+
+    @property
+    def _ended(self) -> bool:
+        """Whether nothing more is to be asked."""
+        return self._met_master or self._stop()
 
     def planned(self) -> list[tuple[str, list[Step]]]:
         """What `run` would ask after listening, phase by phase, where nobody answers."""
@@ -163,7 +169,7 @@ class ModbusScanner:
         else:
             await self._search()
             return
-        if options.every_setting and not self._stop():
+        if options.every_setting and not self._ended:
             here = verdict.settings if verdict else said
             await self._search_all([self._pace.step(here, self._units)])
 
@@ -176,7 +182,7 @@ class ModbusScanner:
         found = {f.settings for f in self.result.units}
         if found:
             await self._steps(plan.full_pass(self._pace, list(found), self._units, done), "every unit")
-        if self._options.quick_only or self._stop() or (found and not self._options.every_setting):
+        if self._options.quick_only or self._ended or (found and not self._options.every_setting):
             if self._options.quick_only and not found:
                 self.result.notes.append("only likely settings and units were tried; without --quick all are")
             return
@@ -253,10 +259,12 @@ class ModbusScanner:
         """Go through `steps`; those that were begun."""
         total_s, done_s = plan.seconds_of(steps), 0.0
         for i, step in enumerate(steps):
+            if self._ended:
+                return steps[:i]
             before = len(self.result.units)
             await self._step(step, partial(self._told, phase, done_s, total_s))
             done_s += step.seconds
-            if self._stop() or (until_found and len(self.result.units) > before):
+            if self._ended or (until_found and len(self.result.units) > before):
                 return steps[: i + 1]
         return steps
 
@@ -280,7 +288,7 @@ class ModbusScanner:
         )
         try:
             await self._drive(sweep, endpoint, lambda: tell(step, sweep))
-            lost = await self._confirm(sweep, endpoint) if sweep.found else set()
+            lost = await self._confirm(sweep, endpoint) if sweep.found and not self._ended else set()
         finally:
             self._keep(sweep, settings)
         for unit in lost:
@@ -311,7 +319,7 @@ class ModbusScanner:
 
     async def _ask(self, sweep: UnitSweep, connection: ByteConnection, tell: Callable[[], None]) -> None:
         clock = self._clock
-        while not self._stop() and (step := sweep.poll(clock.monotonic_ns())) is not None:
+        while not self._ended and (step := sweep.poll(clock.monotonic_ns())) is not None:
             if isinstance(step, Send):
                 tell()
                 await connection.write(step.data)
@@ -320,13 +328,19 @@ class ModbusScanner:
             data = await connection.read_within(max(0, step.until_ns - clock.monotonic_ns()) / NS_PER_S)
             if data:
                 sweep.feed(data, clock.monotonic_ns())
+            if sweep.other_requests and not self._options.share_bus:
+                self._met_master = True  # silent while we listened: we stop as if it had been heard then
+                self.result.notes.append(
+                    "another master began to talk: stopped asking. --share-bus goes on between its exchanges"
+                )
+                return
 
     async def _confirm(self, sweep: UnitSweep, endpoint: Endpoint) -> set[int]:
         """Ask the first and the late ones that were found again, for a good check sum may be chance: who does not answer."""
         first = {next(iter(sweep.found)), *(u for u, a in sweep.found.items() if a.late)}
         again = sweep.another(first)
         await self._drive(again, endpoint, lambda: None)
-        return first - set(again.found) if not self._stop() else set()
+        return first - set(again.found) if not self._ended else set()
 
     def _keep(self, sweep: UnitSweep, settings: SerialSettings | None) -> None:
         result = self.result
@@ -355,12 +369,12 @@ class ModbusScanner:
         await self._steps([sample], "some units")
         answers = [f.answer for f in self.result.units]
         self.result.alike = likeness(answers, len(first))
-        if self.result.alike is None and len(answers) == len(first) and not self._stop():
+        if self.result.alike is None and len(answers) == len(first) and not self._ended:
             self.result.alike = await self._ask_once_more(answers, first)
         if self.result.alike is not None and self.result.alike.one_device and not self._options.every_setting:
             self.result.notes.append(f"{len(first)} unit ids asked, all answered alike: the others were not asked")
             return
-        if not self._stop():
+        if not self._ended:
             await self._steps(rest, "every unit")
         self.result.units.sort(key=lambda f: f.answer.unit)
 

@@ -102,6 +102,8 @@ class UnitSweep:
         """What we send comes back."""
         self.foreign = 0
         """Good frames of others: another master, or its units."""
+        self.other_requests = 0
+        """Good requests that are not ours: there is another master."""
         self.noise_bytes = 0
         self.never_silent = False
         self.asked = 0
@@ -213,7 +215,9 @@ class UnitSweep:
         unit = frame.unit if self._line else self._ids.get(frame.transaction, -1)
         if not self._is_answer(frame.pdu):
             self.foreign += 1
-            if asked is not None and unit == asked.unit and not _looks_like_request(frame.pdu):
+            request = _looks_like_request(frame.pdu)
+            self.other_requests += self._line and request
+            if asked is not None and unit == asked.unit and not request:
                 asked.noise = True
             return
         if asked is not None and unit == asked.unit:
@@ -272,4 +276,4 @@ class UnitSweep:
 
 
 def _looks_like_request(pdu: bytes) -> bool:
-    return 1 <= pdu[0] <= 6 and len(pdu) == 5
+    return 1 <= pdu[0] <= 4 and len(pdu) == 5

@@ -183,3 +183,19 @@ def test_listening_to_anything_never_fails(frames: list[CanFrame]) -> None:
         ear.feed(frame, i * 1_000_000)
     assert ear.heard.frames == len(frames)
     assert all(1 <= n <= 127 for n in ear.heard.nodes)
+
+
+def test_a_master_that_was_silent_for_long_ends_the_asking() -> None:
+    async def main() -> None:
+        peers = PeerBus([PeerNode(100, WHOLE)])
+        async with closing(peers):
+            task = asyncio.ensure_future(scan(peers))
+            await asyncio.sleep(8)
+            assert peers.ours is not None
+            peers.ours.feed(CanFrame(0x000, b"\x01\x00"))
+            found = await task
+        assert 0 < found.asked < 50
+        assert any("another master began" in note for note in found.notes)
+        assert found.took_s < 9
+
+    run_virtually(main())

@@ -235,3 +235,20 @@ def test_what_is_said_of_the_settings_is_kept_and_the_rest_is_tried(said: str) -
         assert all(str(s.baudrate) in said or s.frame in said for s in line.opened)
 
     run_virtually(main())
+
+
+def test_a_master_that_was_silent_for_long_ends_the_asking() -> None:
+    async def main() -> None:
+        line = UartLine({40: meter()})
+        url = f"{PORT}?baudrate=9600&frame=8N1"
+        told: list[Progress] = []
+        scanner = ModbusScanner(url, ScanOptions(listen_s=1), connector=line, clock=loop(), on_progress=told.append)
+        line.chatter = (exchange(5, 1),)
+        line.opened.append(SerialSettings())  # it does not begin when the port is opened
+        loop().call_later(6, line._talk)
+        found = await scanner.run()
+        assert 5 < found.took_s < 8
+        assert found.asked < 20
+        assert any("another master began" in note for note in found.notes)
+
+    run_virtually(main())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import signal
 import subprocess
 import sys
 import termios
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import run
+from support import eventually, run
 
 from emulators.canopen.dictionary import parse_eds
 from emulators.canopen.node import CanopenNode, NodeContext
@@ -71,9 +72,13 @@ def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
             assert [(u["unit"], u["settings"][:5]) for u in found["units"]] == [(5, "19200")]
             sent = [json.loads(line) for line in log.read_text().splitlines() if '"sent"' in line]
             assert {bytes.fromhex(line["hex"])[0] for line in sent} <= {4, 5, 6}
-            code, report, talk = await fieldtwin("line", f"{url}?baudrate=19200&frame=8N1", "--listen", "0.2", "--probe", "5")
+            code, report, talk = await fieldtwin(
+                "line", f"{url}?baudrate=19200&frame=8N1", "--listen", "0.2", "--probe", "5"
+            )
             assert (code, report["probe"]["answer"]) == (0, "good"), talk
-            code, told, talk = await fieldtwin("identify", f"{url}?baudrate=19200&frame=8N1", "--unit", "6", "--timeout", "50ms")
+            code, told, talk = await fieldtwin(
+                "identify", f"{url}?baudrate=19200&frame=8N1", "--unit", "6", "--timeout", "50ms"
+            )
             assert (code, told["answers"]) == (4, False), talk
         await end.aclose()
 
@@ -117,5 +122,32 @@ def test_a_drive_on_the_software_bus() -> None:
             assert (code, told["certain"]) == (0, None), talk
             assert told["summary"] == "fieldtwin/drive-cia402: likely"
         await server.aclose()
+
+    run(main(), timeout_s=40)
+
+
+@pytest.mark.slow
+def test_an_interrupt_keeps_what_was_found_and_says_that_it_is_not_all(tmp_path: Path) -> None:
+    async def main() -> None:
+        end = await PtyEnd.open(tmp_path / "line", Endpoint.parse("pty:line"))
+        url = f"rtu:{tmp_path / 'line'}?baudrate=19200&frame=8N1"
+        async with Nursery() as nursery:
+            nursery.start(answer_at(end, termios.B19200), "device")
+            program = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-m", "fieldtwin", "scan", url, "--listen-for", "0", "--timeout", "200ms", "--json"),
+                *("--log", str(tmp_path / "log")),
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+            )
+            await eventually(
+                lambda: (tmp_path / "log").exists() and '"hex":"0603' in (tmp_path / "log").read_text(), 20
+            )
+            program.send_signal(signal.SIGINT)
+            out, err = await program.communicate()
+            found = json.loads(out)
+            assert (program.returncode, found["stopped"]) == (130, True), err.decode()
+            assert [u["unit"] for u in found["units"]] == [5]
+            assert found["asked"] < 240
+        await end.aclose()
 
     run(main(), timeout_s=40)

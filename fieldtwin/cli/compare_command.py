@@ -19,16 +19,17 @@ from fieldtwin.cli.device_options import device_options, logged, target_from
 from fieldtwin.cli.options import Duration, json_option, pairs
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.formats.candump import read_log
-from fieldtwin.recording.asking import asker_at, changes
+from fieldtwin.recording.asking import asker_at, changes, frame_for
 from fieldtwin.recording.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
 from fieldtwin.recording.comparing_can import Frames, compare_logs
-from fieldtwin.recording.live_comparing import compare_device, compare_node
+from fieldtwin.recording.live_comparing import compare_device, compare_node, uploads_of
 from fieldtwin.recording.rotating import exchanges_of, header_of, parts_of
 from fieldtwin.sitereport.about import headed
 from gateway.core.endpoint import SCHEMES
 from gateway.core.errors import FileInvalid, NotAllowed, UsageError
 from gateway.core.profile import DeviceProfile, load_profile
 from gateway.core.recording import shown
+from gateway.protocols.canopen.sdo import SdoUpload
 from gateway.wallclock import run as run_precise
 from twin.data_files import find
 
@@ -72,6 +73,7 @@ SHOWN = 20
 @click.option("--writes", is_flag=True, help="A live device: make the recorded writes again, too. Asks first.")
 @click.option("--yes", is_flag=True, help="With --writes: do not ask.")
 @click.option("--i-know", is_flag=True, help="With --writes: broadcasts and restarts (FC08) too.")
+@click.option("--dry-run", is_flag=True, help="A live device: print the frames that would be sent, and send nothing.")
 @click.option("--all", "everything", is_flag=True, help=f"Show all differences, not only the first {SHOWN}.")
 @device_options
 @json_option
@@ -88,8 +90,10 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
     """
     rules = Rules(*_tolerances(options["tolerances"]), _latency(options["latency"]), options["least"] / 100)
     live = other.partition(":")[0].lower() in SCHEMES and not Path(other).is_file()
-    if not live and options["writes"]:
-        raise UsageError("--writes is for a live device")
+    if not live and (options["writes"] or options["dry_run"]):
+        raise UsageError("--writes and --dry-run are for a live device")
+    if options["dry_run"]:
+        return _dry(recording, other, options)
     if recording.suffix == ".log":
         result = _live_can(recording, other, rules, options) if live else _logs(recording, Path(other), rules, options)
     else:
@@ -113,6 +117,27 @@ def _headed(recording: Path, other: str, live: bool, options: dict[str, Any]) ->
         address = next((exchange.unit for exchange in exchanges_of(recording)), 0)
     endpoint, device = (other, "") if live else ("", Path(other).name)
     return headed("compare", "canopen" if can else "modbus", endpoint, address or 0, recording.name, device=device)
+
+
+def _dry(recording: Path, url: str, options: dict[str, Any]) -> int:
+    """The frames of what would be asked, as often as it would be."""
+    target = target_from(url, options)
+    asked = 0
+    if recording.suffix == ".log":
+        for exchange in uploads_of(_frames(recording), options["node"]):
+            if not options["most"] or asked < options["most"]:
+                asked += 1
+                span = exchange.spans[0]
+                click.echo(str(SdoUpload(exchange.unit, span.address, span.subindex, 0).start(0)))
+        return 0
+    for e in exchanges_of(recording):
+        if (changes(e.request) and not options["writes"]) or (options["most"] and asked >= options["most"]):
+            continue
+        frame = frame_for(target.url, e.unit if options["unit"] is None else options["unit"], e.request)
+        if frame is not None:
+            asked += 1
+            click.echo(frame.hex(" "))
+    return 0
 
 
 # -- what may differ ----------------------------------------------------------------------------------------------------
@@ -214,12 +239,12 @@ def _live_can(recording: Path, url: str, rules: Rules, options: dict[str, Any]) 
     found: list[Comparison] = []
 
     async def work(stop: asyncio.Event, progress: Callable[[int], None]) -> None:
-        found.append(
-            await compare_node(
+        with logged(options["log"]) as taps:
+            result = await compare_node(
                 lambda: _frames(recording), target, rules, node=options["node"], most=options["most"] or 0,
-                listen_s=options["listen_s"], stop=stop, progress=progress,
-            )
-        )  # fmt: skip
+                listen_s=options["listen_s"], taps=taps, stop=stop, progress=progress,
+            )  # fmt: skip
+        found.append(result)
 
     _run(work)
     return found[0]

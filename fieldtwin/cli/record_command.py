@@ -6,7 +6,7 @@ import asyncio
 import json
 import signal
 import sys
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,10 +15,11 @@ from typing import Any
 import click
 from rich.status import Status
 
-from fieldtwin.cli.device_options import device_options, target_from, words
+from fieldtwin.cli.device_options import device_options, logged, target_from, words
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.talk import data, talk
-from fieldtwin.commissioning.reading import Target
+from fieldtwin.commissioning.reading import Target, dry_point
+from fieldtwin.recording.asking import frame_for
 from fieldtwin.recording.importing import TextSummary, import_capture
 from fieldtwin.recording.polling import (
     PollCounters,
@@ -77,6 +78,7 @@ REFRESH_S = 0.5
     help="ENDPOINT is a run of SYSTEM (--trace, --capture): make a scenario of it, with tolerances.",
 )
 @click.option("--emulated", is_flag=True, help="Say in the recording that the device is an emulator.")
+@click.option("--dry-run", is_flag=True, help="Print the frames that a round would send, and send nothing.")
 @device_options
 @json_option
 def command(
@@ -94,10 +96,10 @@ def command(
     \b
     fieldtwin record rtu:/dev/ttyUSB0 --profile eastron-sdm630 -o meter.jsonl
     fieldtwin record tcp://192.168.0.7 --like old.jsonl --rounds 20 -o new.jsonl
-    fieldtwin record --tap rtu:/dev/ttyUSB0?baudrate=9600 rtu:/dev/ttyUSB1?baudrate=9600 -o line.jsonl
-    fieldtwin record --tap tcp://127.0.0.1:1502 tcp://192.168.0.7:502 -o line.jsonl
-    fieldtwin record can:socketcan/can0 -o bus.log                       listens only
-    fieldtwin record can:socketcan/can0 --profile drive-cia402 --node 5 -o drive.log
+    fieldtwin record --tap rtu:/dev/ttyUSB0 rtu:/dev/ttyUSB1 -o line.jsonl
+    fieldtwin record --tap tcp://127.0.0.1:1502 tcp://192.168.0.7 -o line.jsonl
+    fieldtwin record can:socketcan/can0 -o bus.log                 (listens only)
+    fieldtwin record can:socketcan/can0 --profile drive-cia402 -o drive.log
     fieldtwin record run.jsonl --as-scenario observatory -o run.scenario.yaml
 
     Play it with `fieldtwin emulate`, hold a device against it with `fieldtwin compare`.
@@ -166,25 +168,39 @@ class _Job:
     # -- kinds --------------------------------------------------------------------------------------------------------
 
     def polls(self, target: Target, one_round: Round, device: str) -> int:
+        if self._options["dry_run"]:
+            return self._dry(frame_for(target.url, unit, pdu) for unit, pdu in one_round.asks)
         counters = PollCounters()
         header = RecordingHeader(
             version=1, device=device, kind="exchanges", source="measured", endpoint=target.url, made_by=words(),
             profile_hash=target.profile.hash if target.profile else "", start_utc=self._now(),
             prototype=self._options["emulated"],
         )  # fmt: skip
-        with RotatingFile(self._out, encode_header(header), **self._parts) as file:
+        log: Path | None = self._options["log"]
+        with logged(log) as taps, RotatingFile(self._out, encode_header(header), **self._parts) as file:
 
             async def work(stop: asyncio.Event) -> None:
                 await record_polls(
                     target, one_round, ExchangeSink(file), every_s=self._options["every_s"], counters=counters, stop=stop,
-                    rounds=self._options["rounds"] or 0, spacing_s=self._options["spacing_s"], clock=self._clock,
+                    rounds=self._options["rounds"] or 0, spacing_s=self._options["spacing_s"], taps=taps, clock=self._clock,
                 )  # fmt: skip
 
             self._run(work, lambda: f"{counters.rounds} rounds, {counters.exchanges} exchanges")
         return self._summary(file, counters, {"exchanges": file.lines})
 
+    def _dry(self, frames: Iterable[bytes | str | None]) -> int:
+        for frame in frames:
+            if frame is not None:
+                click.echo(frame if isinstance(frame, str) else frame.hex(" "))
+        return 0
+
     def bus(self, target: Target) -> int:
+        if self._options["dry_run"]:
+            tags = [t for t in target.profile.tags.values() if t.readable] if target.profile else []
+            return self._dry(dry_point(target).read_frames(tags))
         counters, lost = PollCounters(), 0
+        if self._options["log"]:
+            raise UsageError("--log: what is recorded of a bus is all of it already")
         with RotatingFile(self._out, **self._parts) as file:
             sink = CanLogSink(file, self._clock, Endpoint.parse(target.url).path.rpartition("/")[2].replace(":", "_"))
 

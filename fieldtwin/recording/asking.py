@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from fieldtwin.commissioning.live import modbus_at
+from fieldtwin.commissioning.live import frame_of, modbus_at
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Connector, Direction, Tap
@@ -37,6 +37,14 @@ def changes(pdu: bytes) -> bool:
     """Whether a request may change the device; so for every function that no standard knows."""
     asked = asked_of(pdu)
     return asked is None or asked.changes
+
+
+def frame_for(url: str, unit: int, pdu: bytes) -> bytes | None:
+    """What a request would look like on the wire at `url`, for `--dry-run`; None for what cannot be sent."""
+    asked = asked_of(pdu)
+    if asked is None:
+        return None
+    return frame_of(url, unit, Forwarded(unit, pdu, asked, on_line=framing_of(Endpoint.parse(url)) == "rtu"))
 
 
 class _Sent(Tap):

@@ -6,15 +6,16 @@ It must never know a screen; what may be written is decided by who calls.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 from fieldtwin.commissioning.live import canopen_at
 from fieldtwin.commissioning.reading import Target
 from fieldtwin.decoding.canopen_wire import CanopenWire
+from fieldtwin.decoding.exchange import Exchange as Transfer
 from fieldtwin.decoding.modbus_pdu import parse_request
 from fieldtwin.recording.asking import Asker, changes
 from fieldtwin.recording.comparing import Comparer, Comparison, Rules
-from fieldtwin.recording.comparing_can import Frames, compare_logs
+from fieldtwin.recording.comparing_can import TRANSFERS, Frames, compare_logs
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Connector, Direction, Tap
@@ -84,6 +85,20 @@ class _Kept(Tap):
             self.frames.append((t_ns, frame))
 
 
+def transfers_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
+    """The SDO transfers of a log, of `node` or of all."""
+    wire = CanopenWire("can", ())
+    for t_ns, frame in frames:
+        for exchange in wire.feed(frame, t_ns)[1]:
+            if exchange.service in TRANSFERS and node in (None, exchange.unit):
+                yield exchange
+
+
+def uploads_of(frames: Frames, node: int | None) -> Iterator[Transfer]:
+    """Those that only read."""
+    return (exchange for exchange in transfers_of(frames, node) if exchange.service == TRANSFERS[0])
+
+
 async def compare_node(
     recorded: Callable[[], Frames],
     target: Target,
@@ -92,6 +107,7 @@ async def compare_node(
     node: int | None = None,
     most: int = 0,
     listen_s: float = 0.0,
+    taps: Sequence[Tap] = (),
     stop: asyncio.Event | None = None,
     progress: Progress = lambda done: None,
     connector: Connector | None = None,
@@ -102,24 +118,23 @@ async def compare_node(
     clock, kept = clock or WallClock(), _Kept()
     nodes, left_out = set[int](), 0
     async with canopen_at(
-        target.url, target.bitrate, sdo_timeout_s=target.timeout_s, taps=[kept], connector=connector, clock=clock
+        target.url, target.bitrate, sdo_timeout_s=target.timeout_s, taps=[kept, *taps], connector=connector, clock=clock
     ) as master:
         done = 0
-        wire = CanopenWire("can", ())
-        for t_ns, frame in recorded():
-            for exchange in wire.feed(frame, t_ns)[1]:
-                asked = exchange.service == "SDO upload" and node in (None, exchange.unit)
-                if not asked or (most and done >= most) or (stop is not None and stop.is_set()):
-                    left_out += exchange.service == "SDO download"
-                    continue
-                span = exchange.spans[0]
-                nodes.add(exchange.unit)
-                try:
-                    await master.sdo_upload(exchange.unit, span.address, span.subindex)
-                except (SdoAborted, WireError):
-                    pass  # that is an outcome, and the frames show it
-                done += 1
-                progress(done)
+        for exchange in transfers_of(recorded(), node):
+            if exchange.service != "SDO upload":
+                left_out += 1
+                continue
+            if (most and done >= most) or (stop is not None and stop.is_set()):
+                break
+            span = exchange.spans[0]
+            nodes.add(exchange.unit)
+            try:
+                await master.sdo_upload(exchange.unit, span.address, span.subindex)
+            except (SdoAborted, WireError):
+                pass  # that is an outcome, and the frames show it
+            done += 1
+            progress(done)
         if listen_s:
             await clock.sleep_until_ns(clock.monotonic_ns() + round(listen_s * NS_PER_S))
     result = compare_logs(

@@ -7,7 +7,7 @@ connection that is lost is opened again, after growing pauses. It must never kno
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from fieldtwin.commissioning.reading import Target
 from fieldtwin.recording.asking import Asker, asker_at, changes
 from fieldtwin.recording.sinks import CanLogSink
 from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector
+from gateway.core.connection import Connector, Tap
 from gateway.core.errors import ConnectionLost, Unreachable, UsageError
 from gateway.core.profile import READ_FUNCTION, DeviceProfile
 from gateway.core.recording import Exchange
@@ -46,6 +46,11 @@ class PollCounters:
 class Round(Protocol):
     """What is asked in each round."""
 
+    @property
+    def asks(self) -> list[tuple[int, bytes]]:
+        """Unit and request PDU of what a round asks, as it stands now."""
+        ...
+
     async def __call__(self, asker: Asker, sink: Sink) -> None: ...
 
 
@@ -61,6 +66,11 @@ class ProfileRound:
             raise UsageError(f"no group {unknown[0]!r} in {profile.name}", expected=", ".join(there))
         self._plans = [GroupPlan(profile, group, learnt) for group in wanted]
 
+    @property
+    def asks(self) -> list[tuple[int, bytes]]:
+        """As `Round.asks`."""
+        return [(self._unit, _request(read)) for plan in self._plans for read in plan.reads]
+
     async def __call__(self, asker: Asker, sink: Sink) -> None:
         for plan in self._plans:
             waiting = list(plan.reads)
@@ -70,10 +80,7 @@ class ProfileRound:
 
     async def _read(self, plan: GroupPlan, read: Read, asker: Asker, sink: Sink) -> tuple[Read, ...]:
         """What is to be read instead."""
-        at = read.range
-        exchange = await asker.ask(
-            self._unit, bytes((READ_FUNCTION[at.table],)) + at.address.to_bytes(2) + at.count.to_bytes(2)
-        )
+        exchange = await asker.ask(self._unit, _request(read))
         if exchange is None:
             return ()
         sink(exchange)
@@ -84,6 +91,11 @@ class ProfileRound:
             return plan.refused(read, code) if code in (2, 3) else ()
         plan.taken(read)
         return ()
+
+
+def _request(read: Read) -> bytes:
+    at = read.range
+    return bytes((READ_FUNCTION[at.table],)) + at.address.to_bytes(2) + at.count.to_bytes(2)
 
 
 class SameRequests:
@@ -99,6 +111,11 @@ class SameRequests:
                 self.left_out += 1
             else:
                 self.requests[key] = None
+
+    @property
+    def asks(self) -> list[tuple[int, bytes]]:
+        """As `Round.asks`."""
+        return list(self.requests)
 
     async def __call__(self, asker: Asker, sink: Sink) -> None:
         for unit, pdu in self.requests:
@@ -117,6 +134,7 @@ async def record_polls(
     stop: asyncio.Event,
     rounds: int = 0,
     spacing_s: float = 0.0,
+    taps: Sequence[Tap] = (),
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> None:

@@ -116,6 +116,30 @@ def test_a_plant_is_not_written_to_by_the_way(tmp_path: Path) -> None:
         called(compare, restart, nobody, "--writes", "--yes")
 
 
+def test_a_dry_run_prints_the_frames_and_opens_nothing(tmp_path: Path) -> None:
+    def printed(command: Any, *words: object) -> list[str]:
+        done = CliRunner().invoke(command, list(map(str, words)), standalone_mode=False)
+        assert done.return_value == 0, done.exception
+        return done.stdout.split("\n")[:-1]
+
+    path = _write(tmp_path / "r.jsonl", "0300010001", "0600010005", "0300010001")
+    url, out = "tcp://127.0.0.1:1", tmp_path / "x.jsonl"
+    asked, written = "00 01 00 00 00 06 01 03 00 01 00 01", "00 01 00 00 00 06 01 06 00 01 00 05"
+    assert printed(record, url, "--like", path, "--dry-run", "-o", out) == [asked]
+    assert printed(compare, path, url, "--dry-run") == [asked, asked]
+    assert printed(compare, path, url, "--dry-run", "--writes", "--yes") == [asked, written, asked]
+    assert printed(record, "rtu:/dev/nobody", "--profile", "delta-vfd-e", "--dry-run", "-o", out)[0].startswith(
+        "01 03 20 00"
+    )
+    log = tmp_path / "bus.log"
+    log.write_text(
+        "(1.0) can0 605#4041600000000000\n(1.000001) can0 605#4041600000000000\n(1.000002) can0 585#4B41600050020000\n"
+    )
+    log.write_text(log.read_text().replace("(1.0)", "(1.000000)"))
+    assert printed(compare, log, "can:fieldtwin/127.0.0.1:1", "--dry-run") == ["605#4041600000000000"] * 2
+    assert not out.exists()
+
+
 def test_tolerances_that_are_none_and_files_that_are_not_there(tmp_path: Path) -> None:
     path = _write(tmp_path / "w.jsonl", "0300010001")
     for tolerance in ("x", "-1", "nan%", "1,5"):

@@ -138,7 +138,9 @@ class IdentifyForm(Strict):
     """A read whose answer tells this device from others; `tag` names the value to compare with `expect`."""
 
     tag: str
-    expect: str | int | None = Field(default=None, description="what it reads on such a device; spaces around do not count")
+    expect: str | int | None = Field(
+        default=None, description="what it reads on such a device; spaces around do not count"
+    )
     between: tuple[float, float] | None = Field(default=None, description="plausibility only: no identity to read")
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)

@@ -7,8 +7,10 @@ import json
 import shlex
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -20,6 +22,9 @@ from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.template_here import system_file
 from gateway.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from fieldtwin.running.virtual_run import VirtualOptions
 
 NEITHER = """run needs --plant or --prototype; neither is a default.
   --prototype   the field side is emulated, as NAME.prototype.yaml says: nothing real is touched
@@ -72,6 +77,11 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
 )
 @click.option("--trace", type=click.Path(dir_okay=False), help="With --virtual: every event to this file (JSON lines).")
 @click.option(
+    "--compare",
+    type=click.Path(exists=True, dir_okay=False),
+    help="With --virtual: hold the run against an older one's trace (fieldtwin trace --against); exit code 1 if it differs.",
+)
+@click.option(
     "--faults",
     default="",
     metavar="FILE|random",
@@ -112,6 +122,7 @@ def command(
     jobs: int,
     ledger: str | None,
     trace: str | None,
+    compare: str | None,
     faults: str,
     thread: str,
     thread_store: str,
@@ -160,6 +171,7 @@ def command(
                 speed,
                 commands,
                 trace,
+                compare,
                 faults,
             ),
             seeds,
@@ -167,8 +179,8 @@ def command(
             Path(ledger) if ledger else None,
             as_json,
         )
-    if seeds or seed is not None or trace or jobs != 1:
-        raise UsageError("--seed, --seeds, --jobs and --trace go with --virtual")
+    if seeds or seed is not None or trace or compare or jobs != 1:
+        raise UsageError("--seed, --seeds, --jobs, --trace and --compare go with --virtual")
     options = RunOptions(
         system=system,
         prototype=prototype,
@@ -216,6 +228,7 @@ class VirtualRequest(NamedTuple):
     speed: float
     commands: str | None
     trace: str | None
+    compare: str | None
     faults: str
 
 
@@ -241,10 +254,25 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | 
     if not seeds:
         if ledger is not None:
             raise UsageError("--ledger goes with --seeds")
-        return run_one(options, as_json)
-    if request.trace or request.seed is not None:
-        raise UsageError("--seeds makes many runs", hint="--seed and --trace belong to one")
+        return _run_against(options, Path(request.compare), as_json) if request.compare else run_one(options, as_json)
+    if request.trace or request.compare or request.seed is not None:
+        raise UsageError("--seeds makes many runs", hint="--seed, --trace and --compare belong to one")
     return run_many(options, parse_seeds(seeds), jobs, as_json, _again, ledger)
+
+
+def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
+    """The run, and then what of it is otherwise than in the trace `old`; the worse of both exit codes."""
+    from fieldtwin.cli.regression_view import judged, show
+    from fieldtwin.cli.virtual_view import run_one
+    from fieldtwin.regression.comparing import Allowed
+    from twin.system import load_system
+
+    if as_json:
+        raise UsageError("--compare with --json", hint="--trace NEW, then fieldtwin trace NEW SYSTEM --against OLD --json")
+    with TemporaryDirectory(prefix="ft-") as folder:
+        trace = options.trace or Path(folder) / "trace.jsonl"
+        code = run_one(replace(options, trace=trace), as_json)
+        return max(code, show(judged(load_system(options.system, options.profiles), old, trace, Allowed()), old, as_json=False))
 
 
 def _again(seed: int) -> str:

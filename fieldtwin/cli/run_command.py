@@ -268,11 +268,15 @@ def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
     from twin.system import load_system
 
     if as_json:
-        raise UsageError("--compare with --json", hint="--trace NEW, then fieldtwin trace NEW SYSTEM --against OLD --json")
+        raise UsageError(
+            "--compare with --json", hint="--trace NEW, then fieldtwin trace NEW SYSTEM --against OLD --json"
+        )
     with TemporaryDirectory(prefix="ft-") as folder:
         trace = options.trace or Path(folder) / "trace.jsonl"
         code = run_one(replace(options, trace=trace), as_json)
-        return max(code, show(judged(load_system(options.system, options.profiles), old, trace, Allowed()), old, as_json=False))
+        return max(
+            code, show(judged(load_system(options.system, options.profiles), old, trace, Allowed()), old, as_json=False)
+        )
 
 
 def _again(seed: int) -> str:

@@ -6,10 +6,12 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+import signal
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import TracebackType
 
 from fieldtwin.conformance.case import Danger
 from fieldtwin.report.coverage import Collector
@@ -61,6 +63,8 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
             result = _without_run(scenario, target, Verdict.SKIPPED, refused)
         else:
             result = asyncio.run(_run(scenario, target, trace))
+    except asyncio.CancelledError:  # SIGTERM: everything went down in order
+        raise KeyboardInterrupt from None
     except FieldtwinError as e:
         result = replace(_without_run(scenario, target, Verdict.ERROR, str(e)), trace=tuple(trace.events))
     finally:
@@ -113,6 +117,9 @@ def _words(target: Target) -> list[str]:
 
 
 async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResult:
+    me = asyncio.current_task()
+    assert me is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, me.cancel)
     async with AsyncExitStack() as stack:
         gone: Callable[[], FieldtwinError | None] = lambda: None  # noqa: E731
         if target.name == "compose" or target.instance:
@@ -120,7 +127,12 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
         else:
             session = _session(scenario, target)
             own = session.instance.dir
-            stack.callback(shutil.rmtree, own, ignore_errors=True)  # last of all; nobody else knows its name
+
+            def tidy(kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+                if kind is None or not issubclass(kind, FieldtwinError):  # else its logs are what tells why
+                    shutil.rmtree(own, ignore_errors=True)
+
+            stack.push(tidy)
             await stack.enter_async_context(session)
             where = Where(
                 own,

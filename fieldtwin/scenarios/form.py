@@ -262,16 +262,21 @@ def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
         asked.append(Can.PROBE)
     if any(isinstance(one, WireForm) for one in form.never) or any(one.wire is not None for one in form.rate):
         asked.append(Can.SEE_WIRE)
-    for step in form.steps:
-        word = word_of(step) if any(getattr(step, w) is not None for w in WORDS) else ""
-        implied = {"send": Can.SEND_COMMAND, "set": Can.SET_VALUE, "fault": Can.INJECT_FAULT, "clear": Can.INJECT_FAULT}
-        if word in implied:
-            asked.append(implied[word])
-        if step.expect is not None and step.expect.wire is not None:
-            asked.append(Can.SEE_WIRE)
-        if step.expect is not None and step.expect.like is not None:
-            asked.append(Can.SEE_HELD)
+    asked += [need for step in form.steps for need in needs_of(step)]
     return tuple(dict.fromkeys(asked))
+
+
+_IMPLIED = {"send": Can.SEND_COMMAND, "set": Can.SET_VALUE, "fault": Can.INJECT_FAULT, "clear": Can.INJECT_FAULT}
+
+
+def needs_of(step: Step) -> list[Can]:
+    """What a target must be able to do for a step."""
+    needs = [need for word, need in _IMPLIED.items() if getattr(step, word) is not None]
+    if step.expect is not None and step.expect.wire is not None:
+        needs.append(Can.SEE_WIRE)
+    if step.expect is not None and step.expect.like is not None:
+        needs.append(Can.SEE_HELD)
+    return needs
 
 
 def _check_step(scenario: Scenario, step: Step, n: int) -> None:

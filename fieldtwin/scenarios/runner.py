@@ -19,7 +19,7 @@ from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.scenarios.bench import Bench, Can
 from fieldtwin.scenarios.expectation import Watched, is_secret, judge_tag, judge_wire
 from fieldtwin.scenarios.expression import Expression
-from fieldtwin.scenarios.form import Expect, Scenario, Step, WireForm, word_of
+from fieldtwin.scenarios.form import Expect, Scenario, Step, WireForm, needs_of, word_of
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.whole_run import WholeRun
 from gateway.core.errors import UsageError
@@ -53,7 +53,13 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Dang
     """Why a target cannot do what the scenario is made of, or may not have it done to it; empty when all is well."""
     lacking = [need.value for need in scenario.needs if need not in can]
     if lacking:
-        return f"the target {target} cannot {', '.join(lacking)}"
+        steps = [
+            str(n)
+            for n, step in enumerate(scenario.form.steps, 1)
+            if any(need.value in lacking for need in needs_of(step))
+        ]
+        said = f" (step{'s' if len(steps) > 1 else ''} {', '.join(steps[:5])})" if steps else ""
+        return f"the target {target} cannot {', '.join(lacking)}{said}"
     asked = [(DANGER.get(word_of(step), Danger.OBSERVE), f"step {n}") for n, step in enumerate(scenario.form.steps, 1)]
     asked += [(Danger.READ, f"the probe {probe.name}") for probe in scenario.probes]
     for danger, what in asked:

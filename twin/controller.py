@@ -1,7 +1,7 @@
 """The gateway's process: ``python -m twin.controller CONFIG.json``. The same for a plant and for its prototype.
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
-mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, stop.
+mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, command, stop.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from gateway.connections.os_connector import OsConnector
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import Connector
 from gateway.core.control import ControlServer
-from gateway.core.errors import FieldtwinError, Unreachable
+from gateway.core.errors import FieldtwinError, Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
@@ -34,6 +34,7 @@ from twin.system import load_system
 from twin.watching import TagWatch
 
 FLUSH_EVERY_NS = NS_PER_S // 2
+MOST_COMMAND_BYTES = 64
 PUBLISHED_AT_ONCE = 20_000
 """What a line of the control channel takes."""
 
@@ -105,6 +106,7 @@ class GatewayProcess:
                 "get": self._get,
                 "published": self._published,
                 "watch": self._watch,
+                "command": self._command,
                 "stop": self._request_stop,
             }
         )
@@ -163,6 +165,18 @@ class GatewayProcess:
     async def _watch(self, args: dict[str, Any]) -> dict[str, Any]:
         """Changes of tags since the last question, and some tags now (`twin.watching`)."""
         return self._watching.answer(args)
+
+    async def _command(self, args: dict[str, Any]) -> dict[str, Any]:
+        """A command of the digital twin, ``payload`` in hex, as if the transmitter had brought it: the control logic decides."""
+        if len(self._gateway.pumps) != 1:
+            raise UsageError("a command for the transmitter", expected="one", got=str(len(self._gateway.pumps)))
+        try:
+            payload = bytes.fromhex(str(args.get("payload", "")))
+        except ValueError as e:
+            raise UsageError("a command's payload", expected="hex", got=repr(args.get("payload"))) from e
+        if not payload or len(payload) > MOST_COMMAND_BYTES:
+            raise UsageError("a command's payload", expected=f"1 to {MOST_COMMAND_BYTES} bytes", got=str(len(payload)))
+        return {"taken": self._gateway.pumps[0].command(payload, str(args.get("by", "digital twin")))}
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""

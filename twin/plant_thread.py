@@ -1,8 +1,8 @@
 """The plant's side of a digital thread as a process: ``python -m twin.plant_thread CONFIG.json``.
 
 It looks at the process image, as any watcher does, and shares what changes: values, states with their periods, commands that
-came, responses that went. It writes into a store of its own and sends from there. It puts nothing into the image, and takes no
-commands.
+came, responses that went. It writes into a store of its own and sends from there. What its digital twin commands goes through
+the plant's own gate (`twin.command_gate`) to the gateway, as if the transmitter had brought it; the image is the gateway's.
 Control verbs: ready, get, stop.
 """
 
@@ -13,6 +13,7 @@ import os
 import secrets
 import signal
 import sys
+from collections.abc import Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
@@ -20,17 +21,19 @@ from typing import Any
 import msgspec
 
 from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.control import ControlServer
+from gateway.core.control import ControlClient, ControlServer
 from gateway.core.errors import FieldtwinError
 from gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
 from gateway.core.image_region import Snapshot
 from gateway.core.nursery import Nursery
 from gateway.core.statemachine import STATE_CODES, STATES
 from gateway.core.values import COMMAND, RESPONSE, TagValue
-from gateway.store.event import Kind
+from gateway.store.event import Event, Kind
 from gateway.store.knowledge import open_knowledge
 from gateway.wallclock import WallClock, run
+from twin.command_gate import CommandGate
 from twin.knowledge import KnowledgeWriter
+from twin.mape.execute import Bounds
 from twin.physical import attached, image_layout
 from twin.status import encode_status
 from twin.system import System, load_system
@@ -136,12 +139,18 @@ class PlantThread:
             origin = await store.own("plant", system=system.name, prototype=c.prototype, log=secrets.token_hex(4))
             carrier, self._place = await plant_carrier(c.place, system, clock)
             stack.push_async_callback(carrier.aclose)
-            self._end = ThreadEnd(store, carrier, schema_of(system), clock, origin=origin, prototype=c.prototype)
+            least_s, most_s = system.commands.period_s
+            bounds = Bounds(least_s, most_s, system.commands.per_minute)
+            self._gate = CommandGate(remote=system.remote == "remote", bounds=bounds, clock=clock)
+            self._end = ThreadEnd(
+                store, carrier, schema_of(system), clock,
+                origin=origin, prototype=c.prototype, on_events=self._commanded,
+            )  # fmt: skip
             self._writer = KnowledgeWriter(
                 store, origin, clock, on_written=self._end.appended, make_room=self._end.make_room
             )
             process = ImageProcess(system, layout, clock)
-            connection = PTtoDTConnection(self._end, [process], self._writer, clock)
+            connection = PTtoDTConnection(self._end, [process, self._gate], self._writer, clock)
             image = stack.enter_context(attached(layout, Path(c.run_dir) / "image"))
             readers = image.reader(INPUTS), image.reader(OUTPUTS)
             async with Nursery() as nursery:
@@ -153,6 +162,24 @@ class PlantThread:
                 connection.pump()
                 await self._writer.flush()
         return 0
+
+    async def _commanded(self, origin: str, events: Sequence[Event]) -> None:
+        """What arrived from the digital twin's log, each number once: to the gateway, if the gate admits it."""
+        for event in events:
+            command = self._gate.admit(origin, event)
+            if command is None:
+                continue
+            try:
+                client = await ControlClient.connect_unix(Path(self._config.run_dir) / "gateway.sock")
+                try:
+                    taken = (await client.call("command", payload=command.data.hex(), by=origin))["taken"]
+                finally:
+                    await client.aclose()
+            except FieldtwinError as e:  # it is not tried again: a command is for now
+                self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: {e}")
+                continue
+            if not taken:
+                self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: the plant says local")
 
     async def _look(self, process: ImageProcess, connection: PTtoDTConnection, readers: Any) -> None:
         inputs, outputs = readers
@@ -189,6 +216,8 @@ class PlantThread:
             "written": self._writer.written,
             "dropped": self._writer.dropped,
             "store_trouble": self._writer.trouble,
+            "commands_taken": self._gate.taken,
+            "commands_refused": self._gate.refused,
         }
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from twin.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from twin.data_files import find
 from twin.modbus_keys import connect_pauses, device_pace, modbus_bus
 from twin.serving import Serving, resolve_serving
-from twin.system_schema import BusForm, DeviceForm, PlcForm, SystemForm
+from twin.system_schema import BusForm, CommandsForm, DeviceForm, PlcForm, SystemForm
 
 SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
 """What the gateway can talk over so far."""
@@ -40,6 +40,7 @@ class System:
     remote: str
     file: YamlFile
     serving: Serving = field(default_factory=Serving)
+    commands: CommandsForm = field(default_factory=CommandsForm)
 
     def devices_on(self, bus: str) -> list[DeviceConfig]:
         """The devices of a bus, in the file's order."""
@@ -65,6 +66,7 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
         plc=form.plc,
         remote=form.remote,
         file=file,
+        commands=form.commands,
         serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc)),
     )
     _check_programs(system)

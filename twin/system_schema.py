@@ -226,6 +226,21 @@ class BridgeForm(Strict):
     idle_s: int = Field(default=0, ge=0, le=86_400, description="silent clients are closed; 0: never")
 
 
+class CommandsForm(Strict):
+    """What a digital twin may command over a thread, while `remote` says remote."""
+
+    period_s: list[int] = Field(
+        default=[-32768, 32767], min_length=2, max_length=2, description="smallest and largest period in seconds"
+    )
+    per_minute: int = Field(default=60, ge=1, le=6000, description="commands in any minute")
+
+    @model_validator(mode="after")
+    def _in_order(self) -> CommandsForm:
+        if not -32768 <= self.period_s[0] <= self.period_s[1] <= 32767:
+            raise ValueError("period_s is the smallest and the largest, of 16 bits")
+        return self
+
+
 class SystemForm(Strict):
     """A plant: read by the physical twin and by its prototype, byte for byte the same."""
 
@@ -235,6 +250,7 @@ class SystemForm(Strict):
     devices: dict[Name, DeviceForm] = Field(min_length=1)
     plc: PlcForm
     remote: Literal["local", "remote"] = "local"
+    commands: CommandsForm = CommandsForm()
     serve: dict[Name, ServeForm] = {}
     bridge: dict[Name, BridgeForm] = {}
 

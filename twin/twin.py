@@ -1,7 +1,7 @@
 """The digital twin: the shadow, and the way back: Plan and Execute, and a producer whose commands go to the plant.
 
-What carries the commands is a process of the thread (`twin.thread.Operator`), which takes what `execute.transmitter` emits. Whether
-the plant obeys is the plant's to say.
+What carries the commands is a process of the thread (`twin.thread.Operator`), which takes what `execute.transmitter` emits.
+Whether the plant obeys is the plant's to say.
 """
 
 from __future__ import annotations

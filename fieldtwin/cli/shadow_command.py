@@ -24,6 +24,25 @@ from twin.system import System, load_system
 STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "yellow", "unreadable": "red"}
 
 
+class ShadowTalk:
+    """Says each verdict as it is reached; that the states agree, when the state is another than before."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._states: dict[str, str] = {}
+
+    def __call__(self, verdict: Verdict) -> None:
+        if self._quiet or (verdict.finding == "agree" and self._states.get(verdict.subject) == verdict.text):
+            return
+        if verdict.finding == "agree":
+            self._states[verdict.subject] = verdict.text
+        when = datetime.fromtimestamp(verdict.t_ms / 1000, UTC).strftime("%H:%M:%S.%f")[:-3]
+        style = STYLE.get(verdict.finding, "")
+        word = f"[{style}]{verdict.finding:10}[/]" if style else f"{verdict.finding:10}"
+        subject = f"{verdict.subject}: " if not verdict.text.startswith(verdict.subject) else ""
+        talk.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
+
+
 @click.command("shadow")
 @click.argument("system")
 @click.option(
@@ -57,7 +76,7 @@ def command(
         json.dump(seen, sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
-        _print(seen)
+        print_shadow(seen)
     if not seen["origins"]:
         trouble = seen["thread"].get("trouble") or "nothing came"
         raise Unreachable(f"the plant's thread: {trouble}", where=place)
@@ -70,27 +89,14 @@ async def _run(
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    states: dict[str, str] = {}
-
-    def tell(verdict: Verdict) -> None:
-        if as_json or (verdict.finding == "agree" and states.get(verdict.subject) == verdict.text):
-            return
-        if verdict.finding == "agree":
-            states[verdict.subject] = verdict.text
-        when = datetime.fromtimestamp(verdict.t_ms / 1000, UTC).strftime("%H:%M:%S.%f")[:-3]
-        style = STYLE.get(verdict.finding, "")
-        word = f"[{style}]{verdict.finding:10}[/]" if style else f"{verdict.finding:10}"
-        subject = f"{verdict.subject}: " if not verdict.text.startswith(verdict.subject) else ""
-        talk.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
-
-    shadowing = Shadowing(system, place, instance, store=store, on_verdict=tell)
+    shadowing = Shadowing(system, place, instance, store=store, on_verdict=ShadowTalk(quiet=as_json))
     if not as_json:
         talk.print(f"[bold]shadow[/bold] of {system.name}, from {escape(place)}", soft_wrap=True)
     await shadowing.run(stop, duration_s)
     return shadowing.describe()
 
 
-def _print(seen: dict[str, Any]) -> None:
+def print_shadow(seen: dict[str, Any]) -> None:
     if not seen["origins"]:
         return
     kind = "a prototype" if seen["prototype"] else "a plant"

@@ -14,7 +14,7 @@ from typing import Any
 
 from gateway.core.clock import NS_PER_MS
 from gateway.core.nursery import Nursery
-from gateway.store.event import Event
+from gateway.store.event import Event, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
 from gateway.wallclock import WallClock
 from twin.instance import Instance
@@ -25,6 +25,7 @@ from twin.shadow import DigitalShadow
 from twin.system import System
 from twin.thread import schema_of, to_receivers
 from twin.thread_end import ThreadEnd
+from twin.thread_link import Carrier
 from twin.thread_place import twin_carrier
 from twin.thread_process import ReceivingEnd
 
@@ -47,11 +48,17 @@ class Shadowing:
     """``await Shadowing(...).run(stop)``. `on_verdict` is told each verdict as it is reached."""
 
     def __init__(
-        self, system: System, place: str, instance: Instance, *, store: str = "", on_verdict: Callable[[Verdict], None]
+        self,
+        system: System,
+        place: str,
+        instance: Instance,
+        *,
+        store: str = "",
+        on_verdict: Callable[[Verdict], None],
     ) -> None:
         self.clock = WallClock()
         self.receiving = ReceivingEnd("from the plant")
-        self.shadow = DigitalShadow(self.receiving, self.clock, limits=limits_of(system), stale_after_ms=STALE_AFTER_MS)
+        self.shadow = self._make(system)
         self.prototypes: set[str] = set()
         """Origins that say that their field side is emulated (ruling 15)."""
         self.origins: set[str] = set()
@@ -61,6 +68,13 @@ class Shadowing:
         self._on_verdict = on_verdict
         self._end: ThreadEnd | None = None
 
+    def _make(self, system: System) -> DigitalShadow:
+        return DigitalShadow(self.receiving, self.clock, limits=limits_of(system), stale_after_ms=STALE_AFTER_MS)
+
+    async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
+        """This side of the thread: it receives, and has no log to send."""
+        return ThreadEnd(store, carrier, schema_of(self._system), self.clock, on_events=self._arrived)
+
     async def run(self, stop: asyncio.Event, for_s: float = 0.0) -> None:
         """Shadow the plant until `stop`, or for so many seconds. Raises `FieldtwinError` for a store that cannot be used."""
         system, clock = self._system, self.clock
@@ -68,7 +82,7 @@ class Shadowing:
         try:
             own = await store.own("shadow", system=system.name, prototype=False, log=secrets.token_hex(4))
             carrier = twin_carrier(self._place, system, clock)
-            self._end = ThreadEnd(store, carrier, schema_of(system), clock, on_events=self._arrived)
+            self._end = await self._thread(store, carrier)
             writer = KnowledgeWriter(store, own, clock)
             try:
                 async with Nursery() as nursery:
@@ -84,6 +98,7 @@ class Shadowing:
             finally:
                 self._step(writer)
                 await writer.flush()
+                await self._flush()
                 kinds = await store.origins()
                 self.prototypes = {origin for origin in self.origins if kinds.get(origin)}
                 await carrier.aclose()
@@ -94,9 +109,14 @@ class Shadowing:
         self.origins.add(origin)
         await to_receivers(self.receiving)(origin, events)
 
+    async def _flush(self) -> None:
+        """Nothing more comes: what is left to be written, beside the knowledge."""
+        return
+
     async def _work(self, writer: KnowledgeWriter) -> None:
         while True:
             self._step(writer)
+            await self._flush()
             await self.clock.sleep_until_ns(self.clock.monotonic_ns() + STEP_MS * NS_PER_MS)
 
     def _step(self, writer: KnowledgeWriter) -> None:

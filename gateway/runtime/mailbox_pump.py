@@ -12,7 +12,7 @@ from contextlib import suppress
 from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import FieldtwinError, Unreachable
 from gateway.core.events import Consumer
-from gateway.core.values import DATA, RESPONSE
+from gateway.core.values import COMMAND, DATA, RESPONSE
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.modbus_bus import Job, ModbusBus
@@ -40,6 +40,18 @@ class MailboxPump:
         self._sending = 0
         self._next_ns = 0
         self._recorded: tuple[str, object] | None = None
+
+    def command(self, payload: bytes, by: str) -> bool:
+        """A command that did not come through the mailbox; False when the plant's switch says `local`. On record either way."""
+        name = self.driver.config.name
+        result = "taken" if self._remote else "the plant says local"
+        with suppress(Unreachable):
+            self._audit.note("command" if self._remote else "refuse", name, by=by, result=result, payload=payload.hex())
+        if self._remote:
+            self.inbox.observe(COMMAND(payload))
+        else:
+            self.commands_refused += 1
+        return self._remote
 
     def offer(self, payloads: list[bytes]) -> None:
         """The control logic sent these, in order."""

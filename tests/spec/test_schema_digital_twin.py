@@ -7,7 +7,7 @@ from collections import deque
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from shadow_rig import Hands, status, value
+from shadow_rig import NOW_MS, Hands, status, value
 
 from gateway.core.events import Consumer, Producer
 from gateway.core.statemachine import decode_period, delta, encode_period
@@ -72,7 +72,7 @@ def test_Plan_consumes_plans_and_emits_each(periods: list[int]) -> None:
     emitted: Consumer[COMMAND] = Consumer(plan.emitter.event)
     plan.emitter.subscribe(emitted)
     for _ in periods:
-        plan.consumer.observe(verdict("outside", "x", "", 0))
+        plan.consumer.observe(verdict("outside", "x", "", NOW_MS))
     plan.plan()
     assert [decode_period(c) for c in emitted.drain()] == periods
     assert not plan.consumer.queue
@@ -85,6 +85,13 @@ def test_Plan_is_rules_over_the_analysis_of_which_the_first_that_fits_decides() 
     assert rig.give(value(50.0)) == [10]
     planner = RulePlanner((Rule("stale", "", 5),))
     assert planner.plan(DATA(b"no verdict"), DigitalModel()) is None
+
+
+def test_Plan_does_nothing_about_history() -> None:
+    """What an outage kept back arrives late: nobody commands a plant because of how it was an hour ago."""
+    rig = Rig()
+    assert rig.give(value(150.0, NOW_MS - 3_600_000)) == []
+    assert rig.twin.plan.too_old == 1
 
 
 @given(x=PERIODS, before=PERIODS)

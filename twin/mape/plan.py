@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from gateway.core.clock import Clock
+from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.events import Consumer, Producer
 from gateway.core.statemachine import encode_period
 from gateway.core.values import COMMAND, DATA
@@ -18,6 +18,8 @@ from twin.model import DigitalModel
 from twin.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 1000
+OLD_MS = 10_000
+"""What was so longer ago is history, backfilled: nothing is planned because of it."""
 
 
 class Planner(Protocol):
@@ -58,11 +60,15 @@ class Plan(DTDigitalThreadProcess):
         self.consumer: Consumer[Verdict] = Consumer("analyzed", CAPACITY)
         self.emitter: Producer[COMMAND] = Producer("planned")
         self.digital_model = model
-        self.planned = 0
+        self.planned = self.too_old = 0
         self._planner = planner
 
     def plan(self) -> None:
+        now_ms = self._clock.utc_ns() // NS_PER_MS
         for message in self.consumer.drain():
+            if now_ms - message.t_ms > OLD_MS:
+                self.too_old += 1
+                continue
             command = self._planner.plan(message, self.digital_model)
             if command is not None:
                 self.planned += 1

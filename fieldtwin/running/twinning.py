@@ -1,0 +1,78 @@
+"""A digital twin at work: the shadow, and the way back. Its commands are a log that the thread brings to the plant."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from typing import Any
+
+from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing, limits_of
+from gateway.core.events import Consumer
+from gateway.core.values import COMMAND
+from gateway.store.event import KnowledgeStore
+from twin.instance import Instance
+from twin.knowledge import KnowledgeWriter
+from twin.mape.execute import Bounds
+from twin.mape.messages import Verdict
+from twin.mape.plan import Planner
+from twin.system import System
+from twin.thread import DTtoPTConnection, Operator, schema_of
+from twin.thread_end import ThreadEnd
+from twin.thread_link import Carrier
+from twin.twin import DigitalTwin
+
+
+class Twinning(Shadowing):
+    """As `Shadowing`, with a planner. `on_command` is told each command that is sent."""
+
+    shadow: DigitalTwin
+
+    def __init__(
+        self,
+        system: System,
+        place: str,
+        instance: Instance,
+        *,
+        store: str = "",
+        on_verdict: Callable[[Verdict], None],
+        on_command: Callable[[COMMAND], None],
+        planner: Planner,
+    ) -> None:
+        self._planner = planner
+        super().__init__(system, place, instance, store=store, on_verdict=on_verdict)
+        self._on_command = on_command
+        self._operator = Operator("twin", self.clock)
+        self._sent: Consumer[COMMAND] = Consumer(self.shadow.execute.transmitter.event)
+        self.shadow.execute.transmitter.subscribe(self._sent)
+        self._way_back: DTtoPTConnection | None = None
+        self._commands: KnowledgeWriter | None = None
+
+    def _make(self, system: System) -> DigitalTwin:
+        least_s, most_s = system.commands.period_s
+        return DigitalTwin(
+            self.receiving, self.clock, self._planner,
+            limits=limits_of(system), bounds=Bounds(least_s, most_s, system.commands.per_minute), stale_after_ms=STALE_AFTER_MS,
+        )  # fmt: skip
+
+    async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
+        name = self._system.name
+        origin = await store.own("twin", system=name, prototype=False, log=secrets.token_hex(4))
+        end = ThreadEnd(store, carrier, schema_of(self._system), self.clock, origin=origin, on_events=self._arrived)
+        self._commands = KnowledgeWriter(store, origin, self.clock, on_written=end.appended)
+        self._way_back = DTtoPTConnection(end, [self._operator], self._commands, self.clock)
+        return end
+
+    def plan(self, command: COMMAND) -> None:
+        """Somebody's plan, by hand: it goes the way of every other."""
+        self.shadow.execute.plans.observe(command)
+
+    async def _flush(self) -> None:
+        for command in self._sent.drain():
+            self._operator.command(command)
+            self._on_command(command)
+        if self._way_back is not None and self._commands is not None:
+            self._way_back.pump()
+            await self._commands.flush()
+
+    def describe(self) -> dict[str, Any]:
+        return {**super().describe(), "unconfirmed_commands": self._end.waiting if self._end is not None else 0}

@@ -1,0 +1,42 @@
+"""`fieldtwin twin` opposite a prototype: commands that reach the control logic, once, and only while the plant allows it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, wait_for
+
+
+@pytest.mark.slow
+def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_path: Path) -> None:
+    root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
+    shutil.copytree(CHECKOUT / "profiles", tmp_path / "profiles")
+    system = tmp_path / "profiles" / "systems" / "observatory.yaml"
+    system.write_text(system.read_text() + "commands: {period_s: [-1, 60], per_minute: 60}\n")
+    rules = tmp_path / "rules.yaml"
+    rules.write_text("rules: [{when: good, of: ctd.pressure, period_s: 3}]\n")
+    twin = ("twin", str(system), "--from", place, "--for", "60s", "--json")
+    with fieldtwin(
+        root, "run", str(system), "--prototype", "--commands", "none", "--for", "60s", "--thread", place
+    ) as run:
+        plant = run.control("observatory", "thread")
+        with fieldtwin(root, *twin, "--command", "1", "--plan", str(rules), name="first") as first:
+            wait_for(lambda: plant("get")["commands_taken"] == 2, 30, f"period 1, and by the rule 3; {first.err}")
+            first.process.kill()
+        with fieldtwin(root, *twin, name="second") as second:
+            wait_for(
+                lambda: plant("get")["links"] >= 2 and plant("get")["waiting"] == 0, 30, f"caught up; {second.err}"
+            )
+            second.signal(2)
+            assert second.wait(20) == 0, second.err
+        assert plant("get")["commands_taken"] == 2, "nothing is repeated"
+        run.signal(2)
+        run.wait(20)
+    seen = second.summary
+    assert (seen["state"], seen["period_s"], seen["sent"]) == ("ACTIVE", 3, 0)
+    audit = [json.loads(line) for line in (root / "observatory" / "audit.jsonl").read_text().splitlines()]
+    assert [a["payload"] for a in audit if a["action"] == "command"] == ["0001", "0003"]
+    no_tracebacks(root)

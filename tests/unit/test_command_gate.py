@@ -1,0 +1,148 @@
+"""What stands between a digital twin and its plant: the plant's switch, its limits, its rate, and no number twice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fieldtwin.running.twin_rules import load_planner
+from gateway.core.errors import FileInvalid
+from gateway.core.statemachine import decode_period, encode_period
+from gateway.store.event import Event, Kind
+from twin.command_gate import CommandGate
+from twin.mape.execute import Bounds
+from twin.mape.messages import verdict
+from twin.model import DigitalModel
+from twin.system import load_system
+
+OBSERVATORY = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.yaml"
+NOW_MS = 1_790_000_000_000
+
+
+class Hands:
+    now_ms = NOW_MS
+
+    def monotonic_ns(self) -> int:
+        return self.now_ms * 1_000_000
+
+    utc_ns = monotonic_ns
+
+    async def sleep_until_ns(self, deadline_ns: int) -> None:
+        raise AssertionError("nobody waits here")
+
+
+def gate(*, remote: bool = True, bounds: Bounds = Bounds(0, 3600, 5)) -> CommandGate:  # noqa: B008
+    return CommandGate(remote=remote, bounds=bounds, clock=Hands())
+
+
+def number(n: int, period_s: int = 1, t_ms: int = NOW_MS) -> Event:
+    return Event(n, t_ms, Kind.COMMAND, "twin", encode_period(period_s).data)
+
+
+def refusals(made: CommandGate) -> list[str]:
+    return [str(e.value) for e in made.collect() if e.kind == Kind.REFUSAL]
+
+
+def test_what_is_admitted_is_the_command_bit_by_bit_and_on_record() -> None:
+    made = gate()
+    command = made.admit("twin:1", number(1, 5))
+    assert command is not None
+    assert decode_period(command) == 5
+    (event,) = made.collect()
+    assert (event.kind, event.name, event.value) == (Kind.COMMAND, "twin:1", encode_period(5).data)
+
+
+@given(numbers=st.lists(st.integers(1, 8), max_size=30))
+def test_no_number_is_taken_twice_and_none_after_a_later_one(numbers: list[int]) -> None:
+    made = gate(bounds=Bounds(per_minute=1000))
+    taken = [n for n in numbers if made.admit("twin:1", number(n)) is not None]
+    assert taken == sorted(set(taken))
+    assert len(refusals(made)) == len(numbers) - len(taken)
+
+
+@pytest.mark.parametrize(
+    ("made", "event", "why"),
+    [
+        (gate(remote=False), number(1), "the plant says local"),
+        (gate(), number(1, -1), "allowed are 0 to 3600 s"),
+        (gate(), number(1, t_ms=NOW_MS - 601_000), "601 s old"),
+        (gate(), Event(1, NOW_MS, Kind.COMMAND, "twin", "words"), "expected 2 bytes"),
+    ],
+)
+def test_a_refusal_has_its_reason_and_is_kept(made: CommandGate, event: Event, why: str) -> None:
+    assert made.admit("twin:1", event) is None
+    (said,) = refusals(made)
+    assert why in said
+    assert said.startswith("number 1 of twin:1")
+
+
+def test_the_rate_is_bounded_and_recovers() -> None:
+    made = gate()
+    assert [made.admit("t", number(n)) is not None for n in range(1, 8)] == [True] * 5 + [False] * 2
+    Hands.now_ms += 61_000
+    try:
+        assert made.admit("t", number(9, t_ms=Hands.now_ms)) is not None
+    finally:
+        Hands.now_ms = NOW_MS
+
+
+def test_what_is_no_command_is_none_of_its_business() -> None:
+    made = gate()
+    assert made.admit("twin:1", Event(1, NOW_MS, Kind.VERDICT, "x", "y")) is None
+    assert made.collect() == []
+
+
+def test_a_system_file_says_what_may_be_commanded(tmp_path: Path) -> None:
+    system = load_system(str(OBSERVATORY))
+    assert (system.commands.period_s, system.commands.per_minute) == ([-32768, 32767], 60)
+    text = OBSERVATORY.read_text()
+    mine = tmp_path / "observatory.yaml"
+    mine.write_text(text + "commands: {period_s: [0, 60], per_minute: 6}\n")
+    (tmp_path / "relay.st").write_text((OBSERVATORY.parent / "relay.st").read_text())
+    assert load_system(str(mine)).commands.period_s == [0, 60]
+    mine.write_text(text + "commands: {period_s: [60, 0]}\n")
+    with pytest.raises(FileInvalid, match="the smallest and the largest"):
+        load_system(str(mine))
+
+
+# -- rules ------------------------------------------------------------------------------------------------------------------
+
+
+def test_rules_are_read_and_the_first_that_fits_decides(tmp_path: Path) -> None:
+    rules = tmp_path / "rules.yaml"
+    rules.write_text("rules:\n  - {when: outside, of: ctd.pressure, period_s: 1}\n  - {when: stale, period_s: 0}\n")
+    planner, model = load_planner(str(rules), load_system(str(OBSERVATORY))), DigitalModel()
+    command = planner.plan(verdict("outside", "ctd.pressure", "", 0), model)
+    assert command is not None
+    assert decode_period(command) == 1
+    assert planner.plan(verdict("outside", "ctd.temperature", "", 0), model) is None
+    model.process_event(encode_period(7))
+    assert planner.plan(verdict("stale", "anything", "", 0), model) == encode_period(0)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("rules: [{when: ouside, period_s: 1}]", "ouside"),
+        ("rules: [{when: outside, of: ctd.presure, period_s: 1}]", "observatory has no 'ctd.presure'"),
+        ("rules: [{when: outside, period_s: 99999}]", "32767"),
+        ("rules: []", "rules"),
+    ],
+)
+def test_what_is_wrong_with_rules_is_said_with_its_line(tmp_path: Path, text: str, why: str) -> None:
+    rules = tmp_path / "rules.yaml"
+    rules.write_text(text)
+    with pytest.raises(FileInvalid, match=why) as caught:
+        load_planner(str(rules), load_system(str(OBSERVATORY)))
+    assert caught.value.line == 1
+
+
+def test_a_planner_in_python_is_made_or_refused(tmp_path: Path) -> None:
+    system = load_system(str(OBSERVATORY))
+    with pytest.raises(FileInvalid, match="cannot be made: ModuleNotFoundError"):
+        load_planner("python: no_such_module:Planner", system)
+    with pytest.raises(FileInvalid, match="not a planner"):
+        load_planner("python: collections:OrderedDict", system)

@@ -76,6 +76,7 @@ async def run_device(
             wires = [Endpoint.parse(url) for url in endpoints]
             if kind == "recording":
                 units = host.replayed(path, unit_id, unknown, at_end)
+                wires = [as_it_was_recorded(wire, header_of(path).endpoint) for wire in wires]
             else:
                 profile = load_profile(path)
                 wires = [_as_from_the_factory(wire, profile) for wire in wires]
@@ -251,6 +252,14 @@ class DeviceHost:
     async def aclose(self) -> None:
         for thing in reversed(self._closing):
             await thing.aclose()
+
+
+def as_it_was_recorded(wire: Endpoint, recorded: str) -> Endpoint:
+    """What is not said of a serial port's settings is as it was where the device was recorded, if that was a line."""
+    then = Endpoint.parse(recorded) if recorded.partition(":")[0] in SERIAL_SCHEMES else None
+    if then is None or wire.scheme not in ("pty", *SERIAL_SCHEMES) or _is_ascii(wire) != (then.scheme == "ascii"):
+        return wire
+    return replace(wire, params=tuple((dict(then.params) | dict(wire.params)).items()))
 
 
 def _as_from_the_factory(wire: Endpoint, profile: DeviceProfile) -> Endpoint:

@@ -43,7 +43,7 @@ from fieldtwin.recording.polling import (
 from fieldtwin.recording.rotating import RotatingFile, exchanges_of, parts_of
 from fieldtwin.recording.sinks import CanLogSink, ExchangeSink, LineSink
 from fieldtwin.recording.tapping import LineTap
-from fieldtwin.running.device_here import DeviceHost
+from fieldtwin.running.device_here import DeviceHost, as_it_was_recorded
 from gateway.connections.os_connector import OsConnector
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
@@ -417,3 +417,17 @@ def test_parts_are_bounded_and_the_oldest_go(tmp_path: Path) -> None:
         for n, line in enumerate(lines[:35]):
             file.line(float(n), line)
     assert len(file.parts) == 4
+
+
+@pytest.mark.parametrize(
+    ("wire", "recorded", "settings"),
+    [
+        ("rtu:/tmp/x", "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1", (9600, "8N1")),
+        ("rtu:/tmp/x?baudrate=38400", "rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1", (38400, "8N1")),
+        ("rtu:/tmp/x", "tcp://10.0.0.1:502", (19200, "8E1")), ("rtu:/tmp/x", "", (19200, "8E1")),
+        ("rtu:/tmp/x", "ascii:/dev/ttyUSB0?baudrate=9600", (19200, "8E1")),
+    ],
+)  # fmt: skip
+def test_a_virtual_port_is_as_fast_as_the_recorded_one(wire: str, recorded: str, settings: tuple[int, str]) -> None:
+    serial = as_it_was_recorded(Endpoint.parse(wire), recorded).serial
+    assert (serial.baudrate, serial.frame) == settings

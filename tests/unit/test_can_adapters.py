@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from support import eventually, run
 
+from emulators.canopen.dictionary import parse_eds
+from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.canopen.serve import serve_node
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.endpoints.slcan_port import SlcanPort
+from fieldtwin.commissioning.scan_canopen import CanScanner, CanScanOptions
 from gateway.connections.can_adapter import AdapterConnection
 from gateway.connections.os_connector import OsConnector
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, UsageError
+from gateway.core.nursery import Nursery
+from gateway.wallclock import WallClock
 
 FRAMES = (
     CanFrame(0x705, b"\x05"),
@@ -85,5 +93,22 @@ def test_what_cannot_be_is_said_in_one_line(url: str, bitrate: int, says: str) -
     async def main() -> None:
         with pytest.raises(UsageError, match=says):
             await OsConnector().open_can(Endpoint.parse(url), bitrate)
+
+    run(main())
+
+
+def test_a_scan_by_an_adapter_finds_the_node_behind_another_one() -> None:
+    async def main() -> None:
+        url = "can:virtual/commissioning-2"
+        theirs = await OsConnector().open_can(Endpoint.parse(url), 0)
+        node = CanopenNode(parse_eds(Path("profiles/devices/encoder-cia406.eds").read_text()), 9, NodeContext())
+        async with Nursery() as nursery:
+            nursery.start(serve_node(theirs, node, WallClock()), "node")
+            options = CanScanOptions(nodes=(9,), listen_s=0.1, timeout_s=1, lss=False, share_bus=True)  # it boots
+            found = await CanScanner(url, options).run()
+            assert [(n.node, n.answers) for n in found.nodes] == [(9, True)]
+            assert found.facts is not None
+            assert found.facts.can_listen_only
+        await theirs.aclose()
 
     run(main())

@@ -288,7 +288,8 @@ class Runner:
         if (said := self._whole.look()) is not None:
             verdict = self._of_lateness("plc.late" in said.names)
             since_s = self.bench.now_s() - said.bound_s - RECENT_S
-            raise _Broken(verdict, f"{said.number}: {said.expected}", said.got, said.bound_s, since_s)
+            got = "; ".join([said.got, *([self._seen(names)] if (names := self._readable(said.names)) else [])])
+            raise _Broken(verdict, f"{said.number}: {said.expected}", got, said.bound_s, since_s)
         excused = [self._is_excused(one) for _, one in self._never]
         while self._watched:
             exchange = self._watched.popleft()
@@ -378,6 +379,10 @@ class Runner:
     def _seen_of(self, expression: Expression) -> str:
         late = [f"scans up to {self.bench.late_ms():.3g} ms late"] if expression.asks_lateness else []
         return "; ".join([*late, *([self._seen(expression.names)] if expression.names else [])])
+
+    def _readable(self, names: Iterable[str]) -> list[str]:
+        """Those that have a value: no device, nor ``plc.late``."""
+        return [name for name in names if name in self.scenario.known]
 
     def _seen(self, names: Iterable[str]) -> str:
         told = []

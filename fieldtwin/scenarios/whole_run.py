@@ -132,7 +132,7 @@ class _Within:
         if self.then.evaluate(look):
             self.due_s = None
         elif now_s >= self.due_s:
-            got = f"after at {self._since_s:.3f} s, not then until {now_s:.3f} s"
+            got = f"that was at {self._since_s:.3f} s, and not so until {now_s:.3f} s"
             return Violation(self.number, self.text, got, (*self.after.names, *self.then.names), self.limit_s)
         return None
 

@@ -221,6 +221,7 @@ def test_a_lost_reply_is_asked_for_again_and_a_hole_is_not_invented(tmp_path: Pa
     async def main() -> None:
         noisy = wired(mute=lambda adu, before: before % 3 == 2)
         await dump(job(functions=False), tmp_path / "d.jsonl", words="", connector=noisy, clock=loop())
+        assert "silent" not in (tmp_path / "d.jsonl").read_text()
         found = load_dump(tmp_path / "d.jsonl").passes[0].cells
         assert {a for t, a in found if t == "holding"} == {*range(30), *range(40, 100)}
 

@@ -139,6 +139,10 @@ def test_the_same_answer_again_is_no_evidence() -> None:
     assert series.passes == 20
     assert without_repetitions(series).passes == 5
     assert all(r.level is not Level.CERTAIN or r.type == "string" for r in infer(series).readings)
+    fields = hidden_device(6, 12)
+    slow = [Hidden(f.address, f.kind, f.order, [row for row in f.rows for _ in range(3)]) for f in fields]
+    once, thrice = infer(series_of_fields(fields)).readings, infer(series_of_fields(slow)).readings
+    assert [(r.address, r.type, r.probability) for r in once] == [(r.address, r.type, r.probability) for r in thrice]
 
 
 def test_a_word_that_makes_sense_with_both_neighbours_is_doubtful() -> None:

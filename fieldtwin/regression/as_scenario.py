@@ -166,28 +166,32 @@ def _looks(system: System, story: Story, wanted: Wanted, begin_ns: int, look_ns:
         if now is None or rested(changes):
             continue
         value, quality = now.says()
+        device, _, tag = name.partition(".")
+        counts = device in system.devices and system.devices[device].profile.tags[tag].counter
         said = [f"tag: {name}", f"quality: {quality}"]
         restless = sum(begin_ns <= c.t_ns <= look_ns for c in changes) > RESTLESS
         if quality == "good" and restless:
-            size = max((abs(c.value) for c in changes if isinstance(c.value, int | float)), default=0.0)
-            tolerance = max(wanted.share * size, _slack(changes, story))
+            size: float = max((abs(c.value) for c in changes if isinstance(c.value, int | float)), default=0.0)
+            tolerance = max(wanted.share * size, _slack(changes, story, counts=counts))
             said += ["like: recording", f"tolerance: {_number(tolerance)}"]
         elif isinstance(value, bool | str):
             said += [f"value: {json.dumps(value)}"]
         elif isinstance(value, int | float) and not restless:
             said += [f"value: {_literal(value)}"]
-            tolerance = max(wanted.share * abs(value) if isinstance(value, float) else 0, _slack(changes, story))
+            share = wanted.share * abs(value) if isinstance(value, float) else 0
+            tolerance = max(share, _slack(changes, story, counts=counts))
             said += [f"tolerance: {_number(tolerance)}"] if tolerance else []
         yield f"expect: {{{', '.join(said)}, {within}}}"
 
 
-def _slack(changes: list[Change], story: Story) -> float:
-    """How far a field that moves by itself may have got meanwhile: its largest step. 0 for one that commands alone have changed:
-    that one is known exactly."""
+def _slack(changes: list[Change], story: Story, *, counts: bool = False) -> float:
+    """How far a field that moves by itself may have got meanwhile: its largest step, of what `counts` in its device two at
+    least. 0 for one that commands alone have changed: that one is known exactly."""
     numbers = [c.value for c in changes if isinstance(c.value, int | float) and not isinstance(c.value, bool)]
-    if len(changes) <= len(story.commands) + 2:
+    if len(changes) <= len(story.commands) + 2 and not counts:
         return 0
-    return max((abs(b - a) for a, b in pairwise(numbers)), default=0)
+    steps = [abs(b - a) for a, b in pairwise(numbers)]
+    return max([*steps, 2.0 if counts else 0.0])
 
 
 def _at(changes: list[Change], t_ns: int) -> Change | None:

@@ -89,7 +89,8 @@ def compare(old: Story, new: Story, allowed: Allowed | None = None) -> Verdict:
                 there, missing = "there", "not there"
                 found.append(Difference("field", name, there if one else missing, there if other else missing))
             else:
-                found += judge(name, one, other, end_ns, allowed)
+                window_ns = max(round(allowed.window_s * NS_PER_S), old.pace_ns(name), new.pace_ns(name))
+                found += judge(name, one, other, end_ns, window_ns, allowed)
     compared += len(old.latency_ns)
     found += _latencies(old, new, allowed) + _problems(old, new, allowed)
     return Verdict(compared, tuple(found[:MOST_SHOWN]))
@@ -99,9 +100,10 @@ def _until(changes: list[Change], end_ns: int) -> list[Change]:
     return [change for change in changes if change.t_ns <= end_ns]
 
 
-def _states(name: str, old: list[Change], new: list[Change], end_ns: int, allowed: Allowed) -> list[Difference]:
+def _states(
+    name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
+) -> list[Difference]:
     """The same values in the same order, each in time. Behind the last window's begin one of both may have one more."""
-    window_ns = round(allowed.window_s * NS_PER_S)
     for one, other in zip(old, new, strict=False):
         if not allowed.near(name, one.value, other.value):
             return [Difference("order", name, str(one), str(other), other.t_ns / NS_PER_S)]
@@ -130,9 +132,10 @@ def _otherwhen(name: str, one: Change, other: Change) -> Difference:
     )
 
 
-def _values(name: str, old: list[Change], new: list[Change], end_ns: int, allowed: Allowed) -> list[Difference]:
-    """Whatever one of both was, the other was as well, within the window."""
-    window_ns = round(allowed.window_s * NS_PER_S)
+def _values(
+    name: str, old: list[Change], new: list[Change], end_ns: int, window_ns: int, allowed: Allowed
+) -> list[Difference]:
+    """Whatever one of both became, the other was as well, within the window."""
     for one, other, swapped in ((old, new, False), (new, old, True)):
         unmatched = list(_unmatched(name, one, other, end_ns, window_ns, allowed))
         if not unmatched:
@@ -150,12 +153,11 @@ def _unmatched(
 ) -> list[tuple[Change, Change | None]]:
     times = [change.t_ns for change in other]
     found: list[tuple[Change, Change | None]] = []
-    for n, change in enumerate(one):
-        until_ns = one[n + 1].t_ns if n + 1 < len(one) else end_ns
+    for change in one:
         if change.t_ns > end_ns - window_ns:
             break  # the other run may not have come to it
         first = max(0, bisect_right(times, change.t_ns - window_ns) - 1)
-        last = bisect_right(times, until_ns + window_ns)
+        last = bisect_right(times, change.t_ns + window_ns)
         around = other[first:last]
         if not any(_alike(name, change, seen, allowed) for seen in around) and not _between(name, change, around):
             found.append((change, around[len(around) // 2] if around else None))

@@ -73,7 +73,7 @@ def test_on_a_line_the_units_are_found(peer: str, short_dir: Callable[[], Path])
 def test_pymodbus_on_tcp_says_which_units_are_missing() -> None:
     async def main() -> None:
         async with serving("pymodbus", "mbap", [5, 9]) as port:
-            found = await scan(f"tcp://127.0.0.1:{port}", units=(4, 5, 6, 9), timeout_s=0.3)
+            found = await scan(f"tcp://127.0.0.1:{port}", units=(4, 5, 6, 9), timeout_s=1.0)
             assert [f.answer.unit for f in found.units if not f.answer.exception] == [5, 9]
             told = await identify_modbus(f"tcp://127.0.0.1:{port}", 5, SHIPPED, timeout_s=0.3, per_s=1000)
         assert told.answers

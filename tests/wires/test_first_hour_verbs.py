@@ -66,7 +66,7 @@ def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
         async with Nursery() as nursery:
             nursery.start(answer_at(end, termios.B19200), "device")
             log = tmp_path / "log.jsonl"
-            words = ("--units", "4-6", "--listen-for", "0", "--timeout", "50ms", "--rate", "100", "--log", str(log))
+            words = ("--units", "4-6", "--listen-for", "0", "--timeout", "200ms", "--rate", "100", "--log", str(log))
             code, found, talk = await fieldtwin("scan", url, *words)
             assert code == 0, talk
             assert [(u["unit"], u["settings"][:5]) for u in found["units"]] == [(5, "19200")]
@@ -97,7 +97,7 @@ def test_rtu_over_tcp_and_nobody_there() -> None:
     async def main() -> None:
         server = await asyncio.start_server(serve, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
-        code, found, _ = await fieldtwin("scan", f"rtu+tcp://127.0.0.1:{port}", "--units", "4-6", "--timeout", "100ms")
+        code, found, _ = await fieldtwin("scan", f"rtu+tcp://127.0.0.1:{port}", "--units", "4-6", "--timeout", "300ms")
         assert (code, [u["unit"] for u in found["units"]]) == (0, [5])
         server.close()
         await server.wait_closed()
@@ -113,7 +113,7 @@ def test_a_drive_on_the_software_bus() -> None:
         node = CanopenNode(parse_eds(DRIVE.read_text()), 7, NodeContext())
         async with Nursery() as nursery:
             nursery.start(serve_node(server.attach("drive"), node, WallClock()), "drive")
-            words = ("--nodes", "6-8", "--listen-for", "0.3", "--no-lss")
+            words = ("--nodes", "7-8", "--listen-for", "0.3", "--timeout", "500ms", "--no-lss")
             code, found, talk = await fieldtwin("scan", str(server.bound), *words)
             assert code == 0, talk
             assert (found["bitrate"], [n["node"] for n in found["nodes"]]) == (250_000, [7])

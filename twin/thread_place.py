@@ -1,10 +1,12 @@
-"""Where a thread goes, as a URL: ``tcp://HOST:PORT`` (the plant listens, its twin comes), or a broker with Sparkplug B,
+"""Where a thread goes, as a URL: ``tcp://127.0.0.1:PORT`` on one computer, ``tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE`` between
+two (the plant listens, its twin comes, both show a certificate), or a broker with Sparkplug B,
 ``mqtt://[USER@]HOST[:PORT]/GROUP/NODE[?host=NAME]``. A password stands in FIELDTWIN_MQTT_PASSWORD, never in a URL.
 """
 
 from __future__ import annotations
 
 import os
+from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
@@ -18,7 +20,7 @@ from twin.thread import schema_of
 from twin.thread_link import Carrier
 from twin.thread_tcp import TcpDialler, TcpListening
 
-EXPECTED = "tcp://HOST:PORT, or mqtt://HOST/GROUP/NODE"
+EXPECTED = "tcp://127.0.0.1:PORT, tls://HOST:PORT?..., or mqtt://HOST/GROUP/NODE"
 DEFAULT_HOST = "fieldtwin"
 MQTT_PORT = 1883
 
@@ -27,7 +29,13 @@ async def plant_carrier(place: str, system: System, clock: Clock) -> tuple[Carri
     """The plant's side, and where it is to be found: a free port is taken where the URL says 0. Raises `UsageError`."""
     if place.startswith("mqtt:"):
         return _mqtt(place, clock, system), place
-    listening = await TcpListening.start(_tcp(place), TcpListener.open, [schema_of(system)])
+    endpoint = _stream(place)
+    if endpoint.scheme == "tcp" and not _is_loopback(endpoint.host):
+        raise UsageError(
+            "whoever reaches this port may command the plant", expected="a loopback address, or tls://", got=place,
+            hint="tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE asks for a certificate",
+        )  # fmt: skip
+    listening = await TcpListening.start(endpoint, TcpListener.open, [schema_of(system)])
     return listening, str(listening.bound)
 
 
@@ -35,14 +43,21 @@ def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
     """The digital twin's side. Raises `UsageError`."""
     if place.startswith("mqtt:"):
         return _mqtt(place, clock, None)
-    return TcpDialler(_tcp(place), OsConnector(), [schema_of(system)])
+    return TcpDialler(_stream(place), OsConnector(), [schema_of(system)])
 
 
-def _tcp(place: str) -> Endpoint:
+def _stream(place: str) -> Endpoint:
     endpoint = Endpoint.parse(place)
-    if endpoint.scheme != "tcp":
+    if endpoint.scheme not in ("tcp", "tls"):
         raise UsageError("a thread cannot go there", expected=EXPECTED, got=place)
     return endpoint
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
 
 
 def _mqtt(place: str, clock: Clock, plant: System | None) -> Carrier:

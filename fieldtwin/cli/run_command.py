@@ -91,7 +91,7 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     "--thread",
     default="",
     metavar="URL",
-    help="A digital thread for `fieldtwin shadow`: tcp://HOST:PORT to listen on, or mqtt://HOST/GROUP/NODE.",
+    help="A digital thread for `fieldtwin shadow` and `twin`: tcp://127.0.0.1:PORT or tls://... to listen on, or mqtt://HOST/GROUP/NODE.",
 )
 @click.option(
     "--thread-store", default="", metavar="FILE|URL", help="What keeps the thread's log; default: in the run directory."

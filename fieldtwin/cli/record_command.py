@@ -105,7 +105,7 @@ def command(
     Play it with `fieldtwin emulate`, hold a device against it with `fieldtwin compare`.
     """
     if as_scenario:
-        return _scenario_of(endpoint, as_scenario, out)
+        return _scenario_of(endpoint, as_scenario, out, options["profiles"])
     job = _Job(out, for_s, as_json, options)
     if taps is not None:
         if endpoint or like or options["profile_name"]:
@@ -139,7 +139,7 @@ def command(
     return job.polls(target, ProfileRound(target.profile, target.address, options["groups"]), target.profile.name)
 
 
-def _scenario_of(run: str | None, system: str, out: Path) -> int:
+def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[str, ...]) -> int:
     """A recorded run as a scenario, with the tolerances that `fieldtwin trace --as-scenario` has by itself."""
     from fieldtwin.cli.regression_view import write_scenario
     from fieldtwin.regression.comparing import Allowed
@@ -147,7 +147,8 @@ def _scenario_of(run: str | None, system: str, out: Path) -> int:
 
     if run is None:
         raise UsageError("which run?", expected="the file of run --virtual --trace, or of run --capture")
-    return write_scenario(load_system(system), Path(run), out, system, allowed=Allowed(), seed=None, values=False)
+    plant = load_system(system, [Path(p) for p in profiles])
+    return write_scenario(plant, Path(run), out, system, allowed=Allowed(), seed=None, values=False)
 
 
 def _end(text: str) -> Endpoint:

@@ -1,6 +1,6 @@
 """A recorded run as a scenario: what came in becomes its stimuli, what followed its expectations, with tolerance and window.
 
-Stimuli are the commands of the far end and, where asked for, what devices said; the emulators of the scenario's prototype
+Stimuli are the commands of the far end, faults and, where asked for, what devices said; the emulators of the scenario's prototype
 play their recordings by themselves. Pure: a `Story` in, text out.
 """
 
@@ -66,15 +66,17 @@ def as_scenario(system: System, story: Story, wanted: Wanted) -> str:
         f"system: {json.dumps(wanted.system)}",
     ]
     lines += [f"seed: {wanted.seed}"] if wanted.seed is not None else []
-    lines += [f"# {fault}" for fault in _faults(story)]
     return "\n".join([*lines, "steps:", *(f"  - {step}" for step in steps), ""])
 
 
-def _faults(story: Story) -> Iterator[str]:
-    """Faults stand in a trace by name, without their parameters: they are said, and have to be put in by hand."""
+def _faults(story: Story) -> Iterator[_Stimulus]:
+    """Faults put in and taken away, with all that was said of them."""
     for event in story.faults:
-        if event.data.get("on"):
-            yield f"at {_s(event.t_ns)} the fault {event.data.get('name')} was put in at {event.data.get('target')}"
+        if not event.data.get("on"):
+            yield _Stimulus(event.t_ns, f"clear: {json.dumps(event.where)}")
+        else:
+            said = {**event.data.get("said", {"name": event.data.get("name")}), "id": event.where}
+            yield _Stimulus(event.t_ns, f"fault: {json.dumps(said, ensure_ascii=False)}")
 
 
 def _stimuli(system: System, story: Story, wanted: Wanted) -> Iterator[_Stimulus]:
@@ -83,6 +85,7 @@ def _stimuli(system: System, story: Story, wanted: Wanted) -> Iterator[_Stimulus
             yield _Stimulus(came.t_ns, f"send: {{period_s: {decode_period(COMMAND(came.payload))}}}")
         except FieldtwinError:
             continue  # no command that a scenario can send: what the system made of it is expected all the same
+    yield from _faults(story)
     if not wanted.values:
         return
     for name, changes in sorted(story.tags.items()):

@@ -13,7 +13,8 @@ from typing import Any
 
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.scenarios.trace import FAR_END, Event, Kind
+from gateway.core.statemachine import encode_period
 from twin.system import System
 
 MOST = 200_000
@@ -41,7 +42,7 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Came:
-    """A command that came in from the far end of `device`: its payload."""
+    """A command of the far end of `device`: its payload. As it was sent, or, where that was not seen, as it came in."""
 
     t_ns: int
     device: str
@@ -86,6 +87,7 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
     """Read events in their order. Of a capture, which has frames alone, tags are what devices answered."""
     story, decoder = Story(), Decoder(system)
     answered: list[tuple[str, Change]] = []
+    sent: list[Came] = []
     boxes: dict[str, tuple[int, ...]] = {}
 
     def take(exchanges: Iterable[Exchange]) -> None:
@@ -111,7 +113,10 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
             story.note(story.states, event.where, Change(event.t_ns, event.data.get("value")))
         elif event.kind is Kind.FAULT:
             story.faults.append(event)
+        elif event.kind is Kind.NOTE and event.where == FAR_END and isinstance(event.data.get("period_s"), int):
+            sent.append(Came(event.t_ns, event.where, encode_period(event.data["period_s"]).data))
     take(decoder.finish())
+    story.commands = sent or story.commands
     if not story.tags:
         for name, change in answered:
             story.note(story.tags, name, change)

@@ -229,7 +229,7 @@ class ControlBench:
     async def inject(self, fault: dict[str, Any]) -> None:
         answer = await self._to_field("fault", fault=fault, start_ns=self._start_ns)
         target = fault.get("device") or fault.get("bus") or ""
-        self._note(Kind.FAULT, answer["id"], {"name": fault["name"], "on": True, "target": target})
+        self._note(Kind.FAULT, answer["id"], {"name": fault["name"], "on": True, "target": target, "said": fault})
 
     async def clear(self, id: str) -> None:
         await self._to_field("clear", id=id)

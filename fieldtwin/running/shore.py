@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -104,6 +105,8 @@ class Shore:
         self.commands_sent: list[int] = []
         self.responses: deque[bytes] = deque(maxlen=KEPT_RESPONSES)
         self.responses_received = 0
+        self.on_send: Callable[[int], None] | None = None
+        """Told of each period at the moment when it is commanded."""
 
     async def run(self, commands: list[Scripted]) -> None:
         """Serve the far end until cancelled, sending each command at its time."""
@@ -121,7 +124,9 @@ class Shore:
         start_ns = self._clock.monotonic_ns()
         while not self._halted:
             now_ns = self._clock.monotonic_ns()
-            while commands and now_ns - start_ns >= round(commands[0].at_s * NS_PER_S):  # else less than 1 ns may be left
+            while commands and now_ns - start_ns >= round(
+                commands[0].at_s * NS_PER_S
+            ):  # else less than 1 ns may be left
                 self.send(commands.popleft().period_s)
             for response in self._inbox.drain():
                 self.responses_received += 1
@@ -146,6 +151,8 @@ class Shore:
         self._driver.consumer.observe(encode_period(period_s))
         self._news.set()
         self.commands_sent.append(period_s)
+        if self.on_send is not None:
+            self.on_send(period_s)
 
     def _exchange(self) -> None:
         driver = self._driver

@@ -17,7 +17,7 @@ from fieldtwin.running.shore import Scripted, Shore
 from fieldtwin.running.states import state_words
 from fieldtwin.scenarios.bench import Can, Reading
 from fieldtwin.scenarios.probe_form import Probe
-from fieldtwin.scenarios.trace import Kind, Trace
+from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.connection import Direction
@@ -91,6 +91,7 @@ class VirtualBench:
         device = next(iter(self.run.field.far), None)
         if device is not None and self._far_end:
             self.shore = Shore(self.system, device, self.run.field.far[device], self.run.clock, self.run.net)
+            self.shore.on_send = self._commanded
             nursery = await self._stack.enter_async_context(Nursery())
             nursery.start(self.shore.run(self._commands), "far end")
         if Can.PROBE in self.can:
@@ -127,6 +128,9 @@ class VirtualBench:
     def note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
         """Something happened now."""
         self.trace.note(self.now_ns, kind, where, data)
+
+    def _commanded(self, period_s: int) -> None:
+        self.note(Kind.NOTE, FAR_END, {"text": f"commands {period_s} s", "period_s": period_s})
 
     def _put(self, name: str, value: TagValue) -> None:
         self._updates[name] = self._updates.get(name, 0) + 1
@@ -200,7 +204,7 @@ class VirtualBench:
     async def inject(self, fault: dict[str, Any]) -> None:
         id = self.run.field.faults.inject(fault)
         target = fault.get("device") or fault.get("bus") or ""
-        self.note(Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target})
+        self.note(Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault})
 
     async def clear(self, id: str) -> None:
         self.run.field.faults.clear(id)

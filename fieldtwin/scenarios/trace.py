@@ -16,6 +16,7 @@ import msgspec
 
 CAPACITY = 200_000
 _HASHED_AT_ONCE = 256
+FAR_END = "far end"
 
 
 class Kind(Enum):
@@ -25,9 +26,9 @@ class Kind(Enum):
                             ``ext``, ``err`` where they are set. Bytes of a stream are as the medium cut them
     TAG     a tag           ``value``, ``quality``, ``reason``: what the gateway publishes
     STATE   PROGRAM.VARIABLE  ``value``: an output or local of a program that changed
-    FAULT   a fault's id    ``name``, ``on`` true | false, ``target``
+    FAULT   a fault's id    ``name``, ``on`` true | false, ``target``; ``said``, as a fault file has it, while on
     STEP    a step's number ``text``, ``verdict`` once it has one
-    NOTE    who says it     ``text``
+    NOTE    who says it     ``text``; of the far end (`FAR_END`) ``period_s``, when it commands one
     """
 
     FRAME = "frame"

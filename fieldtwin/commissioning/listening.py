@@ -43,6 +43,11 @@ class LineVerdict:
     others: tuple[SerialSettings, ...] = ()
     heard: Heard | None = None
 
+    @property
+    def fits(self) -> tuple[SerialSettings, ...]:
+        """All settings at which what was heard makes sense."""
+        return (self.settings, *self.others)
+
 
 def dwell_over(heard: Heard, elapsed_s: float) -> bool:
     """Whether this setting has been listened to for long enough."""

@@ -161,16 +161,13 @@ class ModbusScanner:
         said = plan.settings_said(self._endpoint)
         if not await self._listen(said):
             return
-        verdict, options = self.result.verdict, self._options
-        if verdict is not None:
-            await self._steps([self._pace.step(verdict.settings, self._units)], "every unit")
-        elif said is not None:
-            await self._steps([self._pace.step(said, self._units)], "every unit")
-        else:
+        verdict = self.result.verdict
+        here = said if verdict is None or (said is not None and said in verdict.fits) else verdict.settings
+        if here is None:
             await self._search()
             return
-        if options.every_setting and not self._ended:
-            here = verdict.settings if verdict else said
+        await self._steps([self._pace.step(here, self._units)], "every unit")
+        if self._options.every_setting and not self._ended:
             await self._search_all([self._pace.step(here, self._units)])
 
     async def _search(self) -> None:
@@ -229,6 +226,11 @@ class ModbusScanner:
             return False
         if result.verdict is None:
             result.notes.append("what is heard makes no sense at any setting: nothing was sent into it")
+            return False
+        if not result.verdict.sure and said not in result.verdict.fits:
+            result.notes.append(
+                "the settings are not proved, and a wrong guess would disturb the others: say baudrate and frame"
+            )
             return False
         return True
 

@@ -135,26 +135,33 @@ async def _inside(
 async def _run_program(argv: list[str], env: Mapping[str, str]) -> int:
     loop = asyncio.get_running_loop()
     terminated = asyncio.Event()
-    try:
-        process = await asyncio.create_subprocess_exec(*argv, env={**os.environ, **env})
-    except OSError as e:
-        raise UsageError(f"cannot start {argv[0]!r}: {e.strerror or e}") from e
+    process: asyncio.subprocess.Process | None = None
+    early: list[int] = []
 
     def pass_on(number: int) -> None:
+        if process is None:
+            early.append(number)
+            return
         with suppress(ProcessLookupError):
             process.send_signal(number)
 
     def interrupted() -> None:
-        if not _has_terminal():  # else the terminal told the program, too
+        if process is None or not _has_terminal():  # else the terminal told the program, too
             pass_on(signal.SIGINT)
 
     def to_end() -> None:
         pass_on(signal.SIGTERM)
         terminated.set()
 
-    loop.add_signal_handler(signal.SIGINT, interrupted)
+    loop.add_signal_handler(signal.SIGINT, interrupted)  # before there is a program that could be told past us
     loop.add_signal_handler(signal.SIGTERM, to_end)
     try:
+        try:
+            process = await asyncio.create_subprocess_exec(*argv, env={**os.environ, **env})
+        except OSError as e:
+            raise UsageError(f"cannot start {argv[0]!r}: {e.strerror or e}") from e
+        for number in early:
+            pass_on(number)
         ended = asyncio.ensure_future(process.wait())
         told = asyncio.ensure_future(terminated.wait())
         try:

@@ -64,7 +64,8 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Dang
     asked += [(Danger.READ, f"the probe {probe.name}") for probe in scenario.probes]
     for danger, what in asked:
         if danger.rank > allowed.rank:
-            return f"{what} is of the class {danger.value}, and the target {target} allows {allowed.value}"
+            said = f"{what} is of the class {danger.value}, and the target {target} allows {allowed.value}"
+            return f"{said} (--allow {danger.value})"
     return ""
 
 

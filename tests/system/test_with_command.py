@@ -43,10 +43,11 @@ def test_a_stranger_finds_every_port(tmp_path: Path) -> None:
     no_tracebacks(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.interop
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
 def test_mbpoll_reads_the_sensor(tmp_path: Path) -> None:
-    words = "mbpoll -m rtu -a 1 -b 19200 -P even -t 4 -r 1 -1 $FIELDTWIN_LINE1"
+    words = "mbpoll -m rtu -a 1 -b 19200 -P even -o 5 -t 4 -r 1 -1 $FIELDTWIN_LINE1"
     ended = run_to_end(tmp_path, "with", "--quiet", "observatory", "--", "sh", "-c", words)
     assert (ended.process.returncode, ended.err) == (0, "")
     assert "[1]:" in ended.out
@@ -56,8 +57,6 @@ def test_mbpoll_reads_the_sensor(tmp_path: Path) -> None:
     ("words", "code", "told"),
     [
         (["observatory", "--", "no-such-program"], 2, "no such program"),
-        (["observatory"], 2, "needs a command"),
-        (["observatorium", "--", "true"], 2, "observatory"),
     ],
 )
 def test_what_cannot_start_is_said_before_anything_runs(tmp_path: Path, words: list[str], code: int, told: str) -> None:
@@ -67,6 +66,7 @@ def test_what_cannot_start_is_said_before_anything_runs(tmp_path: Path, words: l
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_program_first_and_then_the_field(tmp_path: Path, number: int) -> None:
     script = "trap 'echo told; exit 5' INT TERM; echo up; while :; do sleep 0.05; done"
@@ -74,16 +74,17 @@ def test_a_signal_ends_the_program_first_and_then_the_field(tmp_path: Path, numb
         wait_for(lambda: "up" in started.out, 20, started.err)
         field = started.pid_of("w", "field")
         started.signal(number)
-        assert started.wait(10) == 5
+        assert started.wait(30) == 5
     assert "told" in started.out
     wait_for(lambda: not Path(f"/proc/{field}").exists(), 5, "the field side ended")
 
 
+@pytest.mark.slow
 def test_a_field_that_dies_is_no_success(tmp_path: Path) -> None:
     script = "echo up; while [ ! -e gone ]; do sleep 0.05; done"
     with fieldtwin(tmp_path, "with", "--instance", "w", "observatory", "--", "sh", "-c", script) as started:
         wait_for(lambda: "up" in started.out, 20, started.err)
         os.kill(started.pid_of("w", "field"), signal.SIGKILL)
         (tmp_path / "gone").touch()
-        assert started.wait(10) != 0
+        assert started.wait(30) != 0
     assert "field" in started.err

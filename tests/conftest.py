@@ -9,8 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+settings.register_profile("fieldtwin", deadline=None)  # how long an example takes is the host's load
+settings.load_profile("fieldtwin")
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,32 @@
+"""Every option that docs/commissioning.md names for line, scan and identify is one that they have."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+
+from fieldtwin.cli.main import cli
+
+PAGE = (Path(__file__).parents[2] / "docs" / "commissioning.md").read_text(encoding="utf-8")
+LINES = [line for line in re.findall(r"```sh\n(.*?)```", PAGE, re.S)[0].splitlines() if line]
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_command_line_of_the_page_is_understood(line: str) -> None:
+    verb, *arguments = shlex.split(line)[1:]
+    command = cli.get_command(click.Context(cli), verb)
+    assert command is not None
+    assert command.make_context(verb, arguments).params
+
+
+@pytest.mark.parametrize("verb", ["line", "scan", "identify"])
+def test_every_option_that_the_page_names_exists(verb: str) -> None:
+    command = cli.get_command(click.Context(cli), verb)
+    assert command is not None
+    known = {option for parameter in command.params for option in parameter.opts}
+    section = PAGE.split(f"\n## {verb}\n")[1].split("\n## ")[0].replace("`--echo` for the other verbs", "")
+    assert set(re.findall(r"`(--[a-z-]+)", section)) <= known

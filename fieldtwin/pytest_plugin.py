@@ -133,7 +133,8 @@ def _or_fail(make: Callable[[], Any]) -> Any:
     try:
         return make()
     except (FieldtwinRefused, FieldtwinUnavailable) as e:
-        pytest.fail(f"fieldtwin: {e}", pytrace=False)
+        why = str(e)
+    pytest.fail(f"fieldtwin: {why}", pytrace=False)  # out here: nothing "during handling of" is shown
 
 
 @pytest.fixture

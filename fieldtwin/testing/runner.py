@@ -119,7 +119,9 @@ class Runner:
         self._said.seek(0)
         last = "".join(deque(self._said, maxlen=5)).strip()
         ended = "does not answer any more" if code is None else f"ended with status {code}"
-        hint = f"; --fieldtwin-command or {COMMAND_VARIABLE} says what to run" if "No module named" in last else ""
+        hint = ""
+        if "No module named" in last:  # this environment has the plugin alone
+            last, hint = last.splitlines()[-1], f"; --fieldtwin-command or {COMMAND_VARIABLE} says what to run"
         return FieldtwinUnavailable(f"{shlex.join(self.command)} test-host {ended}: {last or 'it said nothing'}{hint}")
 
     def close(self) -> None:

@@ -126,6 +126,13 @@ def _prototype(got: Collected, system: System, path: Path) -> None:
             got.add(_place("recordings", device.form.recording, path), Item("recording", device.recording))
         if device.form.profile is not None:
             _profile(got, path, device.form.profile, device.profile)
+    for simulation in prototype.form.simulations.values():
+        if simulation.python is not None:
+            name = simulation.python.rpartition(":")[0]
+            source = path.parent / name
+            got.add(_place("systems", name, path), Item("program", source))
+            for imported in _imports(source):
+                _python(got, path.parent, imported)
 
 
 # -- control logic ------------------------------------------------------------------------------------------------------

@@ -224,6 +224,29 @@ def test_without_a_terminal_the_answer_is_no_and_trust_says_yes(dam: Path, tmp_p
     assert (trusted.returncode, marker.exists()) == (0, True), trusted.stderr
 
 
+def test_a_simulation_in_python_is_packed_and_asked_about_as_well(dam: Path, tmp_path: Path) -> None:
+    """What emulates a device is the stranger's program, too."""
+    (dam.parent / "hill.py").write_text(
+        "import slope\n\nclass Hill:\n    def step(self, t_s, dt_s, inputs):\n        return {}\n"
+    )
+    (dam.parent / "slope.py").write_text("STEEP = 1\n")
+    prototype = dam.with_name("dam.prototype.yaml")
+    prototype.write_text(
+        prototype.read_text().replace("{recording: tilt.jsonl, at_end: loop}", "{simulation: hill}")
+        + "simulations: {hill: {python: 'hill.py:Hill'}}\n"
+    )
+    manifest = packed(dam, tmp_path / "T.zip")
+    assert manifest.code == ("systems/hill.py", "systems/slope.py")
+    with pytest.raises(NotAllowed):
+        system_file(str(tmp_path / "T.zip"), no)
+
+
+@pytest.mark.parametrize("name", ["lab_vehicle", "silage_tractor"])
+def test_every_shipped_system_makes_a_whole_template(name: str, tmp_path: Path) -> None:
+    manifest = packed(SHIPPED / "systems" / f"{name}.yaml", tmp_path / "T")
+    assert examine(tmp_path / "T", manifest).name == name
+
+
 def test_left_over_byte_code_in_a_folder_counts_as_code(dam: Path, tmp_path: Path) -> None:
     packed(dam, tmp_path / "T")
     (tmp_path / "T" / "systems" / "__pycache__").mkdir()

@@ -22,7 +22,7 @@ from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import state_words
 from fieldtwin.scenarios.bench import Can, Reading
 from fieldtwin.scenarios.probe_form import Probe
-from fieldtwin.scenarios.trace import Event, Kind, Trace
+from fieldtwin.scenarios.trace import FAR_END, Event, Kind, Trace
 from gateway.core.clock import NS_PER_S
 from gateway.core.control import ControlClient, RemoteError
 from gateway.core.endpoint import Endpoint
@@ -135,6 +135,7 @@ class ControlBench:
         device = next((d.name for d in self.system.devices.values() if d.profile.inbox is not None), None)
         if far is not None and device is not None and where.allowed.rank >= Danger.WRITE.rank:
             self._shore = Shore(self.system, device, far, self._clock)
+            self._shore.on_send = self._commanded
             nursery.start(self._shore.run([]), "far end")
             can.add(Can.SEND_COMMAND)
         if where.capture is not None:
@@ -262,6 +263,9 @@ class ControlBench:
 
     def _note(self, kind: Kind, where: str, data: dict[str, Any]) -> None:
         self.trace.note(round(self.now_s() * NS_PER_S), kind, where, data)
+
+    def _commanded(self, period_s: int) -> None:
+        self._note(Kind.NOTE, FAR_END, {"text": f"commands {period_s} s", "period_s": period_s})
 
     async def _refresh(self) -> None:
         gone = self._gone()

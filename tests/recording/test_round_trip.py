@@ -37,6 +37,7 @@ from fieldtwin.recording.polling import (
     ProfileRound,
     Round,
     SameRequests,
+    follow_bus,
     record_node,
     record_polls,
 )
@@ -45,6 +46,7 @@ from fieldtwin.recording.sinks import CanLogSink, ExchangeSink, LineSink
 from fieldtwin.recording.tapping import LineTap
 from fieldtwin.running.device_here import DeviceHost, as_it_was_recorded
 from gateway.connections.os_connector import OsConnector
+from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import Unreachable, UsageError
@@ -369,6 +371,36 @@ def test_a_node_is_recorded_emulated_and_compared(tmp_path: Path) -> None:
     result = compare_logs(frames(logs[0]), frames(logs[1]), UNTIMED)
     assert result.compared >= 4
     assert (result.met, result.differences) == (True, [])
+
+
+def test_a_bus_is_followed_frame_by_frame_and_nothing_is_sent(tmp_path: Path) -> None:
+    """What others say on a bus stands in the log, in order; what we are on the bus for does not show there."""
+    said = [CanFrame(0x185, bytes([n & 0xFF])) for n in range(300)] + [CanFrame(0x123456, b"x", extended=True)]
+
+    async def main() -> int:
+        clock, stop = WallClock(), asyncio.Event()
+        server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 1_000_000)
+        try:
+            talker, ear = server.attach("talker"), server.attach("ear")
+            target = target_of(f"can:fieldtwin/127.0.0.1:{server.bound.path.rpartition(':')[2]}")
+            with RotatingFile(tmp_path / "bus.log") as file:
+                following = asyncio.create_task(follow_bus(target, CanLogSink(file, clock), stop=stop))
+                await eventually(lambda: len(server.bus_stats()["nodes"]) == 3, what="the recorder is on the bus")
+                for frame in said:
+                    await talker.send(frame)
+                await eventually(lambda: file.lines == len(said), what="all frames are in the log")
+                stop.set()
+                lost = await following
+            heard = [await ear.recv() for _ in said]
+            assert [(f.can_id, f.data) for f in heard] == [(f.can_id, f.data) for f in said]
+            assert not ear.inbound.data_stream
+            return lost
+        finally:
+            await server.aclose()
+
+    assert run(main()) == 0
+    logged = [frame for _, frame in frames(tmp_path / "bus.log")]
+    assert [(f.can_id, f.extended, f.data) for f in logged] == [(f.can_id, f.extended, f.data) for f in said]
 
 
 # -- days, and what ends them ------------------------------------------------------------------------------------------------

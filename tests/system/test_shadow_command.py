@@ -12,7 +12,7 @@ from procs import fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 def test_a_shadow_opposite_a_prototype_follows_its_states_and_survives_its_own_death(tmp_path: Path) -> None:
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
     with fieldtwin(
-        root, "run", "observatory", "--prototype", "--commands", "1,2,0,-1", "--for", "9s", "--json", "--thread", place
+        root, "run", "observatory", "--prototype", "--commands", "1,2,0,-1", "--for", "12s", "--json", "--thread", place
     ) as run:
         plant = run.control("observatory", "thread")
         with fieldtwin(root, "shadow", "observatory", "--from", place, "--for", "60s", "--json", name="first") as first:

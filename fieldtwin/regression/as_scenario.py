@@ -95,7 +95,7 @@ def _stimuli(system: System, story: Story, wanted: Wanted) -> Iterator[_Stimulus
             continue
         for change in changes:
             value, quality = change.says()
-            if quality == "good" and isinstance(value, bool | int | float | str):
+            if quality in ("good", "") and isinstance(value, bool | int | float):
                 yield _Stimulus(change.t_ns, f"set: {{tag: {name}, value: {json.dumps(value)}}}")
 
 
@@ -171,9 +171,9 @@ def _looks(system: System, story: Story, wanted: Wanted, begin_ns: int, look_ns:
         value, quality = now.says()
         device, _, tag = name.partition(".")
         counts = device in system.devices and system.devices[device].profile.tags[tag].counter
-        said = [f"tag: {name}", f"quality: {quality}"]
+        said = [f"tag: {name}", *([f"quality: {quality}"] if quality else [])]
         restless = sum(begin_ns <= c.t_ns <= look_ns for c in changes) > RESTLESS
-        if quality == "good" and restless:
+        if quality in ("good", "") and restless:
             size: float = max((abs(c.value) for c in changes if isinstance(c.value, int | float)), default=0.0)
             tolerance = max(wanted.share * size, _slack(changes, story, counts=counts))
             said += ["like: recording", f"tolerance: {_number(tolerance)}"]

@@ -24,7 +24,7 @@ SELDOM = 5
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """From `t_ns` on the field was `value`, of `quality` ("" for a state)."""
+    """From `t_ns` on the field was `value`, of `quality` ("" for a state, and for what was only seen on a wire)."""
 
     t_ns: int
     value: Any
@@ -96,9 +96,9 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
             _mailbox(story, system, boxes, exchange)
             if exchange.ok and len(answered) < MOST and not exchange.secrets:
                 answered.extend(
-                    (f"{exchange.device}.{tag}", Change(exchange.end_ns, value, "good"))
+                    (f"{exchange.device}.{tag}", Change(exchange.end_ns, value))
                     for tag, value in exchange.tags.items()
-                    if value is not None and exchange.device
+                    if value is not None and _is_measured(system, exchange, tag)
                 )
 
     for event in events:
@@ -122,6 +122,15 @@ def story_of(system: System, events: Iterable[Event]) -> Story:
             story.note(story.tags, name, change)
             story.published[name] += 1
     return story
+
+
+def _is_measured(system: System, exchange: Exchange, tag: str) -> bool:
+    """Not a message, of which a device has many, each once; and nothing of a sensor that has not sampled yet."""
+    config = system.devices.get(exchange.device)
+    if config is None or tag not in config.profile.tags:
+        return False
+    sampled = config.profile.sampled
+    return sampled is None or exchange.tags.get(sampled.count) != 0
 
 
 def _count(story: Story, exchange: Exchange) -> None:

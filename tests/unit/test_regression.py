@@ -129,7 +129,7 @@ def test_requests_without_an_answer_are_new() -> None:
 
 def test_a_capture_has_values_and_latencies_but_no_states() -> None:
     story = story_of(SYSTEM, asked(5))
-    assert [(c.value, c.quality) for c in story.tags["ctd.sample_period_s"]] == [(0, "good")]
+    assert [(c.value, c.quality) for c in story.tags["ctd.sample_period_s"]] == [(0, "")]
     assert story.latency_ns == {("ctd", "read holding registers"): [10_000_000]}
 
 

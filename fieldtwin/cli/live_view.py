@@ -45,6 +45,12 @@ def print_mapping(session: RunSession) -> None:
     _print_thread(session)
 
 
+def print_metrics(url: str) -> None:
+    """Say once where the metrics are."""
+    if url:
+        talk.print(f"  metrics  ←  {url}", soft_wrap=True)
+
+
 def _print_thread(session: RunSession) -> None:
     if session.thread_place:
         talk.print(f"  digital thread  ←  {session.thread_place}", soft_wrap=True)

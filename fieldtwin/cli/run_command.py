@@ -21,6 +21,9 @@ from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.template_here import system_file
+from fieldtwin.service.attached import Service, ServiceOptions, check
+from fieldtwin.service.journal import Format
+from fieldtwin.service.notify import Notifier
 from gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -96,6 +99,18 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
 @click.option(
     "--thread-store", default="", metavar="FILE|URL", help="What keeps the thread's log; default: in the run directory."
 )
+@click.option(
+    "--metrics",
+    default="",
+    metavar="HOST:PORT",
+    help="Serve metrics for Prometheus, e.g. 127.0.0.1:9464; without a host on loopback (docs/service.md).",
+)
+@click.option(
+    "--log",
+    type=click.Choice(["text", "json", "journal"]),
+    default=None,
+    help="Instead of a live view, events: as text, JSON lines, or to the journal with fields.",
+)
 @click.option("--trust", is_flag=True, help="Run control logic in Python that a template brings, without asking.")
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
@@ -126,6 +141,8 @@ def command(
     faults: str,
     thread: str,
     thread_store: str,
+    metrics: str,
+    log: Format | None,
     trust: bool,
     cold: bool,
     profiles: tuple[str, ...],
@@ -153,10 +170,10 @@ def command(
     if thread_store and not thread:
         raise UsageError("--thread-store goes with --thread")
     if virtual:
-        if plant or field_host or listen or can or capture or thread:
+        if plant or field_host or listen or can or capture or thread or metrics or log:
             raise UsageError(
                 "--virtual is a prototype in this process, its wires in memory",
-                hint="--plant, --field, --listen, --can, --capture and --thread go with real wires; --trace FILE has the frames",
+                hint="--plant, --field, --listen, --can, --capture, --thread, --metrics, --log: real wires; --trace has frames",
             )
         if duration_s <= 0:
             raise UsageError("--virtual needs an end", expected="--for 24h")
@@ -202,7 +219,7 @@ def command(
         thread_store=thread_store,
         faults=_faults(faults, system, profiles) if faults else (),
     )
-    return asyncio.run(_run(options, as_json))
+    return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), as_json))
 
 
 def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
@@ -292,9 +309,11 @@ def _again(seed: int) -> str:
     return shlex.join(["fieldtwin", *words, "--seed", str(seed)])
 
 
-async def _run(options: RunOptions, as_json: bool) -> int:
-    from fieldtwin.cli.live_view import LiveView, print_mapping, print_summary
+async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bool) -> int:
+    from fieldtwin.cli.live_view import LiveView, print_mapping, print_metrics, print_summary
 
+    check(service_options)
+    notifier = Notifier.from_environment()
     session = RunSession(options)
     interrupted = False
 
@@ -307,9 +326,14 @@ async def _run(options: RunOptions, as_json: bool) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, interrupt)
     async with session:
-        print_mapping(session)
-        async with LiveView(session, quiet=as_json):
-            await session.wait()
+        if service_options.log is None:
+            print_mapping(session)
+        async with Service(session, service_options, notifier) as service:
+            if service_options.log is None:
+                print_metrics(service.url)
+            async with LiveView(session, quiet=as_json or service_options.log is not None):
+                await session.wait()
+    notifier.close()
     summary = summarise(session)
     if as_json:
         json.dump(summary, sys.stdout, indent=2)

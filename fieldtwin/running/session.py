@@ -77,6 +77,7 @@ class RunSession:
         self.thread_place = ""
         self.thread_status: dict[str, Any] | None = None
         self.started_ns = 0
+        self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
         self.stopped = asyncio.Event()
         self._stack = AsyncExitStack()
         self._nursery = Nursery()
@@ -274,6 +275,9 @@ class RunSession:
         self.gateway_status = await self._get(self._clients.get("gateway"))
         self.plc_status = await self._get(self._clients.get("plc"), brief=True)
         self.field_status = await self._get(self._field.client if self._field else None)
+        for name, status in (("gateway", self.gateway_status), ("plc", self.plc_status)):
+            if status is not None:
+                self.answered_ns[name] = self.clock.monotonic_ns()
         if (thread := await self._get(self._clients.get("thread"))) is not None:
             self.thread_status = thread
             if thread["dropped"]:

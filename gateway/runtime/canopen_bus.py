@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import Connector
 from gateway.core.errors import ConnectionLost, FieldtwinError, NotAllowed, ReplyTimeout, Unreachable, UsageError
+from gateway.core.latency import Latencies
 from gateway.core.nursery import Nursery
 from gateway.core.values import COMMAND, Reason
 from gateway.devices.canopen_device import CanopenDriver
@@ -108,6 +109,7 @@ class CanopenBus:
         self._on_offline = on_offline
         self._master: CanopenMaster | None = None
         self._lss: LssMaster | None = None
+        self.latency = Latencies()
         self._past: Counter[str] = Counter()
 
     def _status(self, driver: CanopenDriver, drivers: list[CanopenDriver], clock: Clock) -> NodeStatus:
@@ -183,6 +185,7 @@ class CanopenBus:
                 short_sdo=self.config.canopen.short_sdo,
                 on_event=self._on_event,
             )
+            master.latency = self.latency
             self._master, self._lss = master, LssMaster(master.send, self._clock)
             master.listen(LSS_REPLY, self._lss.on_reply)
             self.connected, self.error = True, ""

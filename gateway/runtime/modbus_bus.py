@@ -26,6 +26,7 @@ from gateway.core.errors import (
     WireError,
     WrongDevice,
 )
+from gateway.core.latency import Latencies
 from gateway.core.values import Reason
 from gateway.devices.config import BusConfig
 from gateway.devices.register_device import RegisterDriver
@@ -102,6 +103,7 @@ class ModbusBus:
         self._wake = asyncio.Event()
         self._idle = asyncio.Event()
         self._halted = False
+        self.latency = Latencies()
         self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
 
@@ -170,6 +172,7 @@ class ModbusBus:
                 turnaround_s=config.turnaround_s,
                 spacing_s=config.spacing_s,
             )
+            client.latency = self.latency
             self._client = client
             self.connected, self.error, self.down = True, "", None
             self.opens += 1

@@ -114,6 +114,7 @@ def _bus(bus: Any) -> dict[str, Any]:
         "opens": bus.opens,
         "error": bus.error,
         "counters": dict(bus.totals()),
+        "latency": bus.latency.describe(),
         **({"not_produced": bus.not_produced} if isinstance(bus, CanopenBus) else {}),
     }
 

@@ -13,6 +13,7 @@ from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import CanConnection
 from gateway.core.errors import Bug, ConnectionLost, Desync, FieldtwinError, ReplyTimeout, SdoAborted, UsageError
+from gateway.core.latency import Latencies
 from gateway.protocols.canopen import abort_codes, cob_id, nmt
 from gateway.protocols.canopen.heartbeat import HeartbeatConsumer
 from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
@@ -51,6 +52,7 @@ class CanopenMaster:
         on_event: EventCallback | None = None,
     ) -> None:
         self.counters = Counters()
+        self.latency = Latencies()  # of SDO transfers that were done
         self.on_event: EventCallback = on_event or _nobody
         self._connection = connection
         self._clock = clock
@@ -299,7 +301,7 @@ class CanopenMaster:
     def _channel(self, node: int) -> SdoChannel:
         channel = self._channels.get(node)
         if channel is None:
-            channel = SdoChannel(node, self.send, self._clock, self.counters)
+            channel = SdoChannel(node, self.send, self._clock, self.counters, self.latency)
             channel.lose(self._stopped)
             self._channels[node] = channel
         return channel

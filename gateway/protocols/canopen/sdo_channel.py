@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted
+from gateway.core.latency import Latencies
 from gateway.protocols.canopen import abort_codes
 from gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
 from gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
@@ -70,12 +71,18 @@ class SdoChannel:
     """The client's end of one channel. `deliver` is called by the bus's reader, `run` by whoever wants an object."""
 
     def __init__(
-        self, node: int, send: Callable[[CanFrame], Awaitable[None]], clock: Clock, counters: Counters
+        self,
+        node: int,
+        send: Callable[[CanFrame], Awaitable[None]],
+        clock: Clock,
+        counters: Counters,
+        latency: Latencies | None = None,
     ) -> None:
         self._node = node
         self._send = send
         self._clock = clock
         self._counters = counters
+        self._latency = latency if latency is not None else Latencies()
         self._turn = asyncio.Lock()
         self._late = LateReplies()
         self._active: SdoTransfer | None = None
@@ -146,7 +153,9 @@ class SdoChannel:
         self._active, self._last_answer, self._rebooted = transfer, None, False
         try:
             await self._tell_owed(transfer)
+            began_ns = self._clock.monotonic_ns()
             data = await self._drive(transfer)
+            self._latency.note(self._clock.monotonic_ns() - began_ns)
             complete = True
             self._last_answer = request
             return data

@@ -24,6 +24,7 @@ from gateway.core.errors import (
     UsageError,
     VerifyFailed,
 )
+from gateway.core.latency import Latencies
 from gateway.protocols.modbus.framings import Framing, framing_of, make_framer
 from gateway.protocols.modbus.identity import ReadDeviceIdentification
 from gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
@@ -130,6 +131,9 @@ class ModbusClient:
         self._turn = asyncio.Lock()
         self._closed = False
         self.counters = ClientCounters()
+        self.latency = (
+            Latencies()
+        )  # of what was answered, exceptions too; whoever keeps it over connections puts in its own
 
     @classmethod
     def at(
@@ -292,11 +296,14 @@ class ModbusClient:
             counters.replies += 1
             settled = True
             line.answered(reply.t_ns, transaction.sent_ns)
+            self.latency.note(reply.t_ns - transaction.sent_ns)
             return reply
         except ModbusExceptionReply as e:
             counters.exceptions += 1
             settled = True
-            line.answered(self._clock.monotonic_ns(), transaction.sent_ns)
+            now_ns = self._clock.monotonic_ns()
+            line.answered(now_ns, transaction.sent_ns)
+            self.latency.note(now_ns - transaction.sent_ns)
             self._place(e)
             raise
         except CrcError as e:

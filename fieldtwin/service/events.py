@@ -1,0 +1,114 @@
+"""What changed between two looks at a run, as events for a log that is read by programs. It writes nothing and asks nobody.
+
+Values of tags are never among them, as in everything that people read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any
+
+from fieldtwin.service.metrics import Snapshot
+
+Status = Mapping[str, Any]
+
+
+class Priority(IntEnum):
+    """syslog's (RFC 5424, 6.2.1), as far as we use them."""
+
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened. `fields` are short names with text or numbers: device, bus, error..."""
+
+    priority: Priority
+    name: str
+    message: str
+    fields: Mapping[str, str | int | float] = field(default_factory=dict)
+
+
+def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
+    """Events between two looks; without one before, everything that is not well is an event."""
+    return [
+        *_children(before, now),
+        *_buses(_part(before, "buses"), _part(now, "buses")),
+        *_devices(_part(before, "devices"), _part(now, "devices")),
+        *_plc(before.plc if before else None, now.plc),
+        *_dropped(before.gateway if before else None, now.gateway),
+    ]
+
+
+def _part(seen: Snapshot | None, name: str) -> Mapping[str, Status]:
+    return (seen.gateway or {}).get(name, {}) if seen is not None else {}
+
+
+def _children(before: Snapshot | None, now: Snapshot) -> list[Event]:
+    found = []
+    for name, lives in now.children.items():
+        if not lives and (before is None or before.children.get(name, True)):
+            found.append(Event(Priority.ERROR, "process_ended", f"the {name} process ended", {"process": name}))
+    return found
+
+
+def _buses(before: Mapping[str, Status], now: Mapping[str, Status]) -> list[Event]:
+    found = []
+    for name, bus in now.items():
+        was = before.get(name)
+        if bus["connected"] and (was is None or not was["connected"]):
+            found.append(Event(Priority.INFO, "bus_open", f"{name}: open", {"bus": name}))
+        elif bus["error"] and (was is None or was["error"] != bus["error"]):
+            text = f"{name}: {bus['error']}"
+            found.append(Event(Priority.ERROR, "bus_closed", text, {"bus": name, "error": bus["error"]}))
+    return found
+
+
+def _devices(before: Mapping[str, Status], now: Mapping[str, Status]) -> list[Event]:
+    found = []
+    for name, device in now.items():
+        was = before.get(name)
+        fields = {"device": name, "bus": device["bus"]}
+        if device["online"] and (was is None or not was["online"]):
+            found.append(Event(Priority.NOTICE, "device_online", f"{name}: answers", fields))
+        elif (
+            not device["online"]
+            and device["error"]
+            and (was is None or was["online"] or was["error"] != device["error"])
+        ):
+            named = {**fields, "error": device["error"]}
+            found.append(Event(Priority.WARNING, "device_offline", f"{name}: {device['error']}", named))
+        codes = device.get("emcy", [])
+        if codes and codes != (was or {}).get("emcy", []):
+            named = {**fields, "emcy": " ".join(codes)}
+            found.append(Event(Priority.WARNING, "device_emcy", f"{name}: emergency {' '.join(codes)}", named))
+    return found
+
+
+def _plc(before: Status | None, now: Status | None) -> list[Event]:
+    if now is None:
+        return []
+    was = (before or {}).get("state")
+    if now["state"] == was:
+        return []
+    priority = Priority.NOTICE if now["state"] == "running" else Priority.ERROR
+    text = f"PLC: {now['state']}" + (f": {now['error']}" if now["error"] else "")
+    return [Event(priority, "plc_state", text, {"state": now["state"], "error": now["error"]})]
+
+
+def _dropped(before: Status | None, now: Status | None) -> list[Event]:
+    if now is None:
+        return []
+    lost = now["log_dropped"] - (before or {}).get("log_dropped", 0)
+    found = []
+    if lost > 0:
+        text = f"the exchange log lost {lost} entries"
+        found.append(Event(Priority.WARNING, "log_dropped", text, {"count": lost}))
+    if now["writes"]["safe"] and not (before or {}).get("writes", {}).get("safe", False):
+        found.append(Event(Priority.WARNING, "outputs_safe", "outputs are at their safe values"))
+    return found

@@ -1,0 +1,71 @@
+"""The text that Prometheus reads: exposition format 0.0.4. It never knows what is measured.
+
+Source: https://prometheus.io/docs/instrumenting/exposition_formats/ (text-based format).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+Kind = Literal["counter", "gauge", "histogram"]
+Labels = Mapping[str, str]
+
+
+@dataclass(slots=True)
+class Family:
+    """A metric by name with its samples; `samples` are name, labels and value, as they are written."""
+
+    name: str
+    kind: Kind
+    help: str
+    samples: list[tuple[str, Labels, float]] = field(default_factory=list)
+
+    def add(self, value: float | None, **labels: str) -> None:
+        """One sample; None is none: where nothing is known, nothing is said."""
+        if value is not None:
+            self.samples.append((self.name, labels, value))
+
+    def add_histogram(self, bounds: Sequence[float], counts: Sequence[int], total: float, **labels: str) -> None:
+        """Buckets with their upper ends `bounds`, the last of `counts` being above all of them; each count its own bucket's."""
+        seen = 0
+        for bound, count in zip((*bounds, float("inf")), counts, strict=True):
+            seen += count
+            self.samples.append((f"{self.name}_bucket", {**labels, "le": _number(bound)}, seen))
+        self.samples.append((f"{self.name}_sum", labels, total))
+        self.samples.append((f"{self.name}_count", labels, seen))
+
+
+def render(families: Sequence[Family]) -> str:
+    """All families that have samples."""
+    lines: list[str] = []
+    for family in families:
+        if family.samples:
+            lines.append(f"# HELP {family.name} {_escape_help(family.help)}")
+            lines.append(f"# TYPE {family.name} {family.kind}")
+            lines += [f"{name}{_labels(labels)} {_number(value)}" for name, labels, value in family.samples]
+    return "\n".join(lines) + "\n"
+
+
+def _labels(labels: Labels) -> str:
+    if not labels:
+        return ""
+    return "{" + ",".join(f'{name}="{_escape(value)}"' for name, value in labels.items()) + "}"
+
+
+def _escape(value: str) -> str:
+    return value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+
+
+def _escape_help(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("\n", "\\n")
+
+
+def _number(value: float) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "+Inf" if value > 0 else "-Inf"
+    return str(int(value)) if value == int(value) else repr(value)

@@ -1,0 +1,226 @@
+"""What a run tells a maintainer's monitoring: the latest statuses of gateway and PLC as metrics.
+
+No value of a tag is among them, and no name of a tag: what may be secret stays inside, and a plant with 100,000 tags has no more
+series than one with ten. Per device there are a few, for `MOST_DEVICES` at most; the rest is counted as left out. It asks
+nobody: it is given what was asked anyway.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from itertools import islice
+from typing import Any
+
+from fieldtwin.__about__ import __version__
+from fieldtwin.service.exposition import Family
+from gateway.core.values import Quality
+from gateway.protocols.canopen.sdo_channel import Counters as CanopenCounters
+from gateway.protocols.modbus.client import ClientCounters
+
+MOST_DEVICES = 1000
+"""Devices with series of their own."""
+
+MOST_NAMED = 256
+"""Buses, servers, bridges, tasks: of each kind so many."""
+
+ALWAYS = {"modbus": ("missed_polls", *asdict(ClientCounters())), "canopen": tuple(asdict(CanopenCounters()))}
+"""Counters that a bus has even before they first count: a rate over them needs the 0."""
+
+Status = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """A run as it was last seen. A status is None while its process does not answer. `states` of children: whether each runs."""
+
+    system: str
+    mode: str
+    uptime_s: float
+    gateway: Status | None
+    plc: Status | None
+    children: Mapping[str, bool]
+    asked_ago_s: float
+    thread: Status | None = None
+
+
+class Page:
+    """The families, made as they are needed, in the order in which they were."""
+
+    def __init__(self) -> None:
+        self.families: dict[str, Family] = {}
+
+    def counter(self, name: str, help: str) -> Family:
+        return self._family(Family(f"fieldtwin_{name}_total", "counter", help))
+
+    def gauge(self, name: str, help: str) -> Family:
+        return self._family(Family(f"fieldtwin_{name}", "gauge", help))
+
+    def histogram(self, name: str, help: str) -> Family:
+        return self._family(Family(f"fieldtwin_{name}", "histogram", help))
+
+    def _family(self, family: Family) -> Family:
+        return self.families.setdefault(family.name, family)
+
+
+def families(seen: Snapshot) -> list[Family]:
+    """All metrics of `seen`. What a process that does not answer would have said is missing, and `fieldtwin_up` is 0."""
+    page = Page()
+    page.gauge("info", "Version, system, and whether it is a plant or its prototype.").add(
+        1, version=__version__, system=seen.system, mode=seen.mode
+    )
+    page.gauge("run_seconds", "How long this run has lasted.").add(seen.uptime_s)
+    page.gauge("status_age_seconds", "How old what is told here is.").add(seen.asked_ago_s)
+    up = page.gauge("up", "Whether a process of the run lives and, gateway and PLC, answers.")
+    for name, lives in seen.children.items():
+        answers = {"gateway": seen.gateway is not None, "plc": seen.plc is not None}.get(name, True)
+        up.add(int(lives and answers), process=name)
+    if seen.gateway is not None:
+        for part in (_buses, _devices, _tags, _writes, _mailboxes, _masters, _watchers):
+            part(page, seen.gateway)
+    if seen.plc is not None:
+        _plc(page, seen.plc)
+    if seen.thread is not None:
+        page.counter("thread_dropped", "Events that the digital thread's log lost.").add(seen.thread.get("dropped"))
+    return list(page.families.values())
+
+
+def _buses(page: Page, gateway: Status) -> None:
+    connected = page.gauge("bus_connected", "Whether the bus's wire is open.")
+    opens = page.counter("bus_opens", "How often it was opened: more than once is lost and found again.")
+    events = page.counter(
+        "bus_events", "What a master counted: requests, replies, timeouts, CRC errors, frames, PDOs... by event."
+    )
+    latency = page.histogram(
+        "bus_latency_seconds", "From a request sent to its answer (Modbus), and whole SDO transfers (CANopen)."
+    )
+    late = page.counter("bus_not_produced", "SYNC, TIME and repeated RPDOs that found no room in their time.")
+    for name, bus in _some(gateway["buses"]):
+        connected.add(int(bus["connected"]), bus=name)
+        opens.add(bus["opens"], bus=name)
+        zeros = dict.fromkeys(ALWAYS["canopen" if "not_produced" in bus else "modbus"], 0)
+        for event, count in (zeros | bus["counters"]).items():
+            events.add(count, bus=name, event=event)
+        if shape := bus.get("latency"):
+            bounds = [ms / 1000 for ms in shape["bounds_ms"]]
+            latency.add_histogram(bounds, shape["counts"], shape["total_s"], bus=name)
+        late.add(bus.get("not_produced"), bus=name)
+
+
+def _devices(page: Page, gateway: Status) -> None:
+    online = page.gauge("device_online", "Whether a device answers and is the right one.")
+    wrong = page.gauge("device_wrong", "Whether what answers is another device than the system file says.")
+    polls = page.counter("device_polls", "Polls of a device.")
+    errors = page.counter("device_errors", "Polls that failed, and PDOs that were malformed.")
+    boots = page.counter(
+        "device_boots", "Boot-ups heard of a CANopen node: more than expected is a device that restarts."
+    )
+    emcys = page.counter("device_emcys", "Emergency messages of a CANopen node.")
+    pdos = page.counter("device_pdos", "Process data frames, by direction as the gateway sees it.")
+    devices = gateway["devices"]
+    for name, device in islice(devices.items(), MOST_DEVICES):
+        labels = {"device": name, "bus": device["bus"]}
+        online.add(int(device["online"]), **labels)
+        wrong.add(int(bool(device["identity_error"])), **labels)
+        polls.add(device["polls"], **labels)
+        errors.add(device["errors"], **labels)
+        boots.add(device.get("boots"), **labels)
+        emcys.add(device.get("emcys"), **labels)
+        if "tpdos" in device:
+            pdos.add(sum(t["frames"] for t in device["tpdos"].values()), **labels, direction="in")
+            pdos.add(device["rpdos_sent"], **labels, direction="out")
+    page.gauge("devices", "Devices of the system.").add(len(devices))
+    page.gauge("devices_online", "Devices that answer.").add(sum(bool(d["online"]) for d in devices.values()))
+    page.gauge("devices_left_out", "Devices without series of their own here: too many.").add(
+        max(0, len(devices) - MOST_DEVICES)
+    )
+
+
+def _tags(page: Page, gateway: Status) -> None:
+    qualities = Counter(tag["quality"] for tag in gateway["tags"].values())
+    counted = page.gauge("tags", "Tags by their quality now.")
+    for quality in Quality:
+        counted.add(qualities[str(quality)], quality=str(quality))
+    ages = [tag["age_s"] for tag in gateway["tags"].values() if tag.get("age_s") is not None]
+    page.gauge("tags_oldest_seconds", "Age of the oldest value.").add(max(ages, default=None))
+    page.counter("published", "Values published.").add(gateway["published"])
+    page.counter("logged", "Entries of the exchange log.").add(gateway["logged"])
+    page.counter("log_dropped", "Entries that the exchange log lost.").add(gateway["log_dropped"])
+    page.gauge("store_ok", "Whether the disk took the log when that was tried last.").add(
+        int(not gateway.get("store_error"))
+    )
+
+
+def _writes(page: Page, gateway: Status) -> None:
+    writes = gateway["writes"]
+    page.gauge("writes_allowed", "Whether this run may write.").add(int(writes["allowed"]))
+    page.gauge("outputs_safe", "Whether the outputs are at their safe values because the PLC is gone.").add(
+        int(writes["safe"])
+    )
+    counted = page.counter("writes", "Writes of outputs, by how they ended; repeated ones are done again as asked.")
+    for result in ("done", "failed", "refused", "repeated"):
+        counted.add(writes[result], result=result)
+    held = [o for o in gateway["outputs"] if o["wanted"] is not None and o["wanted"] != o["held"]]
+    page.gauge("outputs_pending", "Outputs whose device does not hold yet what is wanted.").add(len(held))
+    page.gauge("plc_alive", "Whether the gateway sees the PLC alive.").add(int(gateway["plc"]["alive"]))
+    page.counter("plc_losses", "How often the gateway lost the PLC.").add(gateway["plc"]["losses"])
+
+
+def _mailboxes(page: Page, gateway: Status) -> None:
+    queued = page.gauge("mailbox_queued", "Messages of a transmitter that wait.")
+    counted = page.counter("mailbox_messages", "Messages of a transmitter, by what became of them.")
+    for name, box in _some(gateway["mailboxes"]):
+        queued.add(box["queued"], device=name)
+        for what in ("received", "sent", "taken", "dropped", "waits", "commands_refused"):
+            counted.add(box[what], device=name, what=what)
+
+
+def _masters(page: Page, gateway: Status) -> None:
+    """Those who ask us: servers and bridges."""
+    counted = page.counter("server_events", "What a server or a bridge counted, by event.")
+    for kind in ("serve", "bridge"):
+        for name, server in _some(gateway[kind]):
+            for event, count in server.items():
+                if isinstance(count, int) and not isinstance(count, bool) and event != "unit":
+                    counted.add(count, kind=kind, name=name, event=event)
+
+
+def _watchers(page: Page, gateway: Status) -> None:
+    """Devices by what is wrong with them, so that an alert needs no text."""
+    page.gauge("devices_wrong", "Devices that are others than the system file says.").add(
+        sum(bool(d["identity_error"]) for d in gateway["devices"].values())
+    )
+
+
+def _plc(page: Page, plc: Status) -> None:
+    per_task: list[tuple[str, str, Callable[[Status], Any]]] = [
+        ("scans", "Scans of a task.", lambda t: t["scans"]),
+        ("missed_periods", "Periods in which a task's scan did not begin.", lambda t: t["missed_periods"]),
+        ("overruns", "Scans that took longer than their period.", lambda t: t["overruns"]),
+    ]
+    tasks = dict(_some(plc.get("tasks") or {"main": plc}))
+    for name, text, of in per_task:
+        counted = page.counter(f"plc_{name}", text)
+        for task, status in tasks.items():
+            counted.add(of(status), task=task)
+    for name, key, text in (
+        ("plc_lateness_seconds", "lateness_us", "How late scans began, since the start, by quantile; 1 is the worst."),
+        ("plc_scan_seconds", "duration_us", "How long scans took, since the start, by quantile; 1 is the longest."),
+    ):
+        gauge = page.gauge(name, text)
+        for task, status in tasks.items():
+            for quantile, part in (("0.5", "p50"), ("0.99", "p99"), ("0.999", "p999"), ("1", "max")):
+                gauge.add(status[key][part] / 1e6, task=task, quantile=quantile)
+    running = page.gauge("plc_running", "Whether a task runs; 0 is stopped or failed.")
+    for task, status in tasks.items():
+        running.add(int(status["state"] == "running"), task=task)
+    page.counter("plc_restarts", "Restarts of the PLC's program after a failure.").add(plc["restarts"])
+    page.gauge("plc_forces", "Variables that are forced.").add(len(plc["forces"]))
+    counted = page.counter("plc_events", "What the PLC counted of its image and its messages, by event.")
+    for event, count in plc["counters"].items():
+        counted.add(count, event=event)
+
+
+def _some(named: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    return list(islice(named.items(), MOST_NAMED))

@@ -1,0 +1,105 @@
+"""A small HTTP server for one page: ``GET /metrics``. It reads no body, keeps no connection and knows nothing of the page.
+
+Bounded in every way: `MOST_CLIENTS` at once, `MOST_HEAD` bytes of request, `PATIENCE_S` for all of it. Without authentication and
+without TLS, as Prometheus expects of what it scrapes on a network of its own: hence on loopback unless it is told otherwise.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import re
+from collections.abc import Callable
+
+from fieldtwin.service.exposition import CONTENT_TYPE
+from gateway.core.errors import EndpointBusy, Unreachable, UsageError
+
+MOST_CLIENTS = 16
+MOST_HEAD = 8192
+PATIENCE_S = 5.0
+
+_PLACE = re.compile(r"^(?:(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s:\[\]]*):)?(?P<port>[0-9]{1,5})$")
+
+
+def parse_place(text: str) -> tuple[str, int]:
+    """``HOST:PORT``, ``:PORT`` or ``PORT``; without a host it is 127.0.0.1. Port 0 is any that is free."""
+    found = _PLACE.match(text)
+    if found is None or int(found["port"]) > 65535:
+        raise UsageError("where metrics are served", expected="HOST:PORT such as 127.0.0.1:9464", got=text)
+    return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
+
+
+class MetricsServer:
+    """Serves what `page` returns. `await open(host, port)`, `aclose()` in the end; `served` and `refused` are counted."""
+
+    def __init__(self, page: Callable[[], str]) -> None:
+        self._page = page
+        self._server: asyncio.Server | None = None
+        self._clients: set[asyncio.Task[None]] = set()
+        self.served = 0
+        self.refused = 0
+
+    async def open(self, host: str, port: int) -> str:
+        """Listen; return the URL. Raises `EndpointBusy` where somebody listens, `Unreachable` where nobody can."""
+        try:
+            self._server = await asyncio.start_server(self._serve, host, port, limit=MOST_HEAD)
+        except OSError as e:
+            kind = EndpointBusy if e.errno == errno.EADDRINUSE else Unreachable
+            raise kind("cannot serve metrics here", where=f"{host}:{port}", hint=e.strerror or str(e)) from e
+        at = self._server.sockets[0].getsockname()
+        return f"http://{f'[{at[0]}]' if ':' in at[0] else at[0]}:{at[1]}/metrics"
+
+    async def aclose(self) -> None:
+        """Stop listening and drop whoever is being served."""
+        if self._server is None:
+            return
+        self._server.close()
+        clients = list(self._clients)
+        for task in clients:
+            task.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
+        await self._server.wait_closed()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        if task is None or len(self._clients) >= MOST_CLIENTS:
+            self.refused += 1
+            writer.close()
+            return
+        self._clients.add(task)
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                head = await reader.readuntil(b"\r\n\r\n")
+                writer.write(self._answer(head))
+                await writer.drain()
+        except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
+            self.refused += 1  # gone, too slow, or no HTTP: nothing can be said to it
+        except asyncio.CancelledError:
+            pass  # we are closing
+        finally:
+            self._clients.discard(task)
+            writer.close()
+
+    def _answer(self, head: bytes) -> bytes:
+        words = head.split(b"\r\n", 1)[0].split(b" ")
+        if len(words) != 3 or not words[2].startswith(b"HTTP/1."):
+            return self._refusal("400 Bad Request", "this is HTTP/1.1")
+        method, path = words[0], words[1].split(b"?", 1)[0]
+        if method not in (b"GET", b"HEAD"):
+            return self._refusal("405 Method Not Allowed", "GET /metrics", "Allow: GET, HEAD\r\n")
+        if path != b"/metrics":
+            return self._refusal("404 Not Found", "/metrics is all there is")
+        self.served += 1
+        return _response("200 OK", self._page(), CONTENT_TYPE, with_body=method == b"GET")
+
+    def _refusal(self, status: str, text: str, extra: str = "") -> bytes:
+        self.refused += 1
+        return _response(status, text + "\n", "text/plain; charset=utf-8", extra=extra)
+
+
+def _response(status: str, text: str, kind: str, *, with_body: bool = True, extra: str = "") -> bytes:
+    body = text.encode()
+    head = (
+        f"HTTP/1.1 {status}\r\nContent-Type: {kind}\r\nContent-Length: {len(body)}\r\n{extra}Connection: close\r\n\r\n"
+    )
+    return head.encode() + (body if with_body else b"")

@@ -1,0 +1,246 @@
+"""Metrics of a run: read back by Prometheus's own parser, from statuses as gateway and PLC give them, and over a real socket."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from prometheus_client.parser import text_string_to_metric_families
+from support import run
+
+from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
+from fieldtwin.service.metrics import MOST_DEVICES, Snapshot, families
+from fieldtwin.service.metrics_server import MOST_CLIENTS, MetricsServer, parse_place
+from gateway.core.errors import EndpointBusy, UsageError
+from gateway.core.latency import BOUNDS_MS, Latencies
+
+
+def device(bus: str, online: bool = True, **more: Any) -> dict[str, Any]:
+    status = {"bus": bus, "address": 1, "online": online, "error": "", "identity_error": "", "polls": 7, "errors": 2}
+    return {**status, **more}
+
+
+def gateway_status(devices: int = 1) -> dict[str, Any]:
+    latency = Latencies()
+    latency.note(3_000_000)
+    latency.note(9_000_000_000)
+    return {
+        "devices": {
+            **{f"ctd{i}": device("line1") for i in range(devices)},
+            "tilt": device("can0", False, boots=3, emcys=1, tpdos={"1": {"frames": 5}}, rpdos_sent=4),
+        },
+        "buses": {
+            "line1": {
+                "connected": True,
+                "opens": 2,
+                "error": "",
+                "counters": {"requests": 9, "timeouts": 1},
+                "latency": latency.describe(),
+            },
+            "can0": {"connected": False, "opens": 1, "error": "down", "counters": {"pdos": 5}, "not_produced": 6},
+        },
+        "tags": {
+            "ctd.pressure": {"value": 31337.25, "quality": "good", "age_s": 0.5},
+            "ctd.secret": {"value": "geheim", "quality": "bad", "age_s": None},
+        },
+        "outputs": [{"tag": "ctd.period", "wanted": 2, "held": 1}],
+        "writes": {"allowed": False, "done": 1, "failed": 2, "refused": 3, "repeated": 4, "safe": True},
+        "mailboxes": {
+            "modem": {
+                "received": 1,
+                "sent": 2,
+                "taken": 3,
+                "waits": 4,
+                "queued": 5,
+                "dropped": 6,
+                "commands_refused": 7,
+            }
+        },
+        "plc": {"alive": True, "losses": 1},
+        "serve": {"hmi": {"listening": "tcp://x:1", "requests": 11, "clients": [], "unit": 1}},
+        "bridge": {},
+        "published": 83,
+        "logged": 2,
+        "log_dropped": 1,
+        "store_error": "",
+    }
+
+
+def plc_status() -> dict[str, Any]:
+    shape = {"count": 4, "min": 1.0, "p50": 10.0, "p99": 20.0, "p999": 30.0, "above_1ms": 0.0, "max": 40.0}
+    task = {
+        "state": "running",
+        "scans": 442,
+        "missed_periods": 1,
+        "overruns": 2,
+        "lateness_us": shape,
+        "duration_us": shape,
+    }
+    return {**task, "tasks": {"main": task}, "restarts": 3, "forces": {"a": 1}, "counters": {"messages_missed": 2}}
+
+
+def seen(**changed: Any) -> Snapshot:
+    whole = Snapshot("observatory", "plant", 12.5, gateway_status(), plc_status(), {"gateway": True, "plc": True}, 0.1)
+    return replace(whole, **changed)
+
+
+def scraped(text: str) -> dict[tuple[str, frozenset[tuple[str, str]]], float]:
+    """Every sample by name and labels; that the parser takes it, and that none is there twice, is tested with it."""
+    found: dict[tuple[str, frozenset[tuple[str, str]]], float] = {}
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            key = (sample.name, frozenset(sample.labels.items()))
+            assert key not in found
+            found[key] = sample.value
+    return found
+
+
+def value(samples: dict[Any, float], name: str, /, **labels: str) -> float:
+    return samples[f"fieldtwin_{name}", frozenset(labels.items())]
+
+
+def test_what_a_maintainer_wants_is_there() -> None:
+    got = scraped(render(families(seen())))
+    assert value(got, "up", process="gateway") == 1
+    assert value(got, "bus_events_total", bus="line1", event="requests") == 9
+    assert value(got, "bus_events_total", bus="line1", event="crc_errors") == 0  # a rate needs it before the first
+    assert value(got, "bus_events_total", bus="can0", event="pdos") == 5
+    assert value(got, "bus_not_produced_total", bus="can0") == 6
+    assert value(got, "bus_connected", bus="can0") == 0
+    assert value(got, "device_online", device="tilt", bus="can0") == 0
+    assert value(got, "device_pdos_total", device="tilt", bus="can0", direction="out") == 4
+    assert value(got, "devices_online") == 1
+    assert [value(got, "tags", quality=q) for q in ("good", "bad", "uncertain")] == [1, 1, 0]
+    assert value(got, "writes_total", result="refused") == 3
+    assert value(got, "outputs_pending") == 1
+    assert value(got, "mailbox_messages_total", device="modem", what="dropped") == 6
+    assert value(got, "server_events_total", kind="serve", name="hmi", event="requests") == 11
+    assert value(got, "plc_overruns_total", task="main") == 2
+    assert value(got, "plc_lateness_seconds", task="main", quantile="0.99") == pytest.approx(20e-6)
+    assert value(got, "plc_restarts_total") == 3
+
+
+def test_latency_is_a_histogram_whose_buckets_add_up() -> None:
+    got = scraped(render(families(seen())))
+    buckets = [value(got, "bus_latency_seconds_bucket", bus="line1", le=f"{ms / 1000:g}") for ms in BOUNDS_MS]
+    assert buckets == [0, 0] + [1] * (len(BOUNDS_MS) - 2)
+    assert value(got, "bus_latency_seconds_bucket", bus="line1", le="+Inf") == 2
+    assert value(got, "bus_latency_seconds_count", bus="line1") == 2
+    assert value(got, "bus_latency_seconds_sum", bus="line1") == pytest.approx(9.003)
+
+
+def test_no_value_and_no_name_of_a_tag_is_in_it() -> None:
+    text = render(families(seen()))
+    assert "geheim" not in text
+    assert "31337" not in text
+    assert "pressure" not in text
+
+
+def test_a_process_that_does_not_answer_is_down_and_its_numbers_are_gone() -> None:
+    got = scraped(render(families(seen(gateway=None, plc=None, children={"gateway": True, "plc": False}))))
+    assert value(got, "up", process="gateway") == 0
+    assert value(got, "up", process="plc") == 0
+    assert not [name for name, _ in got if name.startswith(("fieldtwin_bus", "fieldtwin_plc", "fieldtwin_tags"))]
+
+
+def test_series_are_bounded() -> None:
+    got = scraped(render(families(seen(gateway=gateway_status(MOST_DEVICES + 4)))))
+    assert sum(name == "fieldtwin_device_online" for name, _ in got) == MOST_DEVICES
+    assert value(got, "devices_left_out") == 5
+    assert value(got, "devices") == MOST_DEVICES + 5
+
+
+@settings(max_examples=60)
+@given(
+    st.text(st.characters(codec="utf-8", exclude_characters="\r\x0b\x0c\x1c\x1d\x1e\x85\u2028\u2029")),
+    st.floats(allow_nan=False),
+)
+def test_any_label_and_any_number_come_back(label: str, number: float) -> None:
+    family = Family("x", "gauge", "back\\slash\nand line")
+    family.add(number, name=label)
+    assert scraped(render([family])) == {("x", frozenset({("name", label)})): number}
+
+
+def test_latencies_are_bounded_and_never_negative() -> None:
+    latency = Latencies()
+    for duration_ns in (-5, 0, 1_000_000, 1_000_001, 10**15):
+        latency.note(duration_ns)
+    assert latency.counts == [3, 1, *[0] * (len(BOUNDS_MS) - 2), 1]
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("9464", ("127.0.0.1", 9464)),
+        (":9464", ("127.0.0.1", 9464)),
+        ("10.0.0.1:1", ("10.0.0.1", 1)),
+        ("[::1]:9464", ("::1", 9464)),
+    ],
+)
+def test_without_a_host_it_is_loopback(text: str, place: tuple[str, int]) -> None:
+    assert parse_place(text) == place
+
+
+@pytest.mark.parametrize("text", ["", "host", "host:", "1:2:3", "x:70000", "http://x:1"])
+def test_no_place(text: str) -> None:
+    with pytest.raises(UsageError):
+        parse_place(text)
+
+
+async def ask(url: str, request: bytes) -> tuple[str, str]:
+    port = int(url.split(":")[2].split("/")[0])
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(request)
+    try:
+        head, _, body = (await reader.read()).decode().partition("\r\n\r\n")
+        writer.close()
+        await writer.wait_closed()
+    except ConnectionResetError:
+        return "", ""
+    return head, body
+
+
+def test_a_scrape() -> None:
+    async def main() -> None:
+        server = MetricsServer(lambda: render(families(seen())))
+        url = await server.open("127.0.0.1", 0)
+        try:
+            head, body = await ask(url, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert head.startswith("HTTP/1.1 200")
+            assert f"Content-Type: {CONTENT_TYPE}" in head
+            assert value(scraped(body), "published_total") == 83
+            assert (await ask(url, b"HEAD /metrics HTTP/1.1\r\n\r\n"))[1] == ""
+            assert "404" in (await ask(url, b"GET / HTTP/1.1\r\n\r\n"))[0]
+            assert "405" in (await ask(url, b"POST /metrics HTTP/1.1\r\n\r\n"))[0]
+            assert "400" in (await ask(url, b"\x00\x01\r\n\r\n"))[0]
+            assert (await ask(url, b"GET /" + b"x" * 20_000 + b"\r\n\r\n"))[0] == ""  # more than it reads
+            assert server.served == 2
+            second = MetricsServer(str)
+            with pytest.raises(EndpointBusy):
+                await second.open("127.0.0.1", int(url.split(":")[2].split("/")[0]))
+        finally:
+            await server.aclose()
+
+    run(main())
+
+
+def test_idle_clients_take_no_more_than_their_share() -> None:
+    async def main() -> None:
+        server = MetricsServer(str)
+        url = await server.open("127.0.0.1", 0)
+        port = int(url.split(":")[2].split("/")[0])
+        idle = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MOST_CLIENTS)]
+        try:
+            assert (await ask(url, b"GET /metrics HTTP/1.1\r\n\r\n"))[0] == ""
+            assert server.refused == 1
+        finally:
+            await server.aclose()  # does not wait for them
+            for _, writer in idle:
+                writer.close()
+                await writer.wait_closed()
+
+    run(main())

@@ -177,7 +177,9 @@ class VirtualRun:
             if self.shore is not None:
                 await self.shore.halt()
             self.outputs_confirmed_safe = await bench.run.stop_gateway()
-            outputs = describe(bench.run.gateway, loop.now_ns)["outputs"]  # a node that was stopped holds nothing for sure
+            outputs = describe(bench.run.gateway, loop.now_ns)[
+                "outputs"
+            ]  # a node that was stopped holds nothing for sure
             await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
             self._judge(bench.run.field)
             self._take_status(bench, outputs)

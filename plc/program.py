@@ -112,7 +112,7 @@ def var_retain(kind: TagKind, initial: Scalar | None = None, unit: str = "", lim
 
 
 def message_input() -> Any:
-    """Declare an input of messages: in each scan the tuple of `Message`s that are new, each in exactly one scan."""
+    """Declare an input of messages: in each scan a tuple of every new `Message`, each in exactly one scan."""
     return Variable("", Role.INPUT, TagKind.MESSAGE)
 
 

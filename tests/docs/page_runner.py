@@ -1,0 +1,153 @@
+"""What the pages of docs/ show is done: files are written, commands run in one folder a page, and their output compared.
+
+A comment before a fence says what it is for; forges and the book do not show it.
+
+    <!-- file: tank.yaml -->    the fence is that file
+    <!-- run -->                `$ ` lines are commands, the lines below each its output; `...` stands for anything
+    <!-- begin -->              a command that goes on until the page's end; its output must come before the page goes on
+    <!-- end -->                no fence: what goes on is interrupted
+
+Other fences are pictures. What takes longer stands as `<!-- run: long -->`: then all of the page runs with the tests marked long.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE_S = 30.0
+
+_MARK = re.compile(r"^<!-- (file|run|begin|end)(?:: (\S+))? -->\n(?:```[^\n]*\n(.*?)^```$)?", re.MULTILINE | re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A marked fence: what is done with it, the word behind the colon, its text, its line on the page."""
+
+    does: str
+    word: str
+    text: str
+    line: int
+
+
+def blocks(page: Path) -> list[Block]:
+    """The marked fences of a page, in order."""
+    text = page.read_text("utf-8")
+    return [
+        Block(found[1], found[2] or "", found[3] or "", text.count("\n", 0, found.start()) + 1)
+        for found in _MARK.finditer(text)
+    ]
+
+
+def is_long(page: Path) -> bool:
+    return any(block.word == "long" and block.does in ("run", "begin") for block in blocks(page))
+
+
+def commands(text: str) -> list[tuple[str, str]]:
+    """Each command of a console block with the output below it."""
+    found: list[tuple[str, list[str]]] = []
+    for line in text.splitlines():
+        if line.startswith("$ "):
+            found.append((line[2:], []))
+        elif found:
+            found[-1][1].append(line)
+    return [(command, "\n".join(output)) for command, output in found]
+
+
+def agrees(shown: str, seen: str) -> bool:
+    """Whether `seen` is what is shown; `...` is anything, and spaces at the ends of lines are none."""
+    parts = [re.escape(part.strip("\n")) for part in _bare(shown).split("...")]
+    return re.fullmatch(r"\s*" + r"(?s:.*?)".join(parts) + r"\s*", _bare(seen)) is not None
+
+
+def _bare(text: str) -> str:
+    return "\n".join(line.rstrip() for line in text.strip().splitlines())
+
+
+@dataclass(slots=True)
+class Reader:
+    """Somebody who does what a page says, in a folder of their own, with `fieldtwin` on the path."""
+
+    folder: Path
+    going_on: list[subprocess.Popen[str]] = field(default_factory=list)
+
+    def does(self, block: Block) -> None:
+        """One block. Raises AssertionError that says which command, what was shown and what was seen."""
+        if block.does == "file":
+            place = self.folder / block.word
+            place.parent.mkdir(parents=True, exist_ok=True)
+            place.write_text(block.text, "utf-8")
+        elif block.does == "end":
+            self.ends()
+        else:
+            for command, shown in commands(block.text):
+                seen = self._begins(command, shown) if block.does == "begin" else self._runs(command)
+                assert agrees(shown, seen), f"line {block.line}: {command}\n--- shown\n{shown}\n--- seen\n{seen}"
+
+    def ends(self) -> None:
+        """Interrupt what goes on, as Ctrl-C does, the last first."""
+        while self.going_on:
+            process = self.going_on.pop()
+            os.killpg(process.pid, signal.SIGINT)
+            try:
+                process.communicate(timeout=PATIENCE_S)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.communicate()
+
+    def _runs(self, command: str) -> str:
+        process = self._started(command)
+        try:
+            out, _ = process.communicate(timeout=20 * PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            out, _ = process.communicate()
+        return out
+
+    def _begins(self, command: str, shown: str) -> str:
+        """Until it said as many lines as are shown."""
+        process = self._started(command)
+        self.going_on.append(process)
+        assert process.stdout is not None
+        seen: list[str] = []
+        while len(seen) < len(shown.splitlines()):
+            ready, _, _ = select.select([process.stdout], [], [], PATIENCE_S)
+            line = process.stdout.readline() if ready else ""
+            if not line:
+                break
+            seen.append(line)
+        return "".join(seen)
+
+    def _started(self, command: str) -> subprocess.Popen[str]:
+        bin_folder = self.folder / ".bin"
+        if not bin_folder.exists():
+            bin_folder.mkdir()
+            for name, module in (("fieldtwin", "fieldtwin"), ("pytest", "pytest")):
+                script = bin_folder / name
+                script.write_text(f'#!/bin/sh\nexec {sys.executable} -m {module} "$@"\n')
+                script.chmod(0o755)
+        environment = {
+            **os.environ,
+            "PATH": f"{bin_folder}:{Path(sys.executable).parent}:{os.environ['PATH']}",
+            "PYTHONPATH": str(ROOT),
+            "FIELDTWIN_RUN": str(self.folder / "r"),
+            "COLUMNS": "120",
+            "NO_COLOR": "1",
+        }
+        return subprocess.Popen(
+            ["sh", "-c", command],
+            cwd=self.folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )

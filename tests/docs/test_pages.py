@@ -1,0 +1,47 @@
+"""The pages of docs/ that show commands: each is done as it is written, and its output compared."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from page_runner import ROOT, Block, Reader, agrees, blocks, commands, is_long
+
+PAGES = [page for page in sorted((ROOT / "docs").rglob("*.md")) if blocks(page)]
+
+
+def _as_test(page: Path):
+    marks = [pytest.mark.long, pytest.mark.timeout(900)] if is_long(page) else []
+    return pytest.param(page, id=page.relative_to(ROOT / "docs").as_posix(), marks=marks)
+
+
+@pytest.mark.parametrize("page", [_as_test(page) for page in PAGES])
+def test_what_a_page_shows_is_so(page):
+    with tempfile.TemporaryDirectory(prefix="pg", dir="/tmp") as folder:  # short: sockets are made below it
+        reader = Reader(Path(folder))
+        try:
+            for block in blocks(page):
+                reader.does(block)
+        finally:
+            reader.ends()
+
+
+def test_a_tutorial_cannot_be_left_out():
+    tutorials = {page.name for page in (ROOT / "docs" / "tutorials").glob("*.md")} - {"examples.md"}
+    assert tutorials <= {page.name for page in PAGES}
+
+
+def test_a_page_that_shows_something_else_is_noticed(tmp_path):
+    reader = Reader(tmp_path)
+    reader.does(Block("file", "a.txt", "one\n", 1))
+    reader.does(Block("run", "", "$ cat a.txt\none\n", 3))
+    with pytest.raises(AssertionError, match="line 5: cat"):
+        reader.does(Block("run", "", "$ cat a.txt\ntwo\n", 5))
+
+
+def test_output_is_compared_with_its_gaps():
+    assert agrees("a ... c\n...\nd", "a b c\nx\ny\nd  \n")
+    assert not agrees("a ... c", "a b d")
+    assert not agrees("a", "a\nb")
+    assert commands("$ one\nsays\n$ two\n") == [("one", "says"), ("two", "")]

@@ -29,7 +29,6 @@ import ctypes
 import errno
 import gc
 import os
-import resource
 import signal
 import sys
 import time
@@ -121,6 +120,8 @@ def _timer_slack() -> None:
 def _lock_memory() -> None:
     _need_linux()
     # With a limit on locked memory, locking what is still to come would make a later allocation fail: lock what is there.
+    import resource  # not on Windows
+
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     future = _MCL_FUTURE if soft == resource.RLIM_INFINITY else 0
     _check(_libc.mlockall(_MCL_CURRENT | future))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import resource
 import runpy
 import signal
 import sys
@@ -49,6 +48,10 @@ def end_with_parent(parent: int, linger_s: float = 0.0) -> None:
 def allow_open_files() -> None:
     """Let this process open as many files as it may, `MOST_FILES` at most: 1,000 devices are 2,000 sockets, and where a
     process begins with 1,024 it is for programs that use select(2), which we do not."""
+    try:
+        import resource
+    except ImportError:  # Windows, which has no such limit
+        return
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     allowed = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
     if soft != resource.RLIM_INFINITY and soft < allowed:

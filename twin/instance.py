@@ -6,14 +6,22 @@ run side by side; one name runs once.
 
 from __future__ import annotations
 
-import fcntl
+import getpass
 import os
 import re
+import tempfile
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
 from gateway.core.errors import EndpointBusy, Unreachable, UsageError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    LOCKS = False
+else:
+    LOCKS = True
 
 SOCKET_PATH_MAX = 100
 """A Unix socket's path is at most 107 bytes (sockaddr_un); our longest file name takes some of it."""
@@ -25,6 +33,8 @@ def runtime_root() -> Path:
         return Path(chosen)
     if base := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(base) / "fieldtwin"
+    if not hasattr(os, "getuid"):  # Windows
+        return Path(tempfile.gettempdir()) / f"fieldtwin-{getpass.getuser()}"
     return Path("/tmp") / f"fieldtwin-{os.getuid()}"
 
 
@@ -43,6 +53,9 @@ class Instance:
             )
 
     def __enter__(self) -> Instance:
+        if not LOCKS:
+            hint = "here: emulate, record, read, scan, check, and run --virtual"
+            raise Unreachable("a run needs Unix sockets and locks, which this system has not", hint=hint)
         try:
             self.dir.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             self.dir.mkdir(exist_ok=True, mode=0o700)

@@ -8,15 +8,21 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import fcntl
 import os
 import socket
-import termios
 from typing import Any
 
 from gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable, UsageError
+
+try:
+    import fcntl
+    import termios
+except ImportError:  # Windows
+    TTYS = False
+else:
+    TTYS = True
 
 CHUNK = 4096
 MAX_PENDING = 64
@@ -224,6 +230,8 @@ class TtyEnd(ByteConnection):
     def open(cls, endpoint: Endpoint) -> TtyEnd:
         """Open and configure; raises `Unreachable`, `EndpointBusy`, or `UsageError` for settings it cannot do."""
         where = str(endpoint)
+        if not TTYS:
+            raise Unreachable("this system has no serial devices as files", where=where, hint="a tcp end works")
         try:
             fd = os.open(endpoint.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         except OSError as e:

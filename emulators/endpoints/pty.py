@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
-import termios
 from pathlib import Path
 
 from emulators.wires.serial_line import SerialPacer
@@ -19,9 +18,16 @@ from gateway.core.connection import ByteConnection, RS232Connection, closed_here
 from gateway.core.endpoint import Endpoint, SerialSettings
 from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
+try:
+    import termios
+except ImportError:  # Windows
+    PTYS = False
+else:
+    PTYS = True
+
 READ_SIZE = 4096
 SETTLE_CHECK_S = 0.1
-_IDLE_FLAGS = termios.ECHOE | termios.ECHOK | termios.ECHONL
+_IDLE_FLAGS = termios.ECHOE | termios.ECHOK | termios.ECHONL if PTYS else 0
 """Mean something in canonical mode only, and every program that makes a port raw clears one of them at least.
 
 A pty clears parity, and Debian's tcsetattr (glibc 2.36) then fails with EINVAL if nothing else changed either: a port that
@@ -65,6 +71,9 @@ class PtyEnd(ByteConnection):
 
         Raises `EndpointBusy` where something that is no link stands in the way, `Unreachable` where none can be made.
         """
+        if not PTYS:
+            hint = "emulate on tcp, or on a real serial port"
+            raise Unreachable("this system has no virtual serial ports", where=str(endpoint), hint=hint)
         try:
             master, spare = os.openpty()
         except OSError as e:

@@ -9,7 +9,8 @@ import click
 
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.talk import data
-from fieldtwin.running.health import Check, Verdict, examine
+from fieldtwin.running.health import examine
+from fieldtwin.running.health_judging import Check, Verdict
 
 MARK = {Verdict.OK: "[green]ok[/green]  ", Verdict.NOTE: "[yellow]note[/yellow]", Verdict.BAD: "[red]bad[/red] "}
 
@@ -17,7 +18,7 @@ MARK = {Verdict.OK: "[green]ok[/green]  ", Verdict.NOTE: "[yellow]note[/yellow]"
 @click.command("doctor")
 @json_option
 def command(as_json: bool) -> int:
-    """Check Python, shipped data, ptys, serial ports, CAN, real-time limits, clock and disk; exit 1 when something is broken."""
+    """Check Python, shipped data, ports, CAN, real-time limits, processors, clock, files, disk; exit 1 if something is broken."""
     checks = examine()
     if as_json:
         json.dump(

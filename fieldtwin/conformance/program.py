@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import termios
 from collections import deque
 from collections.abc import Callable, Sequence
 from types import TracebackType
@@ -38,6 +37,8 @@ def _flush(tty: str) -> None:
         descriptor = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
     except OSError:
         return  # the other end of a real line
+    import termios  # where there are ptys
+
     try:
         termios.tcflush(descriptor, termios.TCIOFLUSH)
     finally:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import fcntl
 import os
-import termios
+from contextlib import suppress
 from pathlib import Path
 
 from emulators.endpoints.ports import OsPorts
@@ -14,6 +13,10 @@ from fieldtwin.conformance.scene import Unplug
 from gateway.core.connection import ByteConnection
 from gateway.core.endpoint import Endpoint, SerialSettings
 from gateway.core.errors import Unreachable
+
+with suppress(ImportError):  # Windows has no ptys: none can be opened
+    import fcntl
+    import termios
 
 
 class PtyLine:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import platform
-import resource
 import shutil
 import socket
-import tty
 from collections.abc import Callable
-from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.running import health_os as here
+from fieldtwin.running.health_judging import Check, Verdict, judged_clock, judged_processor, judged_watches
 from gateway.core.errors import FieldtwinError
 from twin.data_files import data_root
 from twin.instance import runtime_root
@@ -22,22 +20,6 @@ from twin.system import load_system
 
 MIN_FREE_BYTES = 200 * 1024 * 1024
 MIN_OPEN_FILES = 1024
-
-
-class Verdict(Enum):
-    """NOTE: something optional is missing, and everything else works."""
-
-    OK = "ok"
-    NOTE = "note"
-    BAD = "bad"
-
-
-@dataclass(frozen=True)
-class Check:
-    name: str
-    verdict: Verdict
-    found: str
-    advice: str = ""
 
 
 def examine() -> list[Check]:
@@ -51,6 +33,9 @@ def examine() -> list[Check]:
         _can,
         _realtime,
         _files,
+        _watches,
+        _processor,
+        _clock,
         _disk,
     )
     return [check() for check in checks]
@@ -87,6 +72,10 @@ def _run_directory() -> Check:
 
 
 def _pty() -> Check:
+    if not hasattr(os, "openpty"):
+        return Check("virtual serial", Verdict.NOTE, "this system has none", "emulate on tcp, or on real serial ports")
+    import tty
+
     try:
         master, slave = os.openpty()
         try:
@@ -109,9 +98,7 @@ def _serial() -> Check:
     ports = ports_here()
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]
     if closed:
-        return Check(
-            "serial ports", Verdict.NOTE, f"no access to {', '.join(closed)}", "join the group dialout and log in again"
-        )
+        return Check("serial ports", Verdict.NOTE, f"no access to {', '.join(closed)}", here.join_advice(closed))
     return Check("serial ports", Verdict.OK, ", ".join(ports) or "none (prototypes need none)")
 
 
@@ -132,22 +119,35 @@ def _can() -> Check:
 
 
 def _realtime() -> Check:
-    soft = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
-    allowed = os.geteuid() == 0 or soft > 0 or soft == resource.RLIM_INFINITY
+    allowed, found = here.may_realtime()
     if not allowed:
-        advice = "for a steadier scan: rtprio and memlock in /etc/security/limits.d, or CAP_SYS_NICE"
-        return Check("real time", Verdict.NOTE, "SCHED_FIFO is not allowed", advice)
-    return Check("real time", Verdict.OK, "SCHED_FIFO may be used")
+        advice = (
+            "for a steadier scan: rtprio and memlock in /etc/security/limits.d, or CAP_SYS_NICE (systemd: LimitRTPRIO)"
+        )
+        return Check("real time", Verdict.NOTE, found, advice)
+    return Check("real time", Verdict.OK, found)
 
 
 def _files() -> Check:
     """The hard limit counts: what serves many devices raises its own up to it."""
-    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-    if hard == resource.RLIM_INFINITY:
+    hard = here.most_open_files()
+    if hard is None:
         return Check("open files", Verdict.OK, "no limit")
     if hard < MIN_OPEN_FILES:
         return Check("open files", Verdict.NOTE, f"limit {hard}", f"ulimit -Hn {MIN_OPEN_FILES} for many devices")
     return Check("open files", Verdict.OK, f"limit {hard}")
+
+
+def _watches() -> Check:
+    return judged_watches(here.kernel_number("fs/inotify/max_user_instances"))
+
+
+def _processor() -> Check:
+    return judged_processor(here.cpu_count(), here.cgroup_quota())
+
+
+def _clock() -> Check:
+    return judged_clock(here.clock_state())
 
 
 def _disk() -> Check:

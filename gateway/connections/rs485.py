@@ -7,7 +7,6 @@ program can do that in time from outside. Bytes and one ioctl; it must never kno
 from __future__ import annotations
 
 import errno
-import fcntl
 import struct
 
 TIOCGRS485, TIOCSRS485 = 0x542E, 0x542F
@@ -31,6 +30,8 @@ def settings_sent(driver: bytes) -> bytes:
 
 def let_driver_switch(fd: int) -> None:
     """Turn RS485 mode on. Raises `OSError`: ENOTTY where the port has none (ptys, most USB adapters), or drops it."""
+    import fcntl  # not on Windows, where there is no such request
+
     driver = fcntl.ioctl(fd, TIOCGRS485, bytes(_SERIAL_RS485.size))
     kept = fcntl.ioctl(fd, TIOCSRS485, settings_sent(driver))
     if not _SERIAL_RS485.unpack(kept)[0] & ENABLED:  # the kernel gives back what it made of the request

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-import termios
+from contextlib import suppress
 from typing import cast
 
 from gateway.connections.line_counters import LineCounters, read_control_lines, read_counters
@@ -19,6 +19,9 @@ from gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, o
 from gateway.core.connection import ByteConnection, RS232Connection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError
+
+with suppress(ImportError):  # Windows: `serial_threads` is used there
+    import termios
 
 DRAIN_LIMIT_S = 1.0
 """How long closing waits for the last bytes to leave; a shutdown as a whole has 2 s."""

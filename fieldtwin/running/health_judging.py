@@ -1,0 +1,78 @@
+"""What numbers of a computer mean for a plant's controller, and what to change. Pure: `health` asks the computer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+MIN_INOTIFY = 16
+MIN_CPUS = 1.0
+"""Gateway, PLC and the run's own process share what there is; less than one processor makes scans late."""
+
+
+class Verdict(Enum):
+    """NOTE: something optional is missing, and everything else works."""
+
+    OK = "ok"
+    NOTE = "note"
+    BAD = "bad"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check: its name, the verdict, what was found and, where something is missing, what to change."""
+
+    name: str
+    verdict: Verdict
+    found: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class ClockState:
+    """The kernel's clock: whether something disciplines it, and its own estimate of how far it is off."""
+
+    synchronised: bool
+    error_s: float
+    year: int
+
+
+def judged_clock(state: ClockState | None) -> Check:
+    """Scans and polls go by the monotonic clock; a wrong time of day makes logs and recordings useless, and TLS fail."""
+    if state is None:
+        return Check("clock", Verdict.NOTE, "this system does not say whether it is synchronised", "use NTP or PTP")
+    if state.year < 2024:
+        return Check("clock", Verdict.BAD, f"the year is {state.year}", "set the clock; a battery for it, or NTP")
+    if not state.synchronised:
+        advice = "start chrony or systemd-timesyncd: time stamps of logs, and certificates, go by it"
+        return Check("clock", Verdict.NOTE, "the kernel's clock is not synchronised", advice)
+    return Check("clock", Verdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
+
+
+def judged_watches(instances: int | None) -> Check:
+    """Nothing of ours waits by inotify; udev, the journal and systemd do, by whom ports come back and services start."""
+    if instances is None:
+        return Check("inotify", Verdict.OK, "not on this system")
+    if instances < MIN_INOTIFY:
+        advice = "sysctl fs.inotify.max_user_instances=128"
+        return Check("inotify", Verdict.NOTE, f"{instances} instances a user", advice)
+    return Check("inotify", Verdict.OK, f"{instances} instances a user")
+
+
+def judged_processor(cpus: int, quota: float | None) -> Check:
+    """`quota`: processors that a cgroup gives at most, None for no limit. A quota stops everything until its period is over."""
+    if quota is None:
+        return Check("processors", Verdict.OK, f"{cpus}, no quota")
+    found = f"{cpus}, of which a cgroup gives {quota:g} at most"
+    if quota < MIN_CPUS:
+        advice = "scans are late whenever it is used up: give at least one (docker --cpus, systemd CPUQuota)"
+        return Check("processors", Verdict.NOTE, found, advice)
+    return Check("processors", Verdict.OK, found)
+
+
+def quota_of(text: str) -> float | None:
+    """What cgroup v2's ``cpu.max`` says, ``QUOTA PERIOD`` or ``max PERIOD`` in microseconds, as processors."""
+    words = text.split()
+    if len(words) != 2 or not all(w.isascii() and w.isdigit() for w in words) or int(words[1]) == 0:
+        return None
+    return int(words[0]) / int(words[1])

@@ -1,0 +1,90 @@
+"""What the doctor makes of a computer's numbers, and what it asks the computer for."""
+
+from __future__ import annotations
+
+import grp
+import os
+from pathlib import Path
+
+import pytest
+
+from fieldtwin.running.health import examine
+from fieldtwin.running.health_judging import (
+    ClockState,
+    Verdict,
+    judged_clock,
+    judged_processor,
+    judged_watches,
+    quota_of,
+)
+from fieldtwin.running.health_os import cgroup_quota, clock_state, cpu_count, join_advice, kernel_number
+
+
+@pytest.mark.parametrize(
+    ("state", "verdict"),
+    [
+        (None, Verdict.NOTE),
+        (ClockState(True, 0.004, 2026), Verdict.OK),
+        (ClockState(False, 16.0, 2026), Verdict.NOTE),
+        (ClockState(True, 0.004, 1970), Verdict.BAD),
+    ],
+)
+def test_clock(state: ClockState | None, verdict: Verdict) -> None:
+    check = judged_clock(state)
+    assert check.verdict is verdict
+    assert bool(check.advice) is (verdict is not Verdict.OK)
+
+
+@pytest.mark.parametrize(("text", "quota"), [("max 100000\n", None), ("150000 100000", 1.5), ("", None), ("1 0", None)])
+def test_quota_of_a_cgroup(text: str, quota: float | None) -> None:
+    assert quota_of(text) == quota
+
+
+def test_less_than_a_processor_is_said() -> None:
+    assert judged_processor(8, None).verdict is Verdict.OK
+    assert judged_processor(8, 2.0).verdict is Verdict.OK
+    tight = judged_processor(8, 0.5)
+    assert tight.verdict is Verdict.NOTE
+    assert "0.5" in tight.found
+
+
+def test_inotify() -> None:
+    assert judged_watches(128).verdict is Verdict.OK
+    assert judged_watches(None).verdict is Verdict.OK
+    assert judged_watches(4).verdict is Verdict.NOTE
+
+
+def test_the_group_to_join_is_the_ports_own(tmp_path: Path) -> None:
+    port = tmp_path / "ttyUSB0"
+    port.write_bytes(b"")
+    port.chmod(0o660)
+    group = grp.getgrgid(port.stat().st_gid).gr_name
+    assert f"usermod -aG {group} " in join_advice([str(port)])
+    port.chmod(0o600)
+    assert "udev" in join_advice([str(port)])
+
+
+def test_this_computer_can_be_asked() -> None:
+    assert cpu_count() >= 1
+    assert (cgroup_quota() or 1) > 0
+    assert kernel_number("no/such") is None
+    assert kernel_number("kernel/pid_max")
+    state = clock_state()
+    assert state is None or (state.year >= 2024 and state.error_s >= 0)
+
+
+def test_every_check_that_is_not_ok_says_what_to_do() -> None:
+    checks = examine()
+    assert len({c.name for c in checks}) == len(checks)
+    assert {"python", "serial ports", "kernel CAN", "real time", "clock", "disk", "open files", "processors"} <= {
+        c.name for c in checks
+    }
+    assert [c.name for c in checks if c.verdict is not Verdict.OK and not c.advice] == []
+
+
+def test_a_run_directory_that_cannot_be_written_is_bad(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "file" / "below"))
+    found = {c.name: c for c in examine()}["run directory"]
+    assert found.verdict is Verdict.BAD
+    assert os.fspath(tmp_path) in found.found

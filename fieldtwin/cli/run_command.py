@@ -331,6 +331,9 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
         async with Service(session, service_options, notifier) as service:
             if service_options.log is None:
                 print_metrics(service.url)
+            if hasattr(signal, "SIGHUP"):
+                # From a terminal it says that nobody watches any more; to a service, that its configuration changed.
+                loop.add_signal_handler(signal.SIGHUP, service.hang_up if notifier.wanted else interrupt)
             async with LiveView(session, quiet=as_json or service_options.log is not None):
                 await session.wait()
     notifier.close()

@@ -113,6 +113,11 @@ class Service:
         if self._log is not None:
             self._log.write(event)
 
+    def hang_up(self) -> None:
+        """SIGHUP: nothing is read anew while a plant runs (docs/service.md); and it is no reason to end, as it else would be."""
+        text = "SIGHUP: the configuration is read at the start only; restart to use another"
+        self.note(Event(Priority.WARNING, "not_reloaded", text))
+
     def healthy(self, seen: Snapshot, patience_s: float) -> bool:
         """Whether gateway and PLC both answered within `patience_s` seconds."""
         return seen.gateway is not None and seen.plc is not None and seen.asked_ago_s <= patience_s

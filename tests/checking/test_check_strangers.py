@@ -48,6 +48,7 @@ def not_passed(results: list[DeviceResult]) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(("peer", "wire"), WIRES)
+@pytest.mark.long
 def test_verdicts_are_the_known_ones(peer: str, wire: str) -> None:
     here = version_of(peer)
     if not here:

@@ -153,6 +153,7 @@ def container_health(*sockets: Path) -> tuple[int, str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(150)  # a shore of 8 s and four starts: half a minute on a busy computer
+@pytest.mark.long
 def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> None:
     """The compose file's three commands on free ports: health checks, exit codes and the summary are as it relies on."""
     text = PROTOTYPE_FILE.read_text(encoding="utf-8")

@@ -13,6 +13,7 @@ pytestmark = pytest.mark.slow
 RUN = ("run", "observatory", "--prototype", "--json", "--instance", "r")
 
 
+@pytest.mark.long
 def test_one_field_side_serves_run_after_run(tmp_path: Path) -> None:
     port = free_port()
     with fieldtwin(tmp_path, "emulate", "observatory", "--control", f"127.0.0.1:{port}", name="field") as side:

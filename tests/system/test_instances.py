@@ -77,6 +77,7 @@ def make_active(run: Fieldtwin, instance: str) -> None:
     wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1] == "0001", 10, "the sensor samples")
 
 
+@pytest.mark.long
 def test_two_instances_an_imported_cast_and_an_interrupt(tmp_path: Path) -> None:
     rows = write_cast(tmp_path / "sta1.cnv")
     imported = run_to_end(tmp_path, "import", "sta1.cnv", "-o", "sta1.jsonl", "--json", name="import")
@@ -132,6 +133,7 @@ def test_two_instances_an_imported_cast_and_an_interrupt(tmp_path: Path) -> None
     no_tracebacks(tmp_path)
 
 
+@pytest.mark.long
 def test_a_recording_that_was_cut_off_is_used_up_to_its_last_whole_row(tmp_path: Path) -> None:
     """A recorder that was killed leaves half a line; what stands before it is good (DESIGN.md, decision 7)."""
     write_cast(tmp_path / "sta1.cnv")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from procs import run_to_end
 
 FILES = {
@@ -51,6 +52,7 @@ class Watch(Program):
 }
 
 
+@pytest.mark.long
 def test_what_is_learnt_in_one_run_is_known_in_the_next(tmp_path: Path) -> None:
     for name, text in FILES.items():
         (tmp_path / name).write_text(text.lstrip(), encoding="utf-8")

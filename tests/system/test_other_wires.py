@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from procs import CHECKOUT, run_to_end
 
 SYSTEMS = CHECKOUT / "profiles" / "systems"
 
 
+@pytest.mark.long
 def test_a_prototype_over_ascii_and_udp(tmp_path: Path) -> None:
     system = (SYSTEMS / "observatory.yaml").read_text(encoding="utf-8")
     system = system.replace("rtu:/dev/ttyS0?baudrate=19200&frame=8E1", "ascii:/dev/ttyS0?baudrate=19200&frame=7E1")

@@ -29,6 +29,7 @@ pytestmark = pytest.mark.slow
 SYSTEMS = CHECKOUT / "profiles" / "systems"
 
 
+@pytest.mark.long
 def test_with_nobody_there_it_says_so_retries_and_keeps_scanning(tmp_path: Path) -> None:
     (tmp_path / "systems").mkdir()
     system = (SYSTEMS / "observatory.yaml").read_text(encoding="utf-8")
@@ -157,6 +158,7 @@ def test_another_device_than_expected_is_never_written(plant: Plant) -> None:
     assert any("another device answers" in error for error in run.summary["errors"])
 
 
+@pytest.mark.long
 def test_ports_that_are_taken_are_named(tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -66,6 +66,7 @@ def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, m
         )
 
 
+@pytest.mark.long
 def test_the_observatorys_relay_is_drawn_and_proved(tmp_path: Path) -> None:
     root = ET.fromstring(plc("diagram", "observatory"))
     texts = {e.text for e in root.iter("{http://www.w3.org/2000/svg}text")}

@@ -51,6 +51,7 @@ def test_a_scenario_runs_unchanged_as_processes(tmp_path: Path) -> None:
     no_tracebacks(tmp_path)
 
 
+@pytest.mark.long
 def test_what_does_not_hold_fails_there_too(tmp_path: Path) -> None:
     path = tmp_path / "f.scenario.yaml"
     path.write_text(

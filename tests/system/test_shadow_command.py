@@ -9,6 +9,7 @@ from procs import fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_shadow_opposite_a_prototype_follows_its_states_and_survives_its_own_death(tmp_path: Path) -> None:
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
     with fieldtwin(

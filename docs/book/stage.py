@@ -106,6 +106,9 @@ def stage(target: Path) -> None:
         for name, place in beside.items():
             (target / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, target / place)
+    shutil.copytree(
+        ROOT / "examples", target / "files" / "examples", ignore=shutil.ignore_patterns("__pycache__", ".*")
+    )
     for page, text in generated().items():
         _write(target / page, text)
 

@@ -1,0 +1,59 @@
+"""docs/ci.md: the recipes are YAML of the form that the services take, and call fieldtwin with options that there are."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import click
+import pytest
+import yaml
+
+from fieldtwin.cli.main import cli
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "ci.md"
+RECIPES = re.findall(r"^<!-- recipe: (\w+) -->\n```yaml\n(.*?)^```$", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+def commands_of(service: str, text: str) -> list[str]:
+    """The shell lines of a recipe; fails where it is not of the service's form."""
+    recipe = yaml.safe_load(text)
+    if service == "gitlab":
+        jobs = recipe.values()
+        assert all(job["artifacts"]["when"] == "always" and job["image"] for job in jobs)
+        return [line for job in jobs for line in job["script"]]
+    assert recipe.keys() == {"name", True, "permissions", "jobs"}  # `on` is a boolean of YAML 1.1
+    steps = [step for job in recipe["jobs"].values() for step in job["steps"]]
+    assert all(("uses" in step) != ("run" in step) for step in steps)
+    assert all(re.fullmatch(r"[\w-]+/[\w-]+@v\d+", step["uses"]) for step in steps if "uses" in step)
+    return [line for step in steps for line in step.get("run", "").splitlines()]
+
+
+def parsed(command: str) -> click.Context:
+    """The command line, parsed and not run. Raises click.UsageError for what there is not."""
+    words = shlex.split(command.split(" > ")[0])
+    assert words.pop(0) == "fieldtwin"
+    name = words.pop(0)
+    found = cli.get_command(click.Context(cli), name)
+    assert found is not None, name
+    return found.make_context(name, words)
+
+
+@pytest.mark.parametrize(("service", "text"), RECIPES)
+def test_a_recipe_is_of_its_form_and_its_commands_are_there(service, text):
+    ours = [line for line in commands_of(service, text) if line.startswith("fieldtwin")]
+    assert ours
+    for line in ours:
+        assert parsed(line) is not None
+
+
+def test_scenarios_leave_junit_and_html_on_both_services():
+    told = {service for service, text in RECIPES if "--junit out/" in text and "--html out/" in text}
+    assert told == {"github", "gitlab"}
+    assert {service for service, text in RECIPES if "socketcan/vcan0" in text} == {"github", "gitlab"}
+
+
+def test_an_option_that_there_is_not_is_noticed():
+    with pytest.raises(click.UsageError):
+        parsed("fieldtwin test --junti out.xml")

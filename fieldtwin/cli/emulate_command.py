@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from fieldtwin.cli.options import pairs, profiles_option
+from fieldtwin.cli.options import Secret, pairs, profiles_option
 from fieldtwin.running.field_contact import DEFAULT_CONTROL_PORT
 from gateway.core.errors import UsageError
 from twin.data_files import data_root, find
@@ -65,7 +65,13 @@ from twin.data_files import data_root, find
     metavar="HOST:PORT",
     help="For a system: where `fieldtwin run --field` finds it.",
 )
-@click.option("--token", default="", help="Whoever connects to --control must know it; needed off loopback.")
+@click.option(
+    "--token",
+    type=Secret(),
+    default="",
+    metavar="@FILE",
+    help="Whoever connects to --control must know it; needed off loopback. Or in FIELDTWIN_EMULATE_TOKEN.",
+)
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field.")
 @profiles_option
 def command(

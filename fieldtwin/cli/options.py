@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 import click
@@ -25,6 +26,24 @@ class Duration(click.ParamType[float]):
         if not match:
             self.fail(f"{value!r} is no duration such as 20s, 500ms or 2m", param, ctx)
         return float(match[1]) * _UNIT_S[match[2] or ""]
+
+
+class Secret(click.ParamType[str]):
+    """A secret: ``@FILE`` for the first line of a file. Others see a command line, and not the environment."""
+
+    name = "secret"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        text = str(value)
+        if not text.startswith("@"):
+            return text
+        try:
+            lines = Path(text[1:]).read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as e:
+            self.fail(f"{text[1:]}: {getattr(e, 'strerror', None) or 'not text'}", param, ctx)
+        if not lines or not lines[0].strip():
+            self.fail(f"{text[1:]} is empty", param, ctx)
+        return lines[0].strip()
 
 
 def pairs(values: tuple[str, ...], what: str) -> dict[str, str]:

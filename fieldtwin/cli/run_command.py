@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from fieldtwin.cli.options import Duration, json_option, pairs, profiles_option
+from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
 from fieldtwin.cli.template_question import ask_about_code
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
@@ -51,7 +51,13 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     metavar="HOST[:PORT]",
     help="The field side runs there already (fieldtwin emulate).",
 )
-@click.option("--token", default="", help="Token of that field side's control channel.")
+@click.option(
+    "--token",
+    type=Secret(),
+    default="",
+    metavar="@FILE",
+    help="Token of that field side's control channel; or in FIELDTWIN_RUN_TOKEN.",
+)
 @click.option(
     "--recording", "recordings", multiple=True, metavar="DEVICE=FILE", help="Play this recording for a device."
 )

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 
-from fieldtwin.cli.options import Duration, json_option, profiles_option
+from fieldtwin.cli.options import Duration, Secret, json_option, profiles_option
 from fieldtwin.cli.talk import talk
 from fieldtwin.running.field_contact import connect_control, reachable
 from fieldtwin.running.shore import Shore, parse_periods, script
@@ -30,7 +30,13 @@ from twin.system import System, load_system
     metavar="HOST[:PORT]",
     help="Or: ask this field side where its far modem listens.",
 )
-@click.option("--token", default="", help="Token of that field side's control channel.")
+@click.option(
+    "--token",
+    type=Secret(),
+    default="",
+    metavar="@FILE",
+    help="Token of that field side's control channel; or in FIELDTWIN_SHORE_TOKEN.",
+)
 @click.option("--device", default="", help="The transmitter; default: the system's only one.")
 @click.option(
     "--commands", default="none", metavar="1,2,0,-1", help="Periods to command, spread over the run; or none."

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.cli.options import Secret, json_option, profiles_option
 from fieldtwin.cli.talk import data
 from fieldtwin.conformance.case import Danger
 from gateway.core.errors import UsageError
@@ -40,7 +40,13 @@ _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "
 )
 @click.option("--instance", default="", help="With compose, real: what runs on this host under that name.")
 @click.option("--field", "field_host", default="field", metavar="HOST[:PORT]", help="With compose: the field side.")
-@click.option("--token", default="", help="Token of that field side's control channel.")
+@click.option(
+    "--token",
+    type=Secret(),
+    default="",
+    metavar="@FILE",
+    help="Token of that field side's control channel; or in FIELDTWIN_TEST_TOKEN.",
+)
 @click.option("--far", default="", metavar="ENDPOINT", help="With real: where the far modem is, for `send`.")
 @click.option(
     "--capture",

@@ -116,14 +116,14 @@ class Reader:
         process = self._started(command)
         self.going_on.append(process)
         assert process.stdout is not None
-        seen: list[str] = []
-        while len(seen) < len(shown.splitlines()):
+        seen = b""
+        while seen.count(b"\n") < len(shown.splitlines()):
             ready, _, _ = select.select([process.stdout], [], [], PATIENCE_S)
-            line = process.stdout.readline() if ready else ""
-            if not line:
+            came = os.read(process.stdout.fileno(), 65536) if ready else b""  # past the stream's own buffer
+            if not came:
                 break
-            seen.append(line)
-        return "".join(seen)
+            seen += came
+        return "".join(seen.decode().splitlines(keepends=True)[: len(shown.splitlines())])
 
     def _started(self, command: str) -> subprocess.Popen[str]:
         bin_folder = self.folder / ".bin"

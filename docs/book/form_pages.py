@@ -34,8 +34,7 @@ def _forms() -> str:
     parts = [
         "# Forms\n",
         "Every key of every kind of file, as `fieldtwin schema KIND` has them. What they mean, with examples, is in"
-        " [files](../files.md), [scenarios](../scenarios.md), [faults](../faults.md) and [conformance](../conformance.md)."
-        " A key that stands here and not there is an error of ours.\n",
+        " [files](../files.md), [scenarios](../scenarios.md), [faults](../faults.md) and [conformance](../conformance.md).\n",
     ]
     for kind, about in KINDS.items():
         schema = SCHEMAS[kind]()
@@ -90,7 +89,7 @@ def _type(form: dict[str, Any]) -> str:
     if form.get("type") == "array":
         return f"list of {_type(form.get('items', {}))}"
     if form.get("type") == "object":
-        below = form.get("additionalProperties")
+        below = next(iter(form.get("patternProperties", {}).values()), form.get("additionalProperties"))
         return f"by name: {_type(below)}" if isinstance(below, dict) else "keys and values"
     return str(form.get("type", "anything")) + _bounds(form)
 

@@ -1,0 +1,50 @@
+"""The book of docs/: its links lead somewhere, its reference has what the program has, and it is built without a warning."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from page_runner import ROOT
+
+sys.path.insert(0, str(ROOT / "docs" / "book"))
+
+import stage as book
+
+
+def test_links_between_files_lead_somewhere():
+    pages = book.pages()
+    for source, page in pages.items():
+        book.with_links((ROOT / source).read_text("utf-8"), source, page, pages)
+
+
+def test_a_link_to_nothing_is_named_with_its_line():
+    with pytest.raises(book.BrokenLink, match=r"docs/plc\.md:2: nothing is at gone\.md"):
+        book.with_links("one\n[x](gone.md#y)\n", "docs/plc.md", "plc.md", book.pages())
+
+
+def test_links_are_those_of_the_book():
+    shown = "[a](docs/plc.md#x) ![b](docs/picture.svg)"
+    text, beside = book.with_links(shown, "README.md", "readme.md", book.pages())
+    assert text == "[a](plc.md#x) ![b](picture.svg)"
+    assert beside == {"docs/picture.svg": "picture.svg"}
+
+
+def test_every_page_stands_in_the_contents():
+    listed = set(re.findall(r"^[\w/.-]+$", (ROOT / "docs" / "index.md").read_text("utf-8"), re.MULTILINE))
+    pages = {page.removesuffix(".md") for page in [*book.pages().values(), *book.GENERATED]}
+    assert {page for page in pages if not page.startswith("decisions/0")} - {"index"} == listed
+
+
+@pytest.mark.long
+@pytest.mark.timeout(300)
+def test_the_book_is_built_without_a_warning():
+    for tool in ("sphinx", "myst_parser", "furo"):
+        pytest.importorskip(tool, reason="pip install '.[docs]'")
+    done = subprocess.run(
+        ["scripts/docs"], cwd=ROOT, env={**os.environ, "BOOK_PYTHON": sys.executable}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr

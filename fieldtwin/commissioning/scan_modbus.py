@@ -176,12 +176,13 @@ class ModbusScanner:
         done = await self._steps(steps, "likely settings", until_found=not self._options.every_setting)
         if self._quick != self._pace:
             done = []  # asked too quickly for some: they are asked again
+        if self._options.quick_only:
+            self.result.notes.append("only likely settings and units were tried; without --quick all are")
+            return
         found = {f.settings for f in self.result.units}
         if found:
             await self._steps(plan.full_pass(self._pace, list(found), self._units, done), "every unit")
-        if self._options.quick_only or self._ended or (found and not self._options.every_setting):
-            if self._options.quick_only and not found:
-                self.result.notes.append("only likely settings and units were tried; without --quick all are")
+        if self._ended or (found and not self._options.every_setting):
             return
         await self._search_all(done)
 

@@ -213,6 +213,16 @@ def test_listening_to_anything_counts_it_and_never_fails(chunks: list[bytes]) ->
     assert 0 <= heard.good_bytes <= heard.bytes
 
 
+def test_quick_ends_with_the_quick_pass_where_somebody_answers_too() -> None:
+    async def main() -> None:
+        found = await scan(UartLine({1: meter(), 200: meter()}), quick_only=True)
+        assert [f.answer.unit for f in found.units] == [1]
+        assert found.took_s < 34
+        assert any("--quick" in note for note in found.notes)
+
+    run_virtually(main())
+
+
 def test_the_quick_pass_takes_30_s_and_tries_likely_settings_with_likely_units() -> None:
     async def main() -> None:
         line = UartLine({200: meter()})

@@ -161,6 +161,10 @@ class Outgoing:
         if ack.through > self.last:
             self.contradicted = True
             return
+        if ack.through < self.through:
+            self._on_less(ack.through, now_ns)
+            if not self._known:
+                return
         if not self._known:
             self._known, self.refused, self._hello_ns = True, False, None
             self._loaded = max(self._loaded, ack.through)
@@ -180,6 +184,19 @@ class Outgoing:
             at += run
         if progress:
             self._rto.calm()
+
+    def _on_less(self, through: int, now_ns: int) -> None:
+        """The other side has less than it confirmed: an ACK that was late, or one who is there for the first time. HELLO asks,
+        and what answers it is believed: what was confirmed before was to somebody else."""
+        if self._known:
+            self.on_ask(now_ns)
+            return
+        self._window.clear()
+        self._to_send.clear()
+        self._lost.clear()
+        self._told.clear()
+        self.through = self._loaded = through
+        self._known, self.refused, self._hello_ns = True, False, None
 
     def _confirm_run(self, first: int, last_missing: int, last: int, now_ns: int, late_ns: int) -> bool:
         """Numbers from `first` on are missing, those behind `last_missing` are kept."""

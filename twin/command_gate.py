@@ -21,12 +21,14 @@ OLD_MS = 10 * 60_000
 class CommandGate(PTDigitalThreadProcess):
     """`admit` looks at an event of the twin's log; the command, or None where it was refused. It shares what became of each."""
 
-    def __init__(self, *, remote: bool, bounds: Bounds, clock: Clock, old_ms: int = OLD_MS) -> None:
+    def __init__(self, *, remote: bool, bounds: Bounds, clock: Clock, old_ms: int = OLD_MS, since_ms: int = 0) -> None:
+        """`since_ms`: when the plant's own log began (UTC); what was commanded before may have been obeyed, and nobody knows."""
         super().__init__("command gate", clock)
         self.taken = self.refused = 0
         self._remote = remote
         self._check = CommandCheck(bounds, clock)
         self._old_ms = old_ms
+        self._since_ms = since_ms
         self._last: dict[str, int] = {}
 
     def admit(self, origin: str, event: Event) -> COMMAND | None:
@@ -53,6 +55,8 @@ class CommandGate(PTDigitalThreadProcess):
         age_ms = self._clock.utc_ns() // 1_000_000 - event.t_ms
         if age_ms > self._old_ms:
             return f"it is {age_ms // 1000} s old; at most {self._old_ms // 1000} s are obeyed"
+        if event.t_ms < self._since_ms:
+            return "it is from before this plant's log began, and may have been obeyed then"
         return self._check.objection(command)
 
     def _refuse(self, why: str) -> None:

@@ -28,7 +28,7 @@ from gateway.core.image_region import Snapshot
 from gateway.core.nursery import Nursery
 from gateway.core.statemachine import STATE_CODES, STATES
 from gateway.core.values import COMMAND, RESPONSE, TagValue
-from gateway.store.event import Event, Kind
+from gateway.store.event import Event, Kind, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
 from gateway.wallclock import WallClock, run
 from twin.command_gate import CommandGate
@@ -141,7 +141,9 @@ class PlantThread:
             stack.push_async_callback(carrier.aclose)
             least_s, most_s = system.commands.period_s
             bounds = Bounds(least_s, most_s, system.commands.per_minute)
-            self._gate = CommandGate(remote=system.remote == "remote", bounds=bounds, clock=clock)
+            self._gate = CommandGate(
+                remote=system.remote == "remote", bounds=bounds, clock=clock, since_ms=await self._since(store, origin)
+            )
             self._end = ThreadEnd(
                 store, carrier, schema_of(system), clock,
                 origin=origin, prototype=c.prototype, on_events=self._commanded,
@@ -162,6 +164,13 @@ class PlantThread:
                 connection.pump()
                 await self._writer.flush()
         return 0
+
+    async def _since(self, store: KnowledgeStore, origin: str) -> int:
+        """When our log began; 0 when that is so long ago that it was forgotten."""
+        first = await store.read(origin, 1, 1)
+        if first:
+            return first[0].t_ms if first[0].sequence == 1 else 0
+        return self._clock.utc_ns() // NS_PER_MS
 
     async def _commanded(self, origin: str, events: Sequence[Event]) -> None:
         """What arrived from the digital twin's log, each number once: to the gateway, if the gate admits it."""

@@ -55,6 +55,16 @@ def test_what_is_admitted_is_the_command_bit_by_bit_and_on_record() -> None:
     assert (event.kind, event.name, event.value) == (Kind.COMMAND, "twin:1", encode_period(5).data)
 
 
+def test_what_was_commanded_before_the_plants_log_began_is_not_obeyed() -> None:
+    """A plant that lost its store does not know what it did before; its twin sends everything again."""
+    made = CommandGate(remote=True, bounds=Bounds(0, 3600, 5), clock=Hands(), since_ms=NOW_MS - 1000)
+    assert made.admit("twin:1", number(1, t_ms=NOW_MS - 1001)) is None
+    assert refusals(made) == [
+        "number 1 of twin:1: it is from before this plant's log began, and may have been obeyed then"
+    ]
+    assert made.admit("twin:1", number(2, t_ms=NOW_MS - 1000)) is not None
+
+
 @given(numbers=st.lists(st.integers(1, 8), max_size=30))
 def test_no_number_is_taken_twice_and_none_after_a_later_one(numbers: list[int]) -> None:
     made = gate(bounds=Bounds(per_minute=1000))

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from gateway.core.clock import NS_PER_MS
+from gateway.core.control import ControlServer
 from gateway.core.nursery import Nursery
 from gateway.store.event import Event, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
@@ -45,7 +46,13 @@ def limits_of(system: System) -> dict[str, Limits]:
 
 
 class Shadowing:
-    """``await Shadowing(...).run(stop)``. `on_verdict` is told each verdict as it is reached."""
+    """``await Shadowing(...).run(stop)``. `on_verdict` is told each verdict as it is reached.
+
+    While it runs it serves the verbs ready (something of the plant came, and the thread is there) and get, on `KIND.sock` in the
+    run directory: for health checks.
+    """
+
+    kind = "shadow"
 
     def __init__(
         self,
@@ -64,6 +71,7 @@ class Shadowing:
         self.origins: set[str] = set()
         self._system = system
         self._place = place
+        self._socket = Path(instance.dir) / f"{self.kind}.sock"
         self._store = store or str(Path(instance.dir) / "knowledge.sqlite")
         self._on_verdict = on_verdict
         self._end: ThreadEnd | None = None
@@ -79,7 +87,9 @@ class Shadowing:
         """Shadow the plant until `stop`, or for so many seconds. Raises `FieldtwinError` for a store that cannot be used."""
         system, clock = self._system, self.clock
         store = await open_knowledge(self._store)
+        server = ControlServer({"ready": self._ready, "get": self._get})
         try:
+            await server.listen_unix(self._socket)
             own = await store.own("shadow", system=system.name, prototype=False, log=secrets.token_hex(4))
             carrier = twin_carrier(self._place, system, clock)
             self._end = await self._thread(store, carrier)
@@ -103,7 +113,14 @@ class Shadowing:
                 self.prototypes = {origin for origin in self.origins if kinds.get(origin)}
                 await carrier.aclose()
         finally:
+            await server.aclose()
             await store.aclose()
+
+    async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"ready": bool(self.origins) and self._end is not None and self._end.connected}
+
+    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+        return self.describe()
 
     async def _arrived(self, origin: str, events: Sequence[Event]) -> None:
         self.origins.add(origin)

@@ -25,6 +25,7 @@ from twin.twin import DigitalTwin
 class Twinning(Shadowing):
     """As `Shadowing`, with a planner. `on_command` is told each command that is sent."""
 
+    kind = "twin"
     shadow: DigitalTwin
 
     def __init__(

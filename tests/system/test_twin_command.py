@@ -30,6 +30,9 @@ def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_pat
             wait_for(
                 lambda: plant("get")["links"] >= 2 and plant("get")["waiting"] == 0, 30, f"caught up; {second.err}"
             )
+            health = second.control("observatory-twin", "twin")
+            wait_for(lambda: health("ready")["ready"], 20, "the twin says that it hears the plant")
+            assert health("get")["period_s"] == 3
             second.signal(2)
             assert second.wait(20) == 0, second.err
         assert plant("get")["commands_taken"] == 2, "nothing is repeated"

@@ -132,7 +132,7 @@ class FaultyEnd(ByteConnection):
         if self._flush is not None:
             self._flush.cancel()
             self._flush = None
-        if self._in[Way.REQUEST].pending:
+        if self._in[Way.REQUEST].pending and not self._faults.framing.streams:
             self._flush = self._loop.call_later(FLUSH_S, self._flush_now)
 
     def _flush_now(self) -> None:
@@ -143,10 +143,12 @@ class FaultyEnd(ByteConnection):
         """What of an emulator's reply goes out at once; the rest is on its way."""
         if self._dead:
             return []
-        if not self._faults.active and self._free_ns[Way.REPLY] <= 0:
-            return [data]
         assembler = self._in[Way.REPLY]
-        frames = assembler.feed(data) + assembler.flush()
+        if not self._faults.active and not assembler.pending and self._free_ns[Way.REPLY] <= 0:
+            return [data]
+        frames = assembler.feed(data)
+        if not self._faults.framing.streams:
+            frames += assembler.flush()
         out: list[bytes] = []
         for frame in frames:
             if self._asked is not None:

@@ -44,6 +44,8 @@ class WireFaults:
     def decide(self, frame: Frame, now_ns: int) -> Outcome | None:
         """What becomes of the frame; None: nothing happens to it. Several faults strike one after the other."""
         outcome: Outcome | None = None
+        if frame.spared:
+            return None
         for active in self.in_at(now_ns):
             if isinstance(active.fault, WireFault) and active.strikes(frame, now_ns):
                 outcome = _joined(outcome, frame, active.fault, active)

@@ -1,6 +1,8 @@
-"""Whole frames out of what a medium delivers, so that a fault can aim at one: RTU, ASCII, MBAP; else chunks as they come.
+"""Whole frames out of what a medium delivers, so that a fault can aim at one: RTU, ASCII, MBAP; datagrams of a digital thread,
+packets of MQTT; else chunks as they come.
 
-Lenient on purpose: what makes no frame is passed on after `FLUSH_S`, unchanged. The emulators' own receivers judge.
+Lenient on purpose: what makes no frame is passed on after `FLUSH_S`, unchanged. The emulators' own receivers judge. In a stream
+whose frames say how long they are (`Framing.streams`) the rest of one is waited for: to pass half of it would end the stream.
 """
 
 from __future__ import annotations
@@ -13,7 +15,10 @@ from emulators.modbus.rtu_shapes import crc16
 FLUSH_S = 0.05
 """How long bytes that make no frame wait for more."""
 LONGEST = 1024
+LONGEST_IN_STREAM = 256 * 1024
 _MBAP_HEADER = 7
+_MQTT_TYPE, _MQTT_PUBLISH, _MQTT_QOS = 0xF0, 0x30, 0x06
+"""Bits of a packet's first byte (MQTT 2.1.2, 3.3.1.2)."""
 _ADDRESSED = frozenset((1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 24))
 
 
@@ -23,7 +28,16 @@ class Framing(Enum):
     RTU = "rtu"
     ASCII = "ascii"
     MBAP = "mbap"
+    THREAD = "thread"
+    """A digital thread over TCP: each datagram behind its length in two bytes."""
+    MQTT = "mqtt"
+    """Packets of MQTT. Only a PUBLISH with QoS 0 can be struck: all else is the session with the broker."""
     RAW = "raw"
+
+    @property
+    def streams(self) -> bool:
+        """Whether frames come over TCP in whatever pieces, and each says how long it is."""
+        return self in (Framing.THREAD, Framing.MQTT)
 
 
 class Way(Enum):
@@ -43,6 +57,15 @@ class Frame:
     unit: int = -1
     pdu: bytes = b""
     address: int = -1
+
+    @property
+    def spared(self) -> bool:
+        """Whether no fault strikes it."""
+        return (
+            self.framing is Framing.MQTT
+            and self.data != b""
+            and self.data[0] & (_MQTT_TYPE | _MQTT_QOS) != _MQTT_PUBLISH
+        )
 
     @property
     def function(self) -> int:
@@ -68,7 +91,7 @@ class Assembler:
         frames = []
         while self._buffer:
             length = self._whole()
-            if not length and len(self._buffer) <= LONGEST:
+            if not length and len(self._buffer) <= (LONGEST_IN_STREAM if self.framing.streams else LONGEST):
                 break
             frames.append(self._take(length or len(self._buffer)))
         return frames
@@ -87,6 +110,9 @@ class Assembler:
                 return 0
             length = 6 + int.from_bytes(buffer[4:6])
             return length if len(buffer) >= length else 0
+        if self.framing.streams:
+            length = _mqtt_length(buffer) if self.framing is Framing.MQTT else 2 + int.from_bytes(buffer[:2])
+            return length if len(buffer) >= max(2, length) else 0
         if self.framing is Framing.ASCII:
             end = buffer.find(b"\r\n")
             return end + 2 if end >= 0 else 0
@@ -96,6 +122,16 @@ class Assembler:
         data = bytes(self._buffer[:length])
         del self._buffer[:length]
         return understood(self.way, self.framing, data)
+
+
+def _mqtt_length(buffer: bytearray) -> int:
+    """Of the packet at the front, its header included (MQTT 1.5.5); 0: not to be told yet."""
+    rest = 0
+    for at, byte in enumerate(buffer[1:5]):
+        rest |= (byte & 0x7F) << 7 * at
+        if byte < 0x80:
+            return 2 + at + rest
+    return 0 if len(buffer) < 5 else len(buffer)
 
 
 def understood(way: Way, framing: Framing, data: bytes) -> Frame:

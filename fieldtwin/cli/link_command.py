@@ -30,7 +30,7 @@ from gateway.core.errors import UsageError
 )
 @click.option(
     "--framing",
-    type=click.Choice(["rtu", "ascii", "mbap", "raw"]),
+    type=click.Choice([framing.value for framing in Framing]),
     default="rtu",
     help="With --faults: how frames look on it; default: rtu.",
 )
@@ -45,6 +45,7 @@ def command(near: str, far: str, faults_file: str | None, framing: str, seed: in
     fieldtwin link /tmp/line1 tcp://field:4001            a port here, the device's line there
     fieldtwin link rtu:/dev/ttyUSB0 "tcp://0.0.0.0:4001?listen=1"    a real port, offered to others
     fieldtwin link --faults noisy.yaml /tmp/line1 tcp://plc:4001     the same, with what goes wrong on lines
+    fieldtwin link --faults bad.yaml --framing mqtt "tcp://127.0.0.1:1884?listen=1" tcp://broker:1883      a bad way to a broker
     """
     ends = _endpoint(near), _endpoint(far)
     faults = load_faults(Path(faults_file), check_link) if faults_file else ()

@@ -371,6 +371,45 @@ def test_frames_are_found_however_they_are_cut(pdus: list[bytes], framing: Frami
     assert assembler.flush() == []
 
 
+def publish(payload: bytes, first: int = 0x30) -> bytes:
+    """A packet of MQTT (3.3): first byte, remaining length in groups of seven bits, topic "t", payload."""
+    rest, length = len(payload) + 3, b""
+    while rest or not length:
+        length += bytes([rest & 0x7F | (0x80 if rest > 0x7F else 0)])
+        rest >>= 7
+    return bytes([first]) + length + b"\0\1t" + payload
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.binary(min_size=1, max_size=300) | st.binary(min_size=16400, max_size=16400), max_size=4),
+    st.sampled_from([Framing.THREAD, Framing.MQTT]),
+    st.randoms(use_true_random=False),
+)
+def test_frames_of_a_stream_are_found_however_they_are_cut(
+    payloads: list[bytes], framing: Framing, random: Random
+) -> None:
+    frames = [publish(p) if framing is Framing.MQTT else len(p).to_bytes(2) + p for p in payloads]
+    stream = b"".join(frames)
+    assembler, found = Assembler(Way.REPLY, framing), []
+    while stream:
+        n = random.randint(1, len(stream))
+        found += assembler.feed(stream[:n])
+        stream = stream[n:]
+    assert [f.data for f in found] == frames
+
+
+def test_of_mqtt_only_what_nobody_agreed_to_bring_is_struck() -> None:
+    """PUBLISH with QoS 0. Without the rest there is no session with the broker, and TCP brings it anyway."""
+    faults = WireFaults(Framing.MQTT)
+    faults.put_in(Active("drop", made("drop"), Aim(), Random(1), 0, None))
+
+    def struck_first(first: int) -> bool:
+        return faults.decide(understood(Way.REPLY, Framing.MQTT, publish(b"x", first)), 1) is not None
+
+    assert [first for first in range(0x10, 0x100) if struck_first(first)] == [0x30, 0x31, 0x38, 0x39]
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=700), max_size=5), st.sampled_from(Framing))
 def test_no_byte_is_lost_or_made(chunks: list[bytes], framing: Framing) -> None:

@@ -182,6 +182,49 @@ def test_a_link_puts_faults_between_strangers() -> None:
     run(main())
 
 
+def test_a_link_strikes_whole_frames_of_a_stream_in_whatever_pieces_they_come() -> None:
+    """A digital thread over TCP: half a frame that is passed on by and by, or struck, would be the end of the stream."""
+
+    async def main() -> None:
+        sent = [bytes([n]) * 3000 for n in range(40)]
+
+        async def stranger(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            stream = b"".join(len(data).to_bytes(2) + data for data in sent)
+            for at in range(0, len(stream), 1777):
+                writer.write(stream[at : at + 1777])
+                await writer.drain()
+                await asyncio.sleep(0)
+            await reader.read()
+            writer.close()
+
+        server = await asyncio.start_server(stranger, "127.0.0.1", 0)
+        far = Endpoint.parse(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+        said = [{"name": "drop", "direction": "reply", "every": 4}, {"name": "duplicate", "every": 3}]
+        faults = wire_faults(said, Framing.THREAD, 1, 0)
+        link = Link(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
+        await link.open()
+        serving = asyncio.create_task(link.serve())
+        try:
+            reader, writer = await asyncio.open_connection(*link.ends[0].address)
+            got: list[int] = []
+            while not got or got[-1] != 38:  # 39 is the fortieth, and lost
+                data = await reader.readexactly(int.from_bytes(await reader.readexactly(2)))
+                assert data == data[:1] * 3000
+                got.append(data[0])
+            assert {n for n in range(39) if n not in got} == {n for n in range(39) if n % 4 == 3}
+            assert len(got) > len(set(got)), "some came twice"
+            writer.close()
+            await eventually(lambda: not link.connected)
+        finally:
+            serving.cancel()
+            await asyncio.gather(serving, return_exceptions=True)
+            await link.aclose()
+            server.close()
+            await server.wait_closed()
+
+    run(main())
+
+
 def test_datagrams() -> None:
     async def main() -> None:
         faults = at_once(

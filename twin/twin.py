@@ -11,14 +11,18 @@ from typing import Any
 
 from gateway.core.clock import Clock
 from twin.mape.analyze import Limits
-from twin.mape.execute import Bounds, Execute, WhatIf
+from twin.mape.execute import Bounds, Execute
 from twin.mape.plan import Plan, Planner
+from twin.mape.what_if import Question, WhatIf
 from twin.shadow import DigitalShadow
 from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
 
 
 class DigitalTwin(DigitalShadow):
-    """SPEC row DigitalTwin. `step` runs Monitor, Analyze, Plan and Execute, one after the other, on what has arrived."""
+    """SPEC row DigitalTwin. `step` runs Monitor, Analyze, Plan and Execute, one after the other, on what has arrived.
+
+    While a prototype is asked about a command, the shadow goes on; what it finds waits to be planned for.
+    """
 
     def __init__(
         self,
@@ -30,10 +34,11 @@ class DigitalTwin(DigitalShadow):
         bounds: Bounds,
         stale_after_ms: int = 30_000,
         what_if: WhatIf | None = None,
+        question: Question | None = None,
     ) -> None:
         super().__init__(receiving, clock, limits=limits, stale_after_ms=stale_after_ms)
         self.plan = Plan(self.digital_model, planner, clock)
-        self.execute = Execute(self.digital_model, clock, bounds=bounds, what_if=what_if)
+        self.execute = Execute(self.digital_model, clock, bounds=bounds, what_if=what_if, question=question)
         self.analyze.emitter.subscribe(self.plan.consumer)
         self.plan.emitter.subscribe(self.execute.plans)
 
@@ -43,14 +48,19 @@ class DigitalTwin(DigitalShadow):
 
     def step(self) -> int:
         count = super().step()
-        self.plan.plan()
+        self.plan.take()
         self.execute.execute()
+        while not self.execute.asking and self.plan.plan_next():
+            self.execute.execute()
+        if self.execute.asking:
+            self.plan.only_newest()
         return count
 
     def describe(self) -> dict[str, Any]:
         return {
             **super().describe(),
             "planned": self.plan.planned,
+            "asked": self.execute.asked,
             "sent": self.execute.sent,
             "refused": self.execute.refused,
         }

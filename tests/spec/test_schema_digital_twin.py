@@ -11,11 +11,12 @@ from shadow_rig import NOW_MS, Hands, status, value
 
 from gateway.core.events import Consumer, Producer
 from gateway.core.statemachine import decode_period, delta, encode_period
-from gateway.core.values import COMMAND, DATA
+from gateway.core.values import COMMAND, DATA, Quality, Reason
 from gateway.store.event import Kind
 from twin.mape.execute import Bounds, Execute
 from twin.mape.messages import verdict
 from twin.mape.plan import Plan, Rule, RulePlanner
+from twin.mape.what_if import Question
 from twin.model import DigitalModel
 from twin.shadow import DigitalShadow
 from twin.thread import Operator
@@ -36,13 +37,36 @@ class Always:
         return encode_period(self._periods.popleft()) if self._periods else None
 
 
+class Prototype:
+    """Is asked, and says what the test says: None for a while, then what speaks against the command, or nothing."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[int, Question]] = []
+        self.says: str | None = None
+
+    def ask(self, command: COMMAND, question: Question) -> None:
+        self.asked.append((decode_period(command), question))
+
+    def answer(self) -> str | None:
+        return self.says
+
+
+EMPTY = Question(3600.0, ("battery.charge > 0.1",))
+
+
 class Rig:
-    def __init__(self, *, bounds: Bounds = Bounds(), what_if: object = None) -> None:  # noqa: B008
+    def __init__(
+        self,
+        *,
+        bounds: Bounds = Bounds(),  # noqa: B008
+        what_if: Prototype | None = None,
+        rules: tuple[Rule, ...] = RULES,
+    ) -> None:
         self.clock = Hands()
         self.receiving = ReceivingEnd("from the plant")
         self.twin = DigitalTwin(
-            self.receiving, self.clock, RulePlanner(RULES), limits={"ctd.pressure": (0.0, 100.0)}, bounds=bounds,
-            what_if=what_if,  # type: ignore[arg-type]
+            self.receiving, self.clock, RulePlanner(rules), limits={"ctd.pressure": (0.0, 100.0)}, bounds=bounds,
+            what_if=what_if, question=EMPTY if what_if else None,
         )  # fmt: skip
         self.sent: Consumer[COMMAND] = Consumer(self.twin.execute.transmitter.event)
         self.twin.execute.transmitter.subscribe(self.sent)
@@ -138,12 +162,64 @@ def test_Execute_is_bounded_in_rate() -> None:
     assert execute.sent == 3
 
 
-def test_Execute_asks_what_if_when_it_was_told_to() -> None:
-    rig = Rig(what_if=lambda command: "the battery would be empty" if decode_period(command) == 1 else "")
+def test_Execute_asks_a_prototype_when_it_was_told_to_and_sends_nothing_without_its_answer() -> None:
+    rig = Rig(what_if=(prototype := Prototype()))
     assert rig.give(value(150.0)) == []
-    assert rig.twin.digital_model.period_s == 0
-    assert [e.value for e in rig.twin.execute.collect()] == ["the battery would be empty"]
-    assert rig.give(value(50.0)) == [10]
+    assert rig.give() == [], "no answer yet"
+    assert rig.twin.digital_model.period_s == 0, "nor does the model change"
+    assert prototype.asked == [(1, EMPTY)], "once"
+    prototype.says = ""
+    assert rig.give() == [1]
+    prototype.says = "the battery would be empty"
+    assert rig.give(value(50.0)) == []
+    assert rig.twin.digital_model.period_s == 1
+    assert [e.value for e in rig.twin.execute.collect()] == ["period 10 s: the battery would be empty"]
+    assert rig.twin.describe() | {"asked": 2, "sent": 1, "refused": 1} == rig.twin.describe()
+
+
+def test_Execute_asks_the_model_before_the_prototype() -> None:
+    rig = Rig(bounds=Bounds(5, 60), what_if=(prototype := Prototype()))
+    assert rig.give(value(150.0)) == []
+    assert prototype.asked == []
+    assert [e.value for e in rig.twin.execute.collect()] == ["a period of 1 s; allowed are 5 to 60 s"]
+
+
+def test_Plan_says_what_is_asked_and_of_which_commands_nothing_is() -> None:
+    own = Question(60.0, finally_=("relay.state == 'STANDBY'",))
+    rules = (Rule("bad", "", 0, ask=False), Rule("outside", "", 1, ask=own), Rule("inside", "", 10))
+    rig = Rig(what_if=(prototype := Prototype()), rules=rules)
+    prototype.says = ""
+    bad = value(None, quality=Quality.BAD, reason=Reason.TIMEOUT)
+    assert rig.give(value(150.0), value(50.0), bad) == [1, 10, 0]
+    assert prototype.asked == [(1, own), (10, EMPTY)]
+    nobody = Rig(rules=rules)
+    assert nobody.give(value(150.0), value(50.0)) == [10], "a question that nobody can ask is not left out"
+    assert "nobody here can" in str(nobody.twin.execute.collect()[0].value)
+
+
+def test_what_is_found_while_a_prototype_is_asked_waits_and_of_one_subject_the_newest_counts() -> None:
+    rig = Rig(what_if=(prototype := Prototype()))
+    rig.give(value(150.0))
+    for number in (50.0, 150.0) * 20 + (50.0,):
+        assert rig.give(value(number, rig.clock.now_ms)) == []
+        rig.clock.now_ms += 1000  # 41 s, which is no history: it was new when it came
+    prototype.says = ""
+    assert rig.give() == [1, 10]
+    assert [period_s for period_s, _ in prototype.asked] == [1, 10]
+    assert rig.twin.plan.overtaken == 40
+
+
+def test_a_twin_that_ends_sends_nothing_of_what_it_still_asks_about() -> None:
+    rig = Rig(what_if=Prototype())
+    rig.give(value(150.0))
+    rig.twin.execute.plans.observe(encode_period(7))
+    rig.twin.execute.give_up("the twin ended")
+    assert [e.value for e in rig.twin.execute.collect()] == [
+        "period 1 s: the twin ended",
+        "period 7 s: the twin ended",
+    ]
+    assert not rig.twin.execute.asking
+    assert not rig.sent.queue
 
 
 def test_DigitalTwin_is_the_shadow_plus_plan_and_execute_and_the_way_back() -> None:

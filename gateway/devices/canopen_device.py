@@ -90,6 +90,14 @@ class CanopenDriver(DeviceDriver):
             raise Bug("a driver without a master was used", where=self.config.where)
         return self._master
 
+    def reconfigure(self, config: DeviceConfig) -> None:
+        super().reconfigure(config)
+        self._by_object = {t.object: t for t in self.profile.tags.values()}
+
+    def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
+        """What a tag's bytes mean now."""
+        return decode_little(self.profile.tags[tag_name], held.raw, held.t_ns)
+
     @property
     def pdo_tags(self) -> list[str]:
         """The full names of the tags that TPDOs bring."""

@@ -70,6 +70,11 @@ class DeviceDriver(ABC):
             )
         self._connection = connection
 
+    def reconfigure(self, config: DeviceConfig) -> None:
+        """From now on `config`: the same device at the same place, with other limits, scaling or pace. Never while
+        something is being read or written."""
+        self.config, self.profile = config, config.profile
+
     def check(self, command: COMMAND) -> None:
         """Raise `UnknownCommand` unless `command` is in the command list."""
         if command.name not in self.command_list:

@@ -74,6 +74,19 @@ class RegisterDriver(DeviceDriver):
         self._client = client
         client.set_pace(self.config.address, UnitPace(self.config.timeout_s, self.config.spacing_s))
 
+    def reconfigure(self, config: DeviceConfig) -> None:
+        if config.profile != self.profile:
+            self.plans = {g: GroupPlan(config.profile, g, self.learnt) for g in config.profile.groups}
+        super().reconfigure(config)
+        if self._client is not None:
+            self._client.set_pace(config.address, UnitPace(config.timeout_s, config.spacing_s))
+
+    def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
+        """What a tag's bytes mean now; `of` is what the tag that scales it holds."""
+        tag = self.profile.tags[tag_name]
+        value = decode(tag, held.raw, held.t_ns)
+        return apply_scale(tag, value, of) if tag.scale_by is not None else value
+
     def know(self, learnt: Learnt) -> None:
         """Take over what was learnt in an earlier run, before anything is read. What is missing is asked for once."""
         self.learnt.gaps = list(learnt.gaps)

@@ -11,6 +11,10 @@ class Backoff:
         self._limit_s = limit_s
         self.failures = 0
 
+    def restate(self, first_s: float, limit_s: float) -> None:
+        """From the next failure on, these delays."""
+        self._first_s, self._limit_s = first_s, limit_s
+
     def next_s(self) -> float:
         """Note a failure; the delay before the next try."""
         delay = min(self._limit_s, self._first_s * 2.0 ** min(self.failures, 20))

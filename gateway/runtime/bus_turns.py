@@ -5,10 +5,11 @@ Pure: times are monotonic nanoseconds, passed in. It must never know a connectio
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.core.clock import NS_PER_S
+from gateway.devices.config import DeviceConfig
 from gateway.devices.register_device import Reading, RegisterDriver
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.poll_schedule import PollSchedule, Rate, spread
@@ -45,24 +46,37 @@ class DeviceState:
 
 def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]:
     """The devices of a bus, each with its groups' places in their periods; `offset` keeps several buses apart."""
-    groups: list[tuple[Hashable, int]] = []
-    stated: dict[Hashable, int] = {}
-    for n, driver in enumerate(drivers):
-        groups += [((n, group), every_ms) for group, every_ms in driver.config.poll.items()]
-        stated |= {(n, group): phase_ms for group, phase_ms in driver.config.phase.items()}
+    rates = rates_of([driver.config for driver in drivers], offset)
+    return [_state(driver, rates[driver.config.name]) for driver in drivers]
+
+
+def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, Rate]]:
+    """By the names of the devices of one bus: the rates of their groups."""
+    groups: list[tuple[tuple[str, str], int]] = []
+    stated: dict[tuple[str, str], int] = {}
+    for config in configs:
+        groups += [((config.name, group), every_ms) for group, every_ms in config.poll.items()]
+        stated |= {(config.name, group): phase_ms for group, phase_ms in config.phase.items()}
     rates = spread(groups, stated, offset)
-    return [_state(n, driver, rates) for n, driver in enumerate(drivers)]
+    return {config.name: {group: rates[config.name, group] for group in config.poll} for config in configs}
 
 
-def _state(n: int, driver: RegisterDriver, rates: dict[Hashable, Rate]) -> DeviceState:
+def _state(driver: RegisterDriver, rates: dict[str, Rate]) -> DeviceState:
     config, known = driver.config, driver.config.expect
     once = [
         group
         for group in driver.plans
         if group not in config.poll and any(t.name not in known for t in driver.profile.group(group))
     ]
-    schedule = PollSchedule({group: rates[n, group] for group in config.poll}, once)
-    return DeviceState(driver, schedule, Backoff(config.backoff_first_s, config.backoff_limit_s))
+    return DeviceState(driver, PollSchedule(rates, once), Backoff(config.backoff_first_s, config.backoff_limit_s))
+
+
+def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], now_ns: int) -> None:
+    """Another configuration for a device of which nothing is being read."""
+    device.driver.reconfigure(config)
+    device.backoff.restate(config.backoff_first_s, config.backoff_limit_s)
+    device.schedule.restate(rates, config.phase, now_ns, there=device.online)
+    device.triggered &= rates.keys()
 
 
 class Turns:
@@ -98,6 +112,10 @@ class Turns:
                 if best is None or key < best:
                     best, found = key, (device, group)
         return *found, best[0] if best is not None else now_ns + NS_PER_S
+
+    def restate(self, probe_share: float) -> None:
+        """Another share, from the next try on."""
+        self._share = probe_share
 
     def _try_ns(self, device: DeviceState) -> int:
         """When a device that is away is asked again. On a new connection each is asked once, whatever the share; polls

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 
@@ -33,9 +33,11 @@ from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
 from gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.backoff import Backoff
+from gateway.runtime.bus_turns import rates_of
+from gateway.runtime.coming import Coming
 from gateway.runtime.modbus_bus import reason_of
 from gateway.runtime.node_writes import Done, NodeWrites
-from gateway.runtime.poll_schedule import PollSchedule, spread
+from gateway.runtime.poll_schedule import PollSchedule
 from gateway.runtime.tags import TagTable
 
 SETTLE_NS = 100 * NS_PER_MS
@@ -64,6 +66,9 @@ class NodeStatus:
     bring_ups: int = 0
     polls: int = 0
     poll_errors: int = 0
+    reading: bool = False
+    """A group is being read."""
+    polling: asyncio.Task[None] | None = None
     start_again: asyncio.TimerHandle | None = None
     wanted: asyncio.Event = field(default_factory=asyncio.Event)
     up: asyncio.Event = field(default_factory=asyncio.Event)
@@ -99,6 +104,8 @@ class CanopenBus:
         self.connected = False
         self.opens = 0
         self.error = ""
+        self._coming: Coming | None = None
+        self._nursery: Nursery | None = None
         self._stopping = False
         self._not_produced = 0
         self._connector = connector
@@ -113,15 +120,40 @@ class CanopenBus:
         self._past: Counter[str] = Counter()
 
     def _status(self, driver: CanopenDriver, drivers: list[CanopenDriver], clock: Clock) -> NodeStatus:
-        groups: list[tuple[Hashable, int]] = [
-            ((d.node, group), every_ms) for d in drivers for group, every_ms in d.config.poll.items()
-        ]
-        stated: dict[Hashable, int] = {
-            (d.node, group): phase_ms for d in drivers for group, phase_ms in d.config.phase.items()
-        }
-        rates = spread(groups, stated)
-        schedule = PollSchedule({group: rates[driver.node, group] for group in driver.config.poll}, ())
+        schedule = PollSchedule(rates_of([d.config for d in drivers])[driver.config.name], ())
         return NodeStatus(driver, NodeWrites(driver, clock, self.config.timeout_s), schedule)
+
+    def reconfigure(self, coming: Coming) -> None:
+        """Another configuration, taken over between two polls: each node's when nothing of it is being read."""
+        self._coming = coming
+        for status in self.nodes.values():
+            if not status.reading:
+                self._take_over(status)
+                if (
+                    status.polling is not None and self._nursery is not None
+                ):  # it may sleep until a poll that is no more
+                    status.polling.cancel()
+                    status.polling = self._nursery.start(self._poll(status), f"{status.driver.config.name} polls")
+        self._taken_over()
+
+    def _take_over(self, status: NodeStatus) -> None:
+        coming, driver = self._coming, status.driver
+        assert coming is not None
+        new = coming.devices[driver.config.name]
+        if driver.config is not new:
+            rates = rates_of(list(coming.devices.values()))[new.name]
+            driver.reconfigure(new)
+            status.backoff.restate(new.backoff_first_s, new.backoff_limit_s)
+            status.schedule.restate(rates, new.phase, self._clock.monotonic_ns(), there=status.online)
+            coming.taken(driver)
+
+    def _taken_over(self) -> None:
+        coming = self._coming
+        if coming is not None and all(
+            s.driver.config is coming.devices[s.driver.config.name] for s in self.nodes.values()
+        ):
+            self.config, self._coming = coming.bus, None
+            coming.done.set()
 
     # -- what others see ----------------------------------------------------------------------------------------------
 
@@ -192,6 +224,7 @@ class CanopenBus:
             self.opens += 1
             try:
                 async with Nursery() as nursery:
+                    self._nursery = nursery
                     nursery.start(master.run(), f"{self.config.name} master")
                     for status in self.nodes.values():
                         status.driver.attach_master(connection, master)
@@ -201,7 +234,7 @@ class CanopenBus:
                         nursery.start(status.writes.run_downloads(), f"{name} downloads")
                         nursery.start(status.writes.run_rpdos(), f"{name} RPDOs")
                         if status.driver.config.poll:
-                            nursery.start(self._poll(status), f"{name} polls")
+                            status.polling = nursery.start(self._poll(status), f"{name} polls")
                     for producer in self._producers():
                         nursery.start(self._produce(producer, master), f"{self.config.name} {producer.name}")
                     backoff.reset()
@@ -211,7 +244,12 @@ class CanopenBus:
                 await self._pause(backoff.next_s())
             finally:
                 self._past.update(asdict(master.counters))
-                self._master = self._lss = None
+                self._master = self._lss = self._nursery = None
+                for status in self.nodes.values():
+                    status.polling, status.reading = None, False
+                    if self._coming is not None:
+                        self._take_over(status)
+                self._taken_over()
                 self.connected = False
                 await connection.aclose()
 
@@ -304,7 +342,12 @@ class CanopenBus:
                 await self._clock.sleep_until_ns(due_ns)
                 continue
             schedule.took(group, now_ns)
+            status.reading = True
             await self._read_group(status, group)
+            status.reading = False
+            if self._coming is not None:
+                self._take_over(status)
+                self._taken_over()
 
     async def _read_group(self, status: NodeStatus, group: str) -> None:
         driver, master = status.driver, status.driver.master

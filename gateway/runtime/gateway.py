@@ -59,6 +59,21 @@ def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clo
     return SensorDriver(config, tags) if bus.endpoint.is_serial else RegisterDriver(config, tags)
 
 
+def stale_limits(driver: RegisterDriver | CanopenDriver) -> dict[str, int | None]:
+    """How long each readable tag is good without being refreshed, in ms. Tags read again and again grow stale; a register
+    that is read once, at identification, does not (None)."""
+    config, tags = driver.config, [t for t in driver.profile.tags.values() if t.readable]
+    if isinstance(driver, CanopenDriver):
+        return {f"{config.name}.{tag.name}": driver.stale_after_ms(tag) for tag in tags}
+    cyclic = {t.name for g in config.poll for t in driver.profile.group(g)}
+    return {
+        f"{config.name}.{tag.name}": max(config.stale_after_ms, 3 * config.poll.get(tag.poll, 0))
+        if tag.name in cyclic
+        else None
+        for tag in tags
+    }
+
+
 class Gateway:
     """Runs until cancelled; `shut_down` then brings the outputs to their safe values."""
 
@@ -82,9 +97,7 @@ class Gateway:
         self.buses: dict[str, ModbusBus | CanopenBus] = {}
         for device in config.devices.values():
             driver = make_driver(device, config.buses[device.bus], self.tags, clock)
-            trigger = device.profile.form.trigger
-            if isinstance(driver, RegisterDriver) and trigger is not None:
-                driver.may_trigger = config.allow_writes and trigger.tag in device.writable
+            self.let_trigger(driver)
             self.drivers[device.name] = driver
             self._declare(driver)
         for n, bus in enumerate(config.buses.values()):
@@ -105,19 +118,14 @@ class Gateway:
         self._stopping = False
 
     def _declare(self, driver: RegisterDriver | CanopenDriver) -> None:
-        """Tags read again and again grow stale; a register that is read once, at identification, does not."""
-        config = driver.config
-        if isinstance(driver, CanopenDriver):
-            for tag in driver.profile.tags.values():
-                if tag.readable:
-                    self.tags.declare([f"{config.name}.{tag.name}"], driver.stale_after_ms(tag))
-            return
-        cyclic = {t.name for g in config.poll for t in driver.profile.group(g)}
-        for tag in driver.profile.tags.values():
-            if tag.readable:
-                every_ms = config.poll.get(tag.poll, 0)
-                stale_ms = max(config.stale_after_ms, 3 * every_ms) if tag.name in cyclic else None
-                self.tags.declare([f"{config.name}.{tag.name}"], stale_ms)
+        for name, stale_ms in stale_limits(driver).items():
+            self.tags.declare([name], stale_ms)
+
+    def let_trigger(self, driver: RegisterDriver | CanopenDriver) -> None:
+        """Whether this driver may write what makes its device measure."""
+        device, trigger = driver.config, driver.config.profile.form.trigger
+        if isinstance(driver, RegisterDriver) and trigger is not None:
+            driver.may_trigger = self.config.allow_writes and trigger.tag in device.writable
 
     def _make_bus(self, bus: BusConfig, connector: Connector, offset: float) -> None:
         on_it = [d for d in self.drivers.values() if d.config.bus == bus.name]

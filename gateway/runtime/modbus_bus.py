@@ -36,7 +36,8 @@ from gateway.protocols.modbus.framings import framing_of
 from gateway.protocols.modbus.refusals import Acknowledged, ServerBusy
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.bridge_queue import GuestQueue
-from gateway.runtime.bus_turns import DeviceState, Turns, states_of
+from gateway.runtime.bus_turns import DeviceState, Turns, rates_of, restate, states_of
+from gateway.runtime.coming import Coming
 from gateway.runtime.tags import TagTable
 
 MAX_JOBS = 256
@@ -99,6 +100,8 @@ class ModbusBus:
         self._clock = clock
         self._tags = tags
         self._on_offline = on_offline
+        self._offset = offset
+        self._coming: Coming | None = None
         self._jobs: deque[Job] = deque()
         self._wake = asyncio.Event()
         self._idle = asyncio.Event()
@@ -122,6 +125,33 @@ class ModbusBus:
         else:
             self._jobs.append(job)
             self._wake.set()
+
+    def reconfigure(self, coming: Coming) -> None:
+        """Another configuration, taken over between two polls: each device's when nothing of it is being read."""
+        self._coming = coming
+        if self._client is None:
+            self._take_over()
+        self._wake.set()
+
+    def _take_over(self) -> None:
+        coming, now_ns = self._coming, self._clock.monotonic_ns()
+        assert coming is not None
+        config = self.config = coming.bus
+        self._turns.restate(config.probe_share)
+        if self._client is not None:
+            self._client.restate(
+                timeout_s=config.timeout_s, turnaround_s=config.turnaround_s, spacing_s=config.spacing_s
+            )
+        rates = rates_of([coming.devices[d.driver.config.name] for d in self.devices], self._offset)
+        for device in self.devices:
+            driver = device.driver
+            new = coming.devices[driver.config.name]
+            if device.reading is None and driver.config is not new:
+                restate(device, new, rates[new.name], now_ns)
+                coming.taken(driver)
+        if all(d.driver.config is coming.devices[d.driver.config.name] for d in self.devices):
+            self._coming = None
+            coming.done.set()
 
     def _wake_up(self) -> None:
         self._wake.set()
@@ -149,11 +179,14 @@ class ModbusBus:
     async def run(self) -> None:
         """Open, serve, and open again, until cancelled."""
         backoff = Backoff(0.25, 5.0)
-        config, endpoint = self.config, self.config.endpoint
+        endpoint = self.config.endpoint
         epoch_ns = self._clock.monotonic_ns()
         for device in self.devices:
             device.schedule.anchor(epoch_ns)
         while True:
+            if self._coming is not None:
+                self._take_over()
+            config = self.config
             try:
                 connection = await self._connector.open_bytes(endpoint)
             except Unreachable as e:
@@ -214,6 +247,8 @@ class ModbusBus:
                     f"{MOST_UNANSWERED} requests in a row were not answered: the connection is made anew",
                     where=str(self.config.endpoint),
                 )
+            if self._coming is not None:
+                self._take_over()
             if self._halted:
                 self._idle.set()
                 await self._wake.wait()

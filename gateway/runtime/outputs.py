@@ -9,7 +9,7 @@ and every write and refusal is on record before it is on the wire.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -96,6 +96,14 @@ class Output:
             asked(error)
 
 
+def as_sent(output: Output) -> bytes:
+    """What `output` holds, as it would be sent now; empty where it may not be sent any more."""
+    try:
+        return output.driver.command(output.local, output.held).data if output.held is not None else b""
+    except NotAllowed:
+        return b""
+
+
 class OutputWriter:
     """Brings every output's device to what is wanted. `tick` starts writes and never waits for one."""
 
@@ -143,6 +151,22 @@ class OutputWriter:
     def release(self) -> None:
         """The PLC is back: its commands count again."""
         self.safe_active = False
+
+    def restated(self, driver: RegisterDriver | CanopenDriver, held: Mapping[str, bytes]) -> None:
+        """The configuration of a driver's device is another one. `held` is what it held, as sent, by tag: what that would
+        be sent as otherwise now is written again. What was refused may be allowed now."""
+        for output in self.outputs:
+            if output.driver is not driver:
+                continue
+            output.safe, output.refused = driver.config.safe.get(output.local), None
+            if self.safe_active and output.safe is not None and output.by.startswith(SAFE):
+                output.wanted = output.safe
+            if output.tag in held and as_sent(output) not in (held[output.tag], b""):
+                output.held = None
+
+    def as_sent(self, driver: RegisterDriver | CanopenDriver) -> dict[str, bytes]:
+        """What a device's outputs hold, as it was sent."""
+        return {o.tag: as_sent(o) for o in self.outputs if o.driver is driver and o.held is not None}
 
     def forget(self, driver: RegisterDriver | CanopenDriver) -> None:
         """A device was lost: what it holds when it comes back is not known."""

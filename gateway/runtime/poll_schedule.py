@@ -7,7 +7,7 @@ monotonic nanoseconds, passed in.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from gateway.core.clock import NS_PER_MS
@@ -60,6 +60,39 @@ class PollSchedule:
     def anchor(self, epoch_ns: int) -> None:
         """The grid begins at `epoch_ns`."""
         self._epoch_ns = epoch_ns
+
+    def restate(self, rates: Mapping[str, Rate], stated: Collection[str], now_ns: int, *, there: bool) -> None:
+        """From now on `rates`, which hold all groups that are read again and again; `stated` are those whose phase counts.
+
+        A group whose rate is as before keeps its place. One that has another period is due that long behind its last
+        place, or now: no interval is shorter than the shorter of both periods, none longer than the longer. With a phase that
+        is stated it goes there instead, by at most half a period sooner or later. What is overdue stays so. A new
+        group is read now if the device is `there`.
+        """
+        kept, self._rates = self._rates, dict(rates)
+        for group, rate in rates.items():
+            self.missed.setdefault(group, 0)
+            old, due_ns = kept.get(group), self.due_ns.get(group)
+            if old is None:
+                if there:
+                    self.due_ns[group] = now_ns
+            elif old.period_ns == rate.period_ns and (group not in stated or old.phase_ns == rate.phase_ns):
+                self._rates[group] = old
+            elif due_ns is not None:
+                last_ns = due_ns - old.period_ns
+                if group in stated and due_ns > now_ns:
+                    due_ns = self._place(rate, max(now_ns, last_ns + rate.period_ns // 2))
+                elif group not in stated:
+                    due_ns = due_ns if due_ns <= now_ns else max(now_ns, last_ns + rate.period_ns)
+                    self._rates[group] = Rate(rate.period_ns, (due_ns - self._epoch_ns) % rate.period_ns)
+                self.due_ns[group] = due_ns
+        for group in kept.keys() - rates.keys():
+            self.due_ns.pop(group, None)
+
+    def _place(self, rate: Rate, after_ns: int) -> int:
+        """The first place on the grid of `rate` behind `after_ns`."""
+        start_ns = self._epoch_ns + rate.phase_ns
+        return start_ns + ((after_ns - start_ns) // rate.period_ns + 1) * rate.period_ns
 
     def start(self, now_ns: int) -> None:
         """The device is there: everything is read once now, and then at its places on the grid."""

@@ -53,6 +53,24 @@ class TagTable:
             else:
                 self._stale_ns.pop(name, None)
 
+    def restate(self, name: str, stale_after_ms: int | None) -> None:
+        """Another limit for a tag. What is fresh is not made stale by that: it counts as refreshed now, once."""
+        now_ns = self._clock.monotonic_ns()
+        limit = None if stale_after_ms is None else stale_after_ms * NS_PER_MS
+        if limit == self._stale_ns.get(name):
+            return
+        if self.current(name, now_ns).quality is not Quality.BAD:
+            self._refreshed_ns[name] = now_ns
+        self.declare([name], stale_after_ms)
+
+    def amend(self, name: str, value: TagValue) -> None:
+        """What a tag holds, understood in another way: no newer, and told as any other change."""
+        before = self._values.get(name, NEVER)
+        self._values[name] = value
+        self._news[name] = None
+        if self.on_put is not None and value != before:
+            self.on_put(name, value)
+
     @property
     def names(self) -> list[str]:
         return list(self._values)
@@ -92,6 +110,10 @@ class TagTable:
         if limit is None or value.quality is Quality.BAD or now_ns - self._refreshed_ns.get(name, 0) <= limit:
             return value
         return replace(value, quality=Quality.BAD, reason=Reason.STALE)
+
+    def held(self, name: str) -> TagValue:
+        """The value as it was put last, however old."""
+        return self._values.get(name, NEVER)
 
     def fresh_until_ns(self, name: str) -> int:
         """From when on `current` says STALE unless the tag is refreshed; beyond all time where it never does."""

@@ -163,6 +163,14 @@ class ModbusClient:
             spacing_s=spacing_s,
         )
 
+    def restate(self, *, timeout_s: float, turnaround_s: float, spacing_s: float) -> None:
+        """From the next request on, another pace of the whole connection; as in the constructor."""
+        self._timeout_s = _checked_timeout(timeout_s)
+        self._line.restate(
+            turnaround_ns=round(_checked_timeout(turnaround_s) * NS_PER_S),
+            spacing_ns=round(_checked_pause(spacing_s) * NS_PER_S),
+        )
+
     def set_pace(self, unit: int, pace: UnitPace) -> None:
         """From now on `unit` (0 to 255) is asked at this pace."""
         self._paces[unit] = pace

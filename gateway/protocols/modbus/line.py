@@ -48,6 +48,10 @@ class LineSilence:
         self.longest_latency_ns = 0
         self._before_quarantine = (0, 0)
 
+    def restate(self, *, turnaround_ns: int, spacing_ns: int) -> None:
+        """Other pauses from the next exchange on."""
+        self._turnaround_ns, self._spacing_ns = turnaround_ns, spacing_ns
+
     @property
     def in_quarantine(self) -> bool:
         """Whether an exchange ended badly and the line has not been silent long enough since."""

@@ -1,0 +1,66 @@
+"""Another configuration for a gateway that runs: pace, limits, scaling, safe values; between two polls, none lost or doubled.
+
+Buses, devices, addresses, tags and what is bound to them have to be the same: whoever calls has compared the files
+(`twin.reloading`). A device has either its old configuration or its new one, never some of each; values that it holds are
+understood anew at once. Nothing here reads a file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from gateway.core.profile import DeviceProfile
+from gateway.core.values import Quality, Reason, TagValue
+from gateway.runtime.coming import AnyDriver, Coming
+from gateway.runtime.gateway import Gateway, GatewayConfig, stale_limits
+
+OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, Reason.SENTINEL})
+"""Reasons that are found in the value itself."""
+
+
+async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
+    """Take over `config`. Returns when every device has it: where a long group is being read, at its end."""
+    gateway.config = replace(gateway.config, buses=config.buses, devices=config.devices)
+    coming = []
+    for name, bus in gateway.buses.items():
+        on_it = {d.name: d for d in config.devices.values() if d.bus == name}
+        coming.append(Coming(config.buses[name], on_it, _Taking(gateway, on_it)))
+        bus.reconfigure(coming[-1])
+    for each in coming:
+        await each.done.wait()
+
+
+class _Taking:
+    """What follows, in the gateway, when a driver has its new configuration: all of it at once."""
+
+    def __init__(self, gateway: Gateway, devices: Iterable[str]) -> None:
+        drivers = [gateway.drivers[name] for name in devices]
+        self._gateway = gateway
+        self._before = {d.config.name: d.profile for d in drivers}
+        self._sent = {d.config.name: gateway.outputs.as_sent(d) for d in drivers}
+
+    def __call__(self, driver: AnyDriver) -> None:
+        gateway, name = self._gateway, driver.config.name
+        gateway.let_trigger(driver)
+        for tag, stale_ms in stale_limits(driver).items():
+            gateway.tags.restate(tag, stale_ms)
+        if driver.profile != self._before[name]:
+            self._understand(driver, self._before[name])
+        gateway.outputs.restated(driver, self._sent[name])
+
+    def _understand(self, driver: AnyDriver, before: DeviceProfile) -> None:
+        """What the device said last, by the new profile. Its age stays what it is, and so does what is wrong with it."""
+        tags, name = self._gateway.tags, driver.config.name
+        changed = {n for n, tag in driver.profile.tags.items() if tag != before.tags[n] and tag.readable}
+        for n in changed | {n for n, t in driver.profile.tags.items() if t.scale_by in changed}:
+            tag, held = driver.profile.tags[n], tags.held(f"{name}.{n}")
+            if held.raw:
+                of = tags.held(f"{name}.{tag.scale_by}") if tag.scale_by is not None else None
+                tags.amend(f"{name}.{n}", _kept(held, driver.understood(n, held, of)))
+
+
+def _kept(held: TagValue, anew: TagValue) -> TagValue:
+    if held.quality is Quality.GOOD or held.reason in OF_DECODING:
+        return anew
+    return replace(held, value=anew.value)

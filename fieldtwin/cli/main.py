@@ -57,12 +57,13 @@ COMMANDS = {
         "fieldtwin.cli.template_command",
         "A system and all that it takes, as one file: pack, check, compare, unpack.",
     ),
+    "draw": ("fieldtwin.cli.draw_command", "Draw a system's wires, and who hangs on each: text, or SVG."),
     "trace": ("fieldtwin.cli.trace_command", "What happened in a run: frames in words, JSON, or waveforms."),
     "schema": ("fieldtwin.cli.schema_command", "Print the JSON schema of a kind of file."),
     "doctor": ("fieldtwin.cli.doctor_command", "Check what this computer can do, and say what to change."),
 }
 SECTIONS = {
-    "Run a system, or parts of it": ("run", "emulate", "with", "plc", "shore", "link", "bridge", "can-bus"),
+    "Run a system, or parts of it": ("run", "emulate", "with", "plc", "shore", "link", "bridge", "can-bus", "draw"),
     "Meet a device": (
         *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer"),
         *("record", "import", "export", "compare", "check", "report"),

@@ -1,0 +1,59 @@
+"""`fieldtwin draw`: who hangs on which wire of a system, as text or as a picture."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import click
+
+from fieldtwin.cli.options import json_option, profiles_option
+from gateway.core.errors import UsageError
+
+
+@click.command("draw")
+@click.argument("system")
+@click.option("--prototype", is_flag=True, help="Also what is emulated, with what, and where.")
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(dir_okay=False, allow_dash=True, path_type=Path),
+    help="An SVG there; - is stdout.",
+)
+@profiles_option
+@json_option
+def command(system: str, prototype: bool, output: Path | None, profiles: tuple[str, ...], as_json: bool) -> int:
+    """Draw the wires of SYSTEM, and who hangs on each: as text, or with -o as SVG, which is light or dark as its reader is.
+
+    Reads the files only: nothing is opened, and no control logic is run.
+    """
+    from fieldtwin.drawing.svg import svg
+    from fieldtwin.drawing.tree import tree
+    from fieldtwin.drawing.wiring import wiring
+    from fieldtwin.running.template_here import system_file
+    from twin.prototype_file import load_prototype
+    from twin.system import load_system
+
+    if as_json and output is not None:
+        raise UsageError("--json and -o at once", expected="one of them")
+    loaded = load_system(system_file(system, lambda _: True, plant=False), [Path(folder) for folder in profiles])
+    wires = wiring(loaded, load_prototype(loaded) if prototype else None)
+    if as_json:
+        text = json.dumps(wires.as_data(), indent=2) + "\n"
+    else:
+        text = tree(wires, *_room()) if output is None else svg(wires)
+    if output is None or str(output) == "-":
+        sys.stdout.write(text)
+        return 0
+    try:
+        output.write_text(text, encoding="utf-8")
+    except OSError as e:
+        raise UsageError(f"cannot write {output}: {e.strerror}") from e
+    return 0
+
+
+def _room() -> tuple[int, ...]:
+    """The terminal's width; a pipe takes whole lines."""
+    return (shutil.get_terminal_size().columns,) if sys.stdout.isatty() else ()

@@ -1,0 +1,154 @@
+"""Who hangs on which wire of a system, as facts for a drawing: controller, buses, devices, what stands in for them.
+
+Reads a loaded system and, for a prototype, its file; opens nothing and draws nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from gateway.core.endpoint import Endpoint
+from gateway.devices.config import BusConfig, DeviceConfig
+from twin.prototype_file import Prototype
+from twin.system import System
+
+
+@dataclass(frozen=True, slots=True)
+class Station:
+    """A device where it hangs: its address, how often it is asked, what may be written to it. `plays`: what stands in for it."""
+
+    name: str
+    device: str
+    address: str
+    asked: str
+    writable: tuple[str, ...]
+    far: str
+    plays: str
+
+
+@dataclass(frozen=True, slots=True)
+class Wire:
+    """A bus with the plant's endpoint. `stand_in`: where its emulators listen; empty where it is the plant's own."""
+
+    name: str
+    kind: str
+    endpoint: str
+    rate: str
+    stand_in: str
+    stations: tuple[Station, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Logic:
+    """A program of the PLC: where it comes from, and how many variables are bound to tags."""
+
+    name: str
+    source: str
+    cycle: str
+    inputs: int
+    outputs: int
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """What the gateway answers others with: tags as registers, or units of a bus."""
+
+    name: str
+    endpoint: str
+    offers: str
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """A system's wires. `prototype`: at least the file of one was asked for."""
+
+    system: str
+    prototype: bool
+    wires: tuple[Wire, ...]
+    programs: tuple[Logic, ...]
+    servers: tuple[Server, ...]
+
+    def as_data(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+
+def wiring(system: System, prototype: Prototype | None = None) -> Wiring:
+    """The wires of `system`; with `prototype`, what stands in for each of them as well."""
+    return Wiring(
+        system.name,
+        prototype is not None,
+        tuple(_wire(system, bus, prototype) for bus in system.buses.values()),
+        tuple(_programs(system)),
+        tuple(_servers(system, free_ports=prototype is not None)),
+    )
+
+
+def _wire(system: System, bus: BusConfig, prototype: Prototype | None) -> Wire:
+    listen = prototype.buses[bus.name].listen if prototype else None
+    stations = tuple(_station(device, prototype) for device in system.devices_on(bus.name))
+    kind, rate = _kind(bus)
+    return Wire(bus.name, kind, str(bus.endpoint), rate, str(listen or ""), stations)
+
+
+def _kind(bus: BusConfig) -> tuple[str, str]:
+    endpoint: Endpoint = bus.endpoint
+    if endpoint.is_can:
+        return "CAN bus", f"{bus.bitrate // 1000} kbit/s"
+    return ("serial line" if endpoint.is_serial else "network"), ""
+
+
+def _station(device: DeviceConfig, prototype: Prototype | None) -> Station:
+    emulated = prototype.devices.get(device.name) if prototype else None
+    word = "node" if device.profile.protocol == "canopen" else "unit"
+    far = ""
+    if device.profile.inbox is not None:
+        far = "far end"
+        if emulated is not None and emulated.form.far_link is not None:
+            link = emulated.form.far_link
+            far += f": {link.bytes_per_s:g} byte/s, {link.latency_ms} ms, {link.loss * 100:g} % lost"
+    return Station(
+        device.name,
+        device.profile.form.device,
+        f"{word} {device.address}",
+        _asked(device),
+        tuple(tag for tag in device.profile.tags if tag in device.writable),
+        far,
+        emulated.plays if emulated else "",
+    )
+
+
+def _asked(device: DeviceConfig) -> str:
+    if device.tpdo1 is not None:
+        return f"TPDO1 every {_time(device.tpdo1.event_ms)}"
+    periods = sorted(set(device.poll.values()))
+    return "every " + ", ".join(map(_time, periods)) if periods else ""
+
+
+def _time(ms: int) -> str:
+    return f"{ms / 1000:g} s" if ms >= 1000 else f"{ms} ms"
+
+
+def _programs(system: System) -> Iterator[Logic]:
+    tasks = system.plc.tasks
+    for name, program in system.plc.programs.items():
+        task = tasks.get(program.task) if program.task else next(iter(tasks.values()), None)
+        if task is None:
+            cycle = f"every {_time(system.plc.cycle_ms)}"
+        elif task.single is not None:
+            cycle = f"at {task.single}"
+        else:
+            cycle = f"every {_time(task.interval_ms or 0)}"
+        yield Logic(name, program.source, cycle, len(program.inputs), len(program.outputs))
+
+
+def _servers(system: System, *, free_ports: bool) -> Iterator[Server]:
+    serving = system.serving.for_run(allow_writes=False, free_ports=free_ports)
+    for serve in serving.serve:
+        count = len(serve.tags)
+        yield Server(serve.name, str(serve.listen), f"{count} tag{'s' if count > 1 else ''} as registers")
+    for bridge in serving.bridges:
+        reached = ", ".join(bus for bus in system.buses if bus in bridge.buses)
+        yield Server(bridge.name, str(bridge.listen), f"units of {reached}")

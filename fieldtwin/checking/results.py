@@ -64,6 +64,7 @@ def as_report(subject: Subject, results: Sequence[DeviceResult], reproduce: str)
             ScenarioResult(
                 f"{r.case.id} {r.case.title}", r.verdict, [check, *wire], requirements=(r.case.row,), target=subject.name,
                 reason=r.reason, reproduce=f"{reproduce} --only {r.case.id}", took_s=r.took_s,
+                case=r.case.id, role=r.case.role, danger=r.case.danger.value,
             )
         )  # fmt: skip
     versions = {"fieldtwin": subject.fieldtwin, **{f"device {name}": text for name, text in subject.identity.items()}}

@@ -184,6 +184,9 @@ def _plain(result: object) -> dict[str, object]:
     assert isinstance(result, ScenarioResult)
     return {
         "name": result.name,
+        "case": result.case,
+        "role": result.role,
+        "danger": result.danger,
         "verdict": result.verdict.value,
         "seed": result.seed,
         "target": result.target,
@@ -193,7 +196,15 @@ def _plain(result: object) -> dict[str, object]:
         "trace": result.trace_hash,
         "reproduce": result.reproduce,
         "checks": [
-            {"number": c.number, "text": c.text, "verdict": c.verdict.value, "expected": c.expected, "got": c.got}
+            {
+                "number": c.number,
+                "text": c.text,
+                "verdict": c.verdict.value,
+                "t_s": None if c.t_ns is None else c.t_ns / 1e9,
+                "expected": c.expected,
+                "got": c.got,
+                "where": c.where,
+            }
             for c in result.checks
         ],
     }

@@ -90,5 +90,5 @@ def _scenario(result: CaseResult, target: str, reproduce: str) -> ScenarioResult
     check = CheckResult("1", f"{case.does}: {case.must}", result.verdict, expected=case.must, got=result.reason)
     return ScenarioResult(
         f"{case.id} {case.title}", result.verdict, [check], requirements=(case.row,), target=target, reason=result.reason,
-        reproduce=f"{reproduce} --only {case.id}", took_s=result.took_s,
+        reproduce=f"{reproduce} --only {case.id}", took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
     )  # fmt: skip

@@ -119,21 +119,27 @@ def _verdict_table(report: Report) -> Markup:
     if not report.scenarios:
         return el("p", "No scenario was run: nothing is known.")
     rows = []
+    columns = [name for name in ("case", "role", "danger") if any(getattr(s, name) for s in report.scenarios)]
     ordered = sorted(enumerate(report.scenarios), key=lambda item: _ORDER.index(item[1].verdict))
     for number, scenario in ordered[:MOST_SCENARIOS]:
         name: Markup | str = scenario.title
         if scenario.verdict.bad:
             name = el("a", scenario.title, href=f"#s{number}")
         passed = sum(c.verdict is Verdict.PASSED for c in scenario.checks)
+        about = [el("td", getattr(scenario, column)) for column in columns]
         rows.append(
             el(
-                "tr", el("td", pill(scenario.verdict)), el("td", name, cls="name"), el("td", _why(scenario), cls="long check"),
+                "tr", el("td", pill(scenario.verdict)), el("td", name, cls="name"), about,
+                el("td", _why(scenario), cls="long check"),
                 el("td", f"{passed}/{len(scenario.checks)}", cls="num"), el("td", ", ".join(scenario.requirements)),
                 el("td", _time(scenario.simulated_s), cls="num"), el("td", _time(scenario.took_s), cls="num"),
                 id=None if scenario.verdict.bad else f"s{number}",
             )
         )  # fmt: skip
-    head = [el("th", t) for t in ("", "scenario", "why")] + [el("th", "checks", cls="num"), el("th", "requirements")]
+    head = [el("th", t) for t in ("", "scenario", *columns, "why")] + [
+        el("th", "checks", cls="num"),
+        el("th", "requirements"),
+    ]
     head += [el("th", "simulated", cls="num"), el("th", "took", cls="num")]
     more = len(report.scenarios) - MOST_SCENARIOS
     return join(
@@ -222,7 +228,8 @@ def _place(scenario: ScenarioResult) -> str:
     target = f"target {scenario.target}" if scenario.target else ""
     hashed = f"trace {scenario.trace_hash}" if scenario.trace_hash else ""
     needs = f"requirements {', '.join(scenario.requirements)}" if scenario.requirements else ""
-    return " · ".join(p for p in (where, target, needs, hashed) if p)
+    about = ", ".join(f"{name} {value}" for name in ("case", "role", "danger") if (value := getattr(scenario, name)))
+    return " · ".join(p for p in (about, where, target, needs, hashed) if p)
 
 
 def _plain(scenarios: Sequence[tuple[int, ScenarioResult]]) -> Markup:

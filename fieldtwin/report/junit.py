@@ -70,7 +70,8 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult) -> None:
         case.set("file", clean(scenario.file))
     if scenario.line:
         case.set("line", str(scenario.line))
-    facts = [("requirement", id) for id in scenario.requirements]
+    facts = [(name, value) for name in ("case", "role", "danger") if (value := getattr(scenario, name))]
+    facts += [("requirement", id) for id in scenario.requirements]
     facts += [("trace hash", scenario.trace_hash)] if scenario.trace_hash else []
     _properties(case, facts)
     verdict, message = scenario.verdict, clean(_message(scenario))

@@ -75,6 +75,9 @@ class Counts:
 class ScenarioResult:
     """One scenario against one target with one seed.
 
+    `case` is the id that it goes by, `role` whom it judges (controller, master, device), `danger` what it may do to what is there
+    (observe, read, write, disrupt).
+
     `reproduce` is the one line that runs it again. `simulated_s` is the run's own time, `took_s` the host's. `trace` are
     the events that are still in memory, `dropped` how many are not; `trace_hash` is over all. `counts` is what a `Collector` that
     listened to the run has counted; without them the report counts what is in `trace`.
@@ -96,6 +99,9 @@ class ScenarioResult:
     trace_hash: str = ""
     dropped: int = 0
     counts: Counts | None = None
+    case: str = ""
+    role: str = ""
+    danger: str = ""
 
     @property
     def title(self) -> str:

@@ -21,6 +21,7 @@ from fieldtwin.running.control_bench import ControlBench, Where
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.virtual_scenario import prototype_of, reproduce, run_virtual
+from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner, refusal
@@ -60,13 +61,13 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
     trace.listeners.append(collector.feed)
     try:
         if refused:  # then the plant is left alone
-            result = _without_run(scenario, target, Verdict.SKIPPED, refused)
+            result = result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)
         else:
             result = asyncio.run(_run(scenario, target, trace))
     except asyncio.CancelledError:  # SIGTERM: everything went down in order
         raise KeyboardInterrupt from None
     except FieldtwinError as e:
-        result = replace(_without_run(scenario, target, Verdict.ERROR, str(e)), trace=tuple(trace.events))
+        result = result_of(scenario, target.name, Verdict.ERROR, reason=str(e), trace=tuple(trace.events))
     finally:
         if sink is not None:
             sink.close()
@@ -77,18 +78,6 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),
         trace_hash="",  # no two runs on a clock have the same
-    )
-
-
-def _without_run(scenario: Scenario, target: Target, verdict: Verdict, reason: str) -> ScenarioResult:
-    return ScenarioResult(
-        scenario.form.scenario,
-        verdict,
-        requirements=tuple(scenario.form.requirements),
-        file=str(scenario.path),
-        line=1,
-        target=target.name,
-        reason=reason,
     )
 
 

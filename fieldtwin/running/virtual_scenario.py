@@ -13,6 +13,7 @@ from fieldtwin.report.coverage import Collector
 from fieldtwin.report.machines import machines_of
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner
 from fieldtwin.scenarios.trace import Trace
@@ -51,16 +52,7 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
             if sink is not None:
                 sink.close()
     if result is None:
-        result = ScenarioResult(
-            scenario.form.scenario,
-            Verdict.ERROR,
-            requirements=tuple(scenario.form.requirements),
-            file=str(scenario.path),
-            line=1,
-            target="virtual",
-            reason=error,
-            trace=tuple(trace.events),
-        )
+        result = result_of(scenario, "virtual", Verdict.ERROR, reason=error, trace=tuple(trace.events))
     return replace(
         result,
         seed=chosen,

@@ -16,6 +16,7 @@ from fieldtwin.conformance.case import Danger
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
+from fieldtwin.scenarios.about import dangers, result_of
 from fieldtwin.scenarios.bench import Bench, Can
 from fieldtwin.scenarios.expectation import Watched, is_secret, judge_tag, judge_wire
 from fieldtwin.scenarios.expression import Expression
@@ -32,8 +33,6 @@ RECENT_S = 2.0
 KEPT = 20_000
 LATE_SHARE = 0.1
 """A host that was late by more than this part of the time that a check is about has proved nothing."""
-DANGER = {"send": Danger.WRITE, "set": Danger.WRITE, "fault": Danger.DISRUPT, "clear": Danger.DISRUPT}
-"""Of steps; all others observe."""
 _NS = 1_000_000_000
 
 
@@ -60,9 +59,7 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Dang
         ]
         said = f" (step{'s' if len(steps) > 1 else ''} {', '.join(steps[:5])})" if steps else ""
         return f"the target {target} cannot {', '.join(lacking)}{said}"
-    asked = [(DANGER.get(word_of(step), Danger.OBSERVE), f"step {n}") for n, step in enumerate(scenario.form.steps, 1)]
-    asked += [(Danger.READ, f"the probe {probe.name}") for probe in scenario.probes]
-    for danger, what in asked:
+    for danger, what in dangers(scenario):
         if danger.rank > allowed.rank:
             said = f"{what} is of the class {danger.value}, and the target {target} allows {allowed.value}"
             return f"{said} (--allow {danger.value})"
@@ -108,14 +105,11 @@ class Runner:
                     break
             if verdict is Verdict.PASSED:
                 verdict, reason = await self._hold_to_the_end()
-        return ScenarioResult(
-            form.scenario,
-            verdict,
-            tuple(self.results),
-            tuple(form.requirements),
-            str(scenario.path),
-            1,
+        return result_of(
+            scenario,
             self.bench.target,
+            verdict,
+            checks=tuple(self.results),
             reason=reason,
             simulated_s=self.bench.now_s(),
             trace=tuple(self.bench.trace.events),

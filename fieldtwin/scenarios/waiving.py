@@ -12,14 +12,14 @@ from pathlib import Path
 
 from fieldtwin.conformance.waivers import Waivers
 from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.scenarios.about import case_of
 
-SUFFIX = ".scenario.yaml"
 _WAIVED = "waived: "
 
 
 def ids_of(path: Path, name: str) -> tuple[str, str]:
     """What a waiver may call a scenario."""
-    return path.name.removesuffix(SUFFIX), name
+    return case_of(path), name
 
 
 def waive(result: ScenarioResult, waivers: Waivers, today: date) -> ScenarioResult:

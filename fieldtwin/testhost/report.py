@@ -13,8 +13,8 @@ _VERDICTS = {verdict.value: verdict for verdict in Verdict}
 
 
 def write_report(args: dict[str, Any]) -> None:
-    """Write ``file`` from ``tests`` (name, verdict, requirements, text, took_s, reproduce, file, line), ``title``, ``reproduce``,
-    ``versions``. Raises `UsageError` for a verdict that there is not."""
+    """Write ``file`` from ``tests`` (name, verdict, requirements, text, took_s, reproduce, file, line, case, role,
+    danger), ``title``, ``reproduce``, ``versions``. Raises `UsageError` for a verdict that there is not."""
     results = []
     for test in args.get("tests") or ():
         verdict = _VERDICTS.get(str(test.get("verdict")))
@@ -33,6 +33,9 @@ def write_report(args: dict[str, Any]) -> None:
                 reason=text if verdict is Verdict.SKIPPED else "",
                 reproduce=str(test.get("reproduce") or ""),
                 took_s=float(test.get("took_s") or 0.0),
+                case=str(test.get("case") or ""),
+                role=str(test.get("role") or ""),
+                danger=str(test.get("danger") or ""),
             )
         )
     versions = {str(k): str(v) for k, v in dict(args.get("versions") or {}).items()}

@@ -19,7 +19,8 @@ VERDICTS = ("passed", "failed", "error", "inconclusive", "skipped")
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a scenario ended. `verdict` is one of `VERDICTS`; only the first is a pass. `checks` are its steps and checks, as
+    """How a scenario ended. `verdict` is one of `VERDICTS`; only the first is a pass. `case` is its id, `role` whom it
+    judges, `danger` its class (observe, read, write, disrupt). `checks` are its steps and checks, as
     `fieldtwin test --json` has them."""
 
     name: str
@@ -32,6 +33,9 @@ class Outcome:
     reproduce: str = ""
     simulated_s: float = 0.0
     trace: str = ""
+    case: str = ""
+    role: str = ""
+    danger: str = ""
 
     @property
     def passed(self) -> bool:

@@ -26,7 +26,8 @@ class Results:
         if report.when != "call" and report.passed:
             return
         properties = list(report.user_properties)
-        said = dict(properties).get("fieldtwin verdict", "")
+        facts = dict(properties)
+        said = facts.get("fieldtwin verdict", "")
         ended = (
             "passed"
             if report.passed
@@ -46,6 +47,7 @@ class Results:
             "reproduce": shlex.join(["pytest", report.nodeid]),
             "file": file,
             "line": (line or 0) + 1,
+            **{name: str(facts.get(name, "")) for name in ("case", "role", "danger")},
         }
 
     def pytest_sessionfinish(self) -> None:

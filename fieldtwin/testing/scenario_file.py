@@ -16,6 +16,7 @@ from fieldtwin.testing.outcome import Outcome, run_scenario
 from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, command_of
 
 SUFFIX = ".scenario.yaml"
+ABOUT = ("case", "role", "danger")
 
 
 class NotPassed(Exception):
@@ -46,6 +47,7 @@ class ScenarioItem(pytest.Item):
             target=config.getoption("--fieldtwin-target"),
             profiles=[str(p) for p in config.getini("fieldtwin_profiles")],
         )
+        self.user_properties += [(name, value) for name in ABOUT if (value := getattr(outcome, name))]
         self.user_properties += [("requirement", id) for id in outcome.requirements]
         self.user_properties += [("fieldtwin verdict", outcome.verdict)]
         self.user_properties += [("seed", outcome.seed)] if outcome.seed is not None else []

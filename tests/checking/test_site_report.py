@@ -227,6 +227,9 @@ def test_junit_has_each_case_with_its_bytes() -> None:
     assert xml.count("<failure") == 1
     assert "&gt; 01 03" in xml
     assert f"--only {CASES[1].id}" in xml
+    assert f'<property name="case" value="{CASES[1].id}" />' in xml
+    assert xml.count('<property name="role" value="device" />') == len(RESULTS)
+    assert xml.count(f'<property name="danger" value="{CASES[1].danger.value}" />') >= 1
 
 
 JSON = st.recursive(

@@ -89,3 +89,5 @@ def test_results_as_json_and_junit(tmp_path: Path) -> None:
     assert failure is not None
     assert "published 3333" in failure.get("message", "")
     assert "--only MB-015a" in (failure.text or "")
+    about = {p.get("name"): p.get("value") for p in suite.findall("testcase[1]/properties/property")}
+    assert about == {"case": "MB-015a", "role": "master", "danger": "read", "requirement": "MB-015"}

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from fieldtwin.cli.test_command import command
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.virtual_scenario import run_virtual
+from fieldtwin.scenarios.about import danger_of
 from fieldtwin.scenarios.form import load_scenario
 from gateway.core.errors import FileInvalid
 
@@ -143,9 +144,26 @@ def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: st
 
 def test_reports_are_written(tmp_path: Path) -> None:
     path = written(tmp_path, ACTIVE, "requirements: [REQ-1]\n")
-    words = [str(path), "--html", str(tmp_path / "r.html"), "--junit", str(tmp_path / "r.xml")]
+    words = [str(path), "--html", str(tmp_path / "r.html"), "--junit", str(tmp_path / "r.xml"), "--json"]
     ended = CliRunner().invoke(command, words, standalone_mode=False)
     assert ended.return_value == 0, ended.output
-    assert "1 passed" in ended.output
-    assert "REQ-1" in (tmp_path / "r.html").read_text()
     assert "a test" in (tmp_path / "r.xml").read_text()
+    (told,) = json.loads(ended.output)
+    assert (told["verdict"], told["requirements"]) == ("passed", ["REQ-1"])
+    about = {"case": "x", "role": "controller", "danger": "write"}  # ACTIVE sends
+    assert {name: told[name] for name in about} == about
+    for name, value in {**about, "requirement": "REQ-1"}.items():
+        assert f'<property name="{name}" value="{value}" />' in (tmp_path / "r.xml").read_text()
+        assert f"<td>{value}</td>" in (tmp_path / "r.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("steps", "danger"),
+    [
+        ("  - pause: 1s\n", "observe"),
+        ("  - set: {tag: ctd.pressure, value: 5}\n  - pause: 1s\n", "write"),
+        ("  - send: {period_s: 1}\n  - fault: {id: f, name: silence, device: ctd}\n", "disrupt"),
+    ],
+)
+def test_a_scenario_is_as_dangerous_as_its_worst_step(tmp_path: Path, steps: str, danger: str) -> None:
+    assert danger_of(load_scenario(written(tmp_path, steps))).value == danger

@@ -1,0 +1,58 @@
+"""What a scenario's verdict says of the scenario: its case id, whom it judges, its class of danger.
+
+It knows no bench and runs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.conformance.case import Danger
+from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.scenarios.form import Scenario, Step, word_of
+
+SUFFIX = ".scenario.yaml"
+ROLE = "controller"
+"""Whom a scenario judges: the gateway and PLC of the system, or the one that its probes watch."""
+_DANGER = {"send": Danger.WRITE, "set": Danger.WRITE, "fault": Danger.DISRUPT, "clear": Danger.DISRUPT}
+"""Of steps; all others observe."""
+
+
+def case_of(path: Path) -> str:
+    """The case id: the file's name without its suffix."""
+    return path.name.removesuffix(SUFFIX)
+
+
+def dangers(scenario: Scenario) -> Iterator[tuple[Danger, str]]:
+    """Each step and probe with its class, and how people find it."""
+    for n, step in enumerate(scenario.form.steps, 1):
+        yield _danger_of(step), f"step {n}"
+    for probe in scenario.probes:
+        yield Danger.READ, f"the probe {probe.name}"
+
+
+def _danger_of(step: Step) -> Danger:
+    return _DANGER.get(word_of(step), Danger.OBSERVE)
+
+
+def danger_of(scenario: Scenario) -> Danger:
+    """The highest of all its steps and probes."""
+    return max((danger for danger, _ in dangers(scenario)), key=lambda d: d.rank, default=Danger.OBSERVE)
+
+
+def result_of(scenario: Scenario, target: str, verdict: Verdict, **more: Any) -> ScenarioResult:
+    """A result that says whose it is; `more` are the other fields of `ScenarioResult`."""
+    return ScenarioResult(
+        scenario.form.scenario,
+        verdict,
+        requirements=tuple(scenario.form.requirements),
+        file=str(scenario.path),
+        line=1,
+        target=target,
+        case=case_of(scenario.path),
+        role=ROLE,
+        danger=danger_of(scenario).value,
+        **more,
+    )

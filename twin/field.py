@@ -27,6 +27,7 @@ from emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, 
 from emulators.modbus.unit import ModbusUnit, UnitLimits
 from emulators.models.emulated_node import emulated_node
 from emulators.models.mailbox_modem import ModemPair
+from emulators.models.packet_link import Untamed
 from emulators.models.register_device import StatedRegisters, add_own_functions
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.models.simulated_registers import SimulatedRegisters
@@ -261,6 +262,7 @@ class FieldSide:
                 latency_s=link.latency_ms / 1000,
                 loss=link.loss,
                 seed=self.prototype.seed,
+                untamed=Untamed(link.lost, link.repeated, link.overtakes),
             )
             self._pairs[config.name] = pair
             seen = DistortedRegisters(pair.near, pair.near.peek, emulated.profile, pair.near.journal)

@@ -263,11 +263,14 @@ class BusMappingForm(Strict):
 
 
 class FarLinkForm(Strict):
-    """The link between the two modems."""
+    """The link between the two modems. Of what is lost by `loss` the modems take care, of the rest nobody does."""
 
     bytes_per_s: float = Field(default=80.0, gt=0)
     latency_ms: int = Field(default=900, ge=0, le=600_000)
     loss: float = Field(default=0.0, ge=0.0, lt=1.0)
+    lost: float = Field(default=0.0, ge=0.0, le=1.0)
+    repeated: float = Field(default=0.0, ge=0.0, le=1.0)
+    overtakes: float = Field(default=0.0, ge=0.0, le=1.0)
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 

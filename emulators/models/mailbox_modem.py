@@ -14,7 +14,7 @@ from random import Random
 from emulators.codec import encode
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
-from emulators.models.packet_link import PacketLink
+from emulators.models.packet_link import TAME, PacketLink, Untamed
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import Box, DeviceProfile, RegisterRange
 
@@ -118,9 +118,18 @@ class MailboxModem(RegisterBank):
 class ModemPair:
     """Both modems and both directions of the link. `latency_s` is one way."""
 
-    def __init__(self, profile: DeviceProfile, *, bytes_per_s: float, latency_s: float, loss: float, seed: int) -> None:
-        up = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} up"))
-        down = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} down"))
+    def __init__(
+        self,
+        profile: DeviceProfile,
+        *,
+        bytes_per_s: float,
+        latency_s: float,
+        loss: float,
+        seed: int,
+        untamed: Untamed = TAME,
+    ) -> None:
+        up = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} up"), untamed=untamed)
+        down = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} down"), untamed=untamed)
         self.near = MailboxModem(profile, up, down)
         self.far = MailboxModem(profile, down, up)
         self.up, self.down = up, down

@@ -1,13 +1,14 @@
 """A slow, lossy link that delivers every packet once and in order: the sound between two modems.
 
 Packets go one after the other at `bytes_per_s`, arrive `latency_s` after their last byte, and are lost with probability
-`loss`, which the sender learns from a missing acknowledgement and sends again. So nothing is lost, only late. Seeded, and a
-function of time: when a packet arrives is known when it is sent.
+`loss`, which the sender learns from a missing acknowledgement and sends again. So nothing is lost, only late; unless the modems
+are told to be worse than that (`Untamed`). Seeded, and a function of time: when a packet arrives is known when it is sent.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from random import Random
 
 from gateway.core.clock import NS_PER_S
@@ -17,18 +18,40 @@ OVERHEAD_BYTES = 8
 MAX_RESENDS = 50
 
 
+@dataclass(frozen=True, slots=True)
+class Untamed:
+    """What the modems do not make up for, as probabilities of each packet: it never arrives, arrives twice, arrives before the
+    one that was sent before it."""
+
+    lost: float = 0.0
+    repeated: float = 0.0
+    overtakes: float = 0.0
+
+
+TAME = Untamed()
+
+
 class PacketLink:
     """One direction. At most `capacity` packets are under way; `submit` refuses more."""
 
-    def __init__(self, bytes_per_s: float, latency_s: float, loss: float, random: Random, capacity: int = 8) -> None:
+    def __init__(
+        self,
+        bytes_per_s: float,
+        latency_s: float,
+        loss: float,
+        random: Random,
+        capacity: int = 8,
+        untamed: Untamed = TAME,
+    ) -> None:
         self._bytes_per_s = bytes_per_s
         self._latency_ns = round(latency_s * NS_PER_S)
         self._loss = loss
         self._random = random
         self._capacity = capacity
+        self._untamed = untamed
         self._under_way: deque[tuple[int, bytes]] = deque()
         self._free_ns = 0
-        self.sent = self.resent = self.delivered = 0
+        self.sent = self.resent = self.delivered = self.lost = 0
 
     @property
     def full(self) -> bool:
@@ -47,8 +70,23 @@ class PacketLink:
             end_ns += 2 * self._latency_ns + airtime_ns
         self._free_ns = end_ns
         self.sent += 1
-        self._under_way.append((end_ns + self._latency_ns, payload))
+        self._launch(end_ns + self._latency_ns, payload)
         return True
+
+    def _launch(self, arrives_ns: int, payload: bytes) -> None:
+        if self._happens(self._untamed.lost):
+            self.lost += 1
+            return
+        if self._under_way and self._happens(self._untamed.overtakes):
+            before_ns, overtaken = self._under_way.pop()
+            self._under_way.append((before_ns, payload))
+            payload = overtaken
+        self._under_way.append((arrives_ns, payload))
+        if self._happens(self._untamed.repeated):
+            self._under_way.append((arrives_ns, payload))
+
+    def _happens(self, probability: float) -> bool:
+        return probability > 0 and self._random.random() < probability
 
     def arrived(self, now_ns: int) -> bytes | None:
         """The next packet that has arrived by `now_ns`, or None. Taking it removes it."""

@@ -1,0 +1,101 @@
+"""Every `fieldtwin` command that a page shows, in a fence or in a line of text, there is, with the options shown."""
+
+from __future__ import annotations
+
+import re
+import shlex
+
+import click
+import pytest
+import yaml
+from page_runner import ROOT
+
+from fieldtwin.cli.main import COMMANDS, cli
+
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
+PAGES += [*sorted(p for p in (ROOT / "docs").rglob("*.md") if "decisions" not in p.parts)]
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_INLINE = re.compile(r"`(fieldtwin\s[^`]+)`")
+
+
+def shown(text: str) -> list[str]:
+    """The command lines of a page: fences of shells, continued lines joined, and what stands in a sentence."""
+    found = []
+    for language, body in _FENCE.findall(text):
+        lines = body.replace("\\\n", " ").splitlines()
+        if language in ("sh", "console", "bash"):
+            found += [line.removeprefix("$ ") for line in lines if not (language == "console" and line[:2] != "$ ")]
+        elif language == "yaml":
+            found += [line.strip().removeprefix("- ").removeprefix("run: ") for line in lines if "fieldtwin " in line]
+    found += [" ".join(inline.split()) for inline in _INLINE.findall(_FENCE.sub("", text))]
+    return [part for line in found for part in _parts(line) if part[0] == "fieldtwin"]
+
+
+def _parts(line: str) -> list[list[str]]:
+    """The words of each command of a line; what stands before the name (variables, `timeout 5`) is left out."""
+    lexer = shlex.shlex(line, posix=True, punctuation_chars="();<>|&")
+    lexer.whitespace_split = True
+    try:
+        words = list(lexer)
+    except ValueError:  # a sentence's quotes
+        return []
+    parts: list[list[str]] = [[]]
+    for word in words:
+        if re.fullmatch(r"[();<>|&]+", word):
+            parts.append([])
+        else:
+            parts[-1].append(word)
+    starts = [(part, part.index("fieldtwin")) for part in parts if "fieldtwin" in part]
+    return [part[at:] for part, at in starts if at == 0 or "=" in part[0]]
+
+
+def unknown(words: list[str]) -> str:
+    """What of a command line there is not, in words; empty when all of it is there."""
+    command, words = cli, words[1:]
+    if words and words[0] in ("COMMAND", "VERB"):
+        return ""
+    context = click.Context(cli)
+    while isinstance(command, click.Group) and words and not words[0].startswith("-"):
+        name = words.pop(0)
+        choices = name.split("|") if "|" in name else [name.rstrip(",.")]
+        below = [command.get_command(context, choice) for choice in choices]
+        if None in below:
+            return f"no command {name!r}"
+        command = below[0]
+    options = {
+        option for parameter in command.get_params(context) for option in (*parameter.opts, *parameter.secondary_opts)
+    }
+    options |= {"--help", "-h"}
+    for word in words:
+        if word == "--":
+            break
+        if word.startswith("-") and not re.fullmatch(r"-|-?\d.*|-[a-zA-Z]\S+", word):
+            option = word.partition("=")[0].rstrip(",.:")
+            if any(one not in options for one in option.split("|") if one.startswith("-")):
+                return f"{command.name} has no {option!r}"
+    return ""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_commands_of_a_page_are_there(page):
+    wrong = [f"{' '.join(words)}: {why}" for words in shown(page.read_text("utf-8")) if (why := unknown(words))]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_every_command_is_shown_somewhere():
+    told = {words[1] for page in PAGES for words in shown(page.read_text("utf-8")) if len(words) > 1}
+    assert set(COMMANDS) - told == set()
+
+
+def test_a_command_that_there_is_not_is_noticed():
+    page = "`fieldtwin rnu x`\n```sh\nA=1 fieldtwin run x --protoype | head; fieldtwin plc nothing\n```\n"
+    assert [unknown(words) for words in shown(page)] == [
+        "run has no '--protoype'", "no command 'nothing'", "no command 'rnu'",
+    ]  # fmt: skip
+
+
+def test_yaml_of_the_pages_is_yaml():
+    for page in PAGES:
+        for language, body in _FENCE.findall(page.read_text("utf-8")):
+            if language == "yaml":
+                yaml.safe_load(body)

@@ -26,8 +26,8 @@ from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit, UnitLimits
 from emulators.models.emulated_node import emulated_node
-from emulators.models.mailbox_modem import ModemPair
-from emulators.models.packet_link import Untamed
+from emulators.models.mailbox_modem import MailboxModem, ModemPair
+from emulators.models.packet_link import ModemEnd, Untamed
 from emulators.models.register_device import StatedRegisters, add_own_functions
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.models.simulated_registers import SimulatedRegisters
@@ -87,11 +87,18 @@ class FieldSide:
     """Builds every emulator of a prototype and runs them on their wires.
 
     `run_dir` is where virtual serial ports get their links. After `open`, `listening` says where each emulated bus really
-    listens (free ports taken), and `far` where the far modems do.
+    listens (free ports taken), and `far` where the far modems do. `water`: the ends of transmitters that are in a network's water
+    and have no far modem of their own.
     """
 
     def __init__(
-        self, system: System, prototype: Prototype, run_dir: Path, clock: Clock, ports: Ports | None = None
+        self,
+        system: System,
+        prototype: Prototype,
+        run_dir: Path,
+        clock: Clock,
+        ports: Ports | None = None,
+        water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
         self.system = system
         self.prototype = prototype
@@ -110,6 +117,7 @@ class FieldSide:
         self._buses: list[CanPort] = []
         self._connections: list[ByteConnection | CanConnection] = []
         self._pairs: dict[str, ModemPair] = {}
+        self._water = water or {}
         self._tracks: dict[Path, SignalTrack] = {}
         self._replays: dict[tuple[Path, str, str, WhenUsedUp], tuple[ExchangeReplay, int]] = {}
 
@@ -255,21 +263,12 @@ class FieldSide:
 
     def _made_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit | RecordedDevice:
         if emulated.form.model == "mailbox":
-            link = emulated.form.far_link
-            pair = ModemPair(
-                emulated.profile,
-                bytes_per_s=link.bytes_per_s,
-                latency_s=link.latency_ms / 1000,
-                loss=link.loss,
-                seed=self.prototype.seed,
-                untamed=Untamed(link.lost, link.repeated, link.overtakes),
-            )
-            self._pairs[config.name] = pair
-            seen = DistortedRegisters(pair.near, pair.near.peek, emulated.profile, pair.near.journal)
+            modem = self._modem(config, emulated)
+            seen = DistortedRegisters(modem, modem.peek, emulated.profile, modem.journal)
             unit = self._emulated_unit(config, seen, ())
             self.faults.on_values(config.name, seen.distortions)
-            modem = self.devices[config.name] = FieldDevice(emulated, unit, None)
-            modem.journal = pair.near.journal
+            device = self.devices[config.name] = FieldDevice(emulated, unit, None)
+            device.journal = modem.journal
             return unit
         if emulated.form.model == "profile" or (emulated.form.simulation and emulated.profile.sampled is None):
             return self._stated_unit(config, emulated)
@@ -282,6 +281,22 @@ class FieldSide:
         device.journal = bank.journal
         self.faults.on_values(config.name, bank.distortions)
         return unit
+
+    def _modem(self, config: DeviceConfig, emulated: EmulatedDevice) -> MailboxModem:
+        """A transmitter: in a network's water, or with a far modem and a link of its own."""
+        end, link = self._water.get(config.name), emulated.form.far_link
+        if end is not None:
+            return MailboxModem(emulated.profile, end, end, emulated.form.identity)
+        pair = self._pairs[config.name] = ModemPair(
+            emulated.profile,
+            bytes_per_s=link.bytes_per_s,
+            latency_s=link.latency_ms / 1000,
+            loss=link.loss,
+            seed=self.prototype.seed,
+            untamed=Untamed(link.lost, link.repeated, link.overtakes),
+            identity=emulated.form.identity,
+        )
+        return pair.near
 
     def _stated_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit:
         """A device of which nothing is recorded: its profile, and what the prototype file says that its tags hold."""

@@ -6,10 +6,12 @@ side is made. What runs left of the wire is `twin.physical`, unchanged and unawa
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from emulators.emulator import EmulatedCommunication
 from emulators.endpoints.ports import Ports
+from emulators.models.packet_link import ModemEnd
 from gateway.core.clock import Clock
 from twin.field import FieldSide
 from twin.model import DigitalModel
@@ -39,7 +41,9 @@ class DigitalTwinPrototype:
         for communication in self.communications.values():
             communication.check()
 
-    def field(self, run_dir: Path, ports: Ports | None = None) -> FieldSide:
+    def field(
+        self, run_dir: Path, ports: Ports | None = None, water: Mapping[str, ModemEnd] | None = None
+    ) -> FieldSide:
         """The emulators on their wires, not opened yet: those of the operating system unless other `ports` are given.
-        Virtual serial ports get their links in `run_dir`."""
-        return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock, ports)
+        Virtual serial ports get their links in `run_dir`. `water`: the ends of transmitters that are in a network's."""
+        return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)

@@ -6,11 +6,12 @@ same seed, configuration, version, Python minor and architecture give the same e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
 
+from emulators.models.packet_link import ModemEnd
 from emulators.virtual.clock import VirtualClock
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.ports import MemoryNet
@@ -43,7 +44,8 @@ class VirtualPrototype:
     what is retained; the exchange log is in memory.
 
     `seed` replaces the prototype file's. `taps` observe the gateway's wires. `prepare` is called when everything is made and
-    nothing has run yet. After entering, `field`, `gateway` and `plc` run.
+    nothing has run yet. `water`: the ends of transmitters that are in a network's. After entering, `field`, `gateway` and `plc`
+    run.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class VirtualPrototype:
         taps: Sequence[Tap] = (),
         on_change: Callable[[Change], None] | None = None,
         prepare: Callable[[VirtualPrototype], None] | None = None,
+        water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
         self.system = system
         self.prototype = prototype if seed is None else replace(prototype, seed=seed)
@@ -64,7 +67,7 @@ class VirtualPrototype:
         self.clock = VirtualClock(loop)
         self.net = MemoryNet(loop)
         self.twin = DigitalTwinPrototype(system, self.prototype, self.clock)
-        self.field: FieldSide = self.twin.field(Path("virtual"), self.net)
+        self.field: FieldSide = self.twin.field(Path("virtual"), self.net, water)
         self.gateway: Gateway
         self.plc: Runner
         self.mapping: dict[Endpoint, Endpoint] = {}

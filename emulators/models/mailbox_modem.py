@@ -8,13 +8,13 @@ as the same message again and not sent twice. Functions of time: links are advan
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from random import Random
 
 from emulators.codec import encode
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
-from emulators.models.packet_link import TAME, PacketLink, Untamed
+from emulators.models.packet_link import TAME, Incoming, Outgoing, PacketLink, Untamed
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import Box, DeviceProfile, RegisterRange
 
@@ -24,9 +24,11 @@ RECEIVED = 64
 
 
 class MailboxModem(RegisterBank):
-    """One modem. `outgoing` carries what it sends, `incoming` what it receives."""
+    """One modem. `outgoing` carries what it sends, `incoming` what it receives; `identity` is what others of its tags hold."""
 
-    def __init__(self, profile: DeviceProfile, outgoing: PacketLink, incoming: PacketLink) -> None:
+    def __init__(
+        self, profile: DeviceProfile, outgoing: Outgoing, incoming: Incoming, identity: Mapping[str, str] | None = None
+    ) -> None:
         if profile.inbox is None or profile.outbox is None:
             raise FileInvalid("the profile has no mailbox", path=profile.path, expected="`mailbox:`")
         self._inbox, self._outbox = profile.inbox, profile.outbox
@@ -40,6 +42,18 @@ class MailboxModem(RegisterBank):
         self._sequence = 0
         self._accepted = 0
         self._pending: bytes | None = None
+        for name, text in (identity or {}).items():
+            self._state(name, text)
+
+    def _state(self, name: str, text: str) -> None:
+        """A tag that never changes."""
+        tag = self._tags[name]
+        try:
+            words = encode(text if tag.is_text else float(text), tag.type, tag.order, registers=tag.registers.count)
+        except ValueError as e:
+            raise FileInvalid(f"{name!r} is a number", expected="such as 1", got=text) from e
+        self._cells.poke(tag.registers.table, tag.registers.address, *words)
+        self.journal.note(name, b"".join(w.to_bytes(2) for w in words), 0)
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
         self.advance(now_ns)
@@ -127,10 +141,11 @@ class ModemPair:
         loss: float,
         seed: int,
         untamed: Untamed = TAME,
+        identity: Mapping[str, str] | None = None,
     ) -> None:
         up = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} up"), untamed=untamed)
         down = PacketLink(bytes_per_s, latency_s, loss, Random(f"{seed} down"), untamed=untamed)
-        self.near = MailboxModem(profile, up, down)
+        self.near = MailboxModem(profile, up, down, identity)
         self.far = MailboxModem(profile, down, up)
         self.up, self.down = up, down
 

@@ -10,12 +10,38 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 from random import Random
+from typing import Protocol
 
 from gateway.core.clock import NS_PER_S
 
 OVERHEAD_BYTES = 8
 """Preamble, address and check sum of a packet."""
 MAX_RESENDS = 50
+
+
+class Outgoing(Protocol):
+    """What takes a modem's packets away."""
+
+    sent: int
+    resent: int
+
+    def submit(self, payload: bytes, now_ns: int) -> bool:
+        """Send `payload`; False when there is no room."""
+        ...
+
+
+class Incoming(Protocol):
+    """What brings a modem its packets."""
+
+    delivered: int
+
+    def arrived(self, now_ns: int) -> bytes | None:
+        """The next packet that has arrived by `now_ns`, or None. Taking it removes it."""
+        ...
+
+
+class ModemEnd(Outgoing, Incoming, Protocol):
+    """Both, for one modem."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,32 @@
+"""A modem's end of the water: what its registers hand over is said, what it hears arrives in its mailbox."""
+
+from __future__ import annotations
+
+from emulators.wires.acoustic import AcousticMedium
+
+
+class AcousticLink:
+    """Both directions of the modem `name` in `medium` (`packet_link.Outgoing` and `Incoming`).
+
+    `times`: how often each packet is said, `every_ns` apart: a modem that nobody answers. The water loses what it likes, so
+    `resent` counts what was said besides.
+    """
+
+    def __init__(self, medium: AcousticMedium, name: str, *, times: int = 1, every_ns: int = 0) -> None:
+        self.sent = self.resent = self.delivered = 0
+        self._medium = medium
+        self._name = name
+        self._times = times
+        self._every_ns = every_ns
+
+    def submit(self, payload: bytes, now_ns: int) -> bool:
+        taken = self._medium.say(self._name, payload, now_ns, times=self._times, every_ns=self._every_ns)
+        if taken:
+            self.sent += 1
+            self.resent += self._times - 1
+        return taken
+
+    def arrived(self, now_ns: int) -> bytes | None:
+        payload = self._medium.take(self._name, now_ns)
+        self.delivered += payload is not None
+        return payload

@@ -29,6 +29,7 @@ from gateway.core.errors import (
     Unreachable,
     UsageError,
     WireError,
+    os_reason,
 )
 
 OPEN_TIMEOUT_S = 5.0
@@ -60,7 +61,7 @@ async def _join_soft_bus(endpoint: Endpoint, bitrate: int) -> SoftBusEnd:
         async with asyncio.timeout(OPEN_TIMEOUT_S):
             reader, writer = await asyncio.open_connection(host, port)
     except OSError as e:  # a time-out is one
-        raise Unreachable(f"no software CAN bus: {e.strerror or 'no answer'}", where=str(endpoint)) from e
+        raise Unreachable(f"no software CAN bus: {os_reason(e)}", where=str(endpoint)) from e
     try:
         loop = asyncio.get_running_loop()
         asked_ns = int(loop.time() * NS_PER_S)

@@ -14,7 +14,7 @@ from typing import Any
 
 from gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable, UsageError
+from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable, UsageError, os_reason
 
 try:
     import fcntl
@@ -54,7 +54,7 @@ class TcpEnd(ByteConnection):
         except TimeoutError as e:
             raise Unreachable(f"no answer within {timeout_s:g} s", where=str(endpoint)) from e
         except (OSError, UnicodeError) as e:
-            why = getattr(e, "strerror", None) or str(e)
+            why = os_reason(e) if isinstance(e, OSError) else str(e)
             raise Unreachable(f"cannot connect: {why}", where=str(endpoint)) from e
         return end
 

@@ -24,7 +24,7 @@ from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_rec
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CANConnection, CanConnection, closed_here
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Desync, FieldtwinError, Unreachable, UsageError
+from gateway.core.errors import ConnectionLost, Desync, FieldtwinError, Unreachable, UsageError, os_reason
 from gateway.wallclock import WallClock
 
 OPEN_TIMEOUT_S = 5.0
@@ -371,9 +371,7 @@ def _frame_of(msg: can.Message) -> CanFrame:
 
 
 def _nobody(error: OSError, where: str) -> Unreachable:
-    return Unreachable(
-        f"no software CAN bus: {error.strerror or error}", where=where, hint="start one: fieldtwin can-bus"
-    )
+    return Unreachable(f"no software CAN bus: {os_reason(error)}", where=where, hint="start one: fieldtwin can-bus")
 
 
 def _loop_ns(loop: asyncio.AbstractEventLoop) -> int:

@@ -59,26 +59,28 @@ class TcpConnection(ByteConnection):
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(timeout_s):
-                addresses = await resolve(self.endpoint, socket.SOCK_STREAM)
-                for n, address in enumerate(addresses, start=1):
+                refused: list[OSError] = []
+                for address in await resolve(self.endpoint, socket.SOCK_STREAM):
                     try:
                         await loop.create_connection(
                             lambda: self._wire, address, self.endpoint.port, ssl=tls, server_hostname=name
                         )
                         return
                     except OSError as e:
-                        if n == len(addresses):
-                            raise self._cannot_open(e) from e
+                        refused.append(e)
         except TimeoutError as e:
             raise Unreachable(f"no answer within {timeout_s:g} s", where=where) from e
-        raise Unreachable("the name has no address", where=where)
+        raise self._cannot_open(refused)
 
-    def _cannot_open(self, error: OSError) -> Unreachable:
+    def _cannot_open(self, errors: list[OSError]) -> Unreachable:
+        """What each address of the name said; a host without IPv6 says little of ::1, and 127.0.0.1 is the one that counts."""
         where = str(self.endpoint)
-        if isinstance(error, ConnectionRefusedError):
+        if not errors:
+            return Unreachable("the name has no address", where=where)
+        if any(isinstance(error, ConnectionRefusedError) for error in errors):
             hint = f"the host answers and has no program on port {self.endpoint.port}"
             return Unreachable("connection refused", where=where, hint=hint)
-        return Unreachable(f"cannot connect: {error.strerror or error}", where=where)
+        return Unreachable(f"cannot connect: {errors[-1].strerror or errors[-1]}", where=where)
 
     async def write(self, data: bytes) -> None:
         """Hand `data` to the network, waiting while `WRITE_HIGH_WATER` bytes are unsent. Raises `ConnectionLost`."""

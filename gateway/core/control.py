@@ -17,7 +17,16 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from gateway.core.errors import Bug, ConnectionLost, EndpointBusy, FieldtwinError, ReplyTimeout, Unreachable, UsageError
+from gateway.core.errors import (
+    Bug,
+    ConnectionLost,
+    EndpointBusy,
+    FieldtwinError,
+    ReplyTimeout,
+    Unreachable,
+    UsageError,
+    os_reason,
+)
 
 VERSION = 1
 MAX_LINE = 4 * 1024 * 1024
@@ -194,7 +203,7 @@ class ControlClient:
         try:
             reader, writer = await asyncio.open_connection(host, port, limit=MAX_LINE)
         except OSError as e:
-            raise Unreachable(f"no control channel: {e.strerror or e}", where=f"{host}:{port}") from e
+            raise Unreachable(f"no control channel: {os_reason(e)}", where=f"{host}:{port}") from e
         return cls(reader, writer, f"{host}:{port}", token)
 
     async def call(self, verb: str, timeout_s: float = 5.0, **args: Any) -> Any:

@@ -9,6 +9,9 @@ The class decides the exit code of the command line (DESIGN.md, command line con
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 from enum import Enum
 from typing import ClassVar
 
@@ -206,3 +209,25 @@ class VerifyFailed(DeviceRefused):
 
 class WrongDevice(DeviceRefused):
     """The device that answers is not the one that the system file expects; writes to it are blocked."""
+
+
+# -- what the system says -----------------------------------------------------------------------------------------
+
+_NUMBER = re.compile(r"\[Errno (\d+)\]")
+_SAYS_LITTLE = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
+"""What a host without IPv6 says of the address ::1 that ``localhost`` has too."""
+
+
+def os_reason(error: OSError) -> str:
+    """Why the system refused, in its own words and in one phrase, without addresses and numbers.
+
+    asyncio tries each address of a name and lists all that failed in one text: the one counts that somebody was asked at.
+    """
+    numbers = [error.errno] if error.errno is not None else [int(n) for n in _NUMBER.findall(str(error))]
+    if not numbers or numbers[0] < 0:  # getaddrinfo counts below zero and has words of its own
+        silent = "no answer" if isinstance(error, TimeoutError) else type(error).__name__
+        return error.strerror or str(error) or silent
+    telling = [n for n in numbers if n not in _SAYS_LITTLE]
+    if errno.ECONNREFUSED in telling:
+        return os.strerror(errno.ECONNREFUSED)
+    return os.strerror((telling or numbers)[0])

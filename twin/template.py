@@ -182,21 +182,29 @@ class Document:
 
 
 class BluePrint(Document):
+    """How something is built: a drawing, a wiring plan."""
+
     __slots__ = ()
     kind = "blueprint"
 
 
 class TechnicalManual(Document):
+    """What a maker says of a device."""
+
     __slots__ = ()
     kind = "technical-manual"
 
 
 class BillOfMaterials(Document):
+    """What the physical twin is made of."""
+
     __slots__ = ()
     kind = "bill-of-materials"
 
 
 class Generic(Document):
+    """Any other document."""
+
     __slots__ = ()
     kind = "generic"
 

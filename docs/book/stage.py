@@ -20,6 +20,7 @@ if str(Path(__file__).parent) not in sys.path:
 
 from cli_page import cli_page  # noqa: E402
 from form_pages import form_pages  # noqa: E402
+from paper_page import paper_page  # noqa: E402
 
 PAPERS = {  # file of the repository: page of the book
     "README.md": "readme.md",
@@ -30,7 +31,10 @@ PAPERS = {  # file of the repository: page of the book
 }
 FOLDERS = {"examples": "tutorials/examples.md", "docs/decisions": "decisions/README.md", "docs": "index.md"}
 LISTS = {"decisions/README.md": "\n```{toctree}\n:hidden:\n:glob:\n\n0*\n```\n"}
-GENERATED = ("reference/cli.md", "reference/forms.md", "reference/faults.md", "reference/profiles.md")
+GENERATED = (
+    *("reference/cli.md", "reference/forms.md", "reference/faults.md", "reference/profiles.md"),
+    "reference/paper.md",
+)
 
 _LINK = re.compile(r"(\]\()([^)\s#]+)(#[^)\s]*)?(\))")
 _FENCE = re.compile(r"^(```+|~~~+)")
@@ -91,7 +95,7 @@ def _target(link: str, source: str, number: int, book: dict[str, str], beside: d
 
 def generated() -> dict[str, str]:
     """Reference pages that are made from the program itself."""
-    return {"reference/cli.md": cli_page(), **form_pages()}
+    return {"reference/cli.md": cli_page(), **form_pages(), "reference/paper.md": paper_page()}
 
 
 def stage(target: Path) -> None:

@@ -180,7 +180,7 @@ def _end_wait(waiter: asyncio.Future[None]) -> None:
 class ByteConnection(_End[bytes], ABC):
     """One end of a byte stream (serial line or socket). One reader at a time.
 
-    `feed`ed chunks are as the medium delivered them: chunk borders mean nothing to a protocol.
+    Chunks given to `feed` are as the medium delivered them: their borders mean nothing to a protocol.
     """
 
     def __init__(self, inbound: Connection[bytes], endpoint: Endpoint, max_pending: int = 1024) -> None:

@@ -12,7 +12,11 @@ from page_runner import ROOT
 
 sys.path.insert(0, str(ROOT / "docs" / "book"))
 
+import form_pages
+import paper_page
 import stage as book
+
+from fieldtwin.cli.schema_command import SCHEMAS
 
 
 def test_links_between_files_lead_somewhere():
@@ -37,6 +41,26 @@ def test_every_page_stands_in_the_contents():
     listed = set(re.findall(r"^[\w/.-]+$", (ROOT / "docs" / "index.md").read_text("utf-8"), re.MULTILINE))
     pages = {page.removesuffix(".md") for page in [*book.pages().values(), *book.GENERATED]}
     assert {page for page in pages if not page.startswith("decisions/0")} - {"index"} == listed
+
+
+def test_every_schema_of_the_paper_has_classes_that_there_are():
+    rows = paper_page.rows(paper_page.PAPER.read_text("utf-8"))
+    schemas = {name.strip() for row in rows for name in row.schemas.split(",")}
+    documents = {"Document", "BluePrint", "TechnicalManual", "BillOfMaterials", "Generic"}
+    concepts = {"PhysicalTwin", "DigitalModel", "DigitalTemplate", "DigitalThread", "DigitalShadow", "DigitalTwin"}
+    assert schemas >= {*documents, *concepts, "DigitalTwinPrototype"}
+    assert all(row.classes for row in rows)
+
+
+def test_a_class_that_there_is_not_is_named():
+    with pytest.raises(paper_page.NoSuchClass, match="no class Twin in twin"):
+        paper_page.rows("## Schemas and classes\n| schema | class | where |\n| DigitalTwin | `Twin` | `twin.twin` |\n")
+
+
+def test_every_kind_of_file_and_every_fault_is_in_the_reference():
+    assert set(form_pages.KINDS) == set(SCHEMAS)
+    faults = form_pages.form_pages()["reference/faults.md"]
+    assert all(f"`{name}`" in faults for name in form_pages.FAULTS)
 
 
 @pytest.mark.long

@@ -70,17 +70,18 @@ class TcpConnection(ByteConnection):
                         refused.append(e)
         except TimeoutError as e:
             raise Unreachable(f"no answer within {timeout_s:g} s", where=where) from e
-        raise self._cannot_open(refused)
+        if not refused:
+            raise Unreachable("the name has no address", where=where)
+        # A host without IPv6 says little of ::1, which localhost is too; 127.0.0.1 is the one that counts.
+        telling = next((e for e in refused if isinstance(e, ConnectionRefusedError)), refused[-1])
+        raise self._cannot_open(telling) from telling
 
-    def _cannot_open(self, errors: list[OSError]) -> Unreachable:
-        """What each address of the name said; a host without IPv6 says little of ::1, and 127.0.0.1 is the one that counts."""
+    def _cannot_open(self, error: OSError) -> Unreachable:
         where = str(self.endpoint)
-        if not errors:
-            return Unreachable("the name has no address", where=where)
-        if any(isinstance(error, ConnectionRefusedError) for error in errors):
+        if isinstance(error, ConnectionRefusedError):
             hint = f"the host answers and has no program on port {self.endpoint.port}"
             return Unreachable("connection refused", where=where, hint=hint)
-        return Unreachable(f"cannot connect: {errors[-1].strerror or errors[-1]}", where=where)
+        return Unreachable(f"cannot connect: {error.strerror or error}", where=where)
 
     async def write(self, data: bytes) -> None:
         """Hand `data` to the network, waiting while `WRITE_HIGH_WATER` bytes are unsent. Raises `ConnectionLost`."""

@@ -20,8 +20,9 @@ from peers import Goals
 from virtual_run import CASES, faster, system
 
 from fieldtwin.whatif.fork import Fork, answer
+from fieldtwin.whatif.last_known import of_period
 from fieldtwin.whatif.plan import Plan
-from fieldtwin.whatif.state import KnownState, of_period
+from fieldtwin.whatif.state import KnownState
 
 HORIZON_S = 6 * 3600.0
 GOAL_S = 25.0

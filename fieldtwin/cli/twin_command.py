@@ -10,17 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.shadow_command import ShadowTalk, print_shadow
 from fieldtwin.cli.talk import talk
-from fieldtwin.running.twin_rules import load_planner
+from fieldtwin.running.twin_rules import PythonPlanner, load_planner, questions_of
 from fieldtwin.running.twinning import Twinning
-from gateway.core.errors import Unreachable
+from fieldtwin.whatif.asking import Asking, Subject
+from gateway.core.errors import Unreachable, UsageError
 from gateway.core.statemachine import decode_period, encode_period
 from gateway.core.values import COMMAND
+from gateway.wallclock import WallClock
 from twin.instance import Instance
 from twin.mape.plan import RulePlanner
+from twin.mape.what_if import Question
 from twin.system import System, load_system
 
 
@@ -31,6 +35,20 @@ from twin.system import System, load_system
 )
 @click.option("--plan", "planner", default="", metavar="FILE", help='Rules (YAML), or "python: module:Class".')
 @click.option("--command", "periods", multiple=True, type=int, metavar="SECONDS", help="A period to plan at the start.")
+@click.option(
+    "--what-if",
+    "horizon_s",
+    type=Duration(),
+    default=0.0,
+    metavar="TIME",
+    help="Ask a prototype what comes of a command so far ahead, such as 30min, before it is sent.",
+)
+@click.option("--require", multiple=True, metavar="EXPRESSION", help="With --what-if: what must hold all the time.")
+@click.option("--finally", "finally_", multiple=True, metavar="EXPRESSION", help="With --what-if: and at the end.")
+@click.option(
+    "--what-if-timeout", "timeout_s", type=Duration(), default="60s", show_default=True, help="No answer then is a no."
+)
+@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="What is asked.")
 @click.option(
     "--store", default="", metavar="FILE|URL", help="What keeps the knowledge; default: in the run directory."
 )
@@ -45,6 +63,11 @@ def command(
     place: str,
     planner: str,
     periods: tuple[int, ...],
+    horizon_s: float,
+    require: tuple[str, ...],
+    finally_: tuple[str, ...],
+    timeout_s: float,
+    prototype_file: Path | None,
     store: str,
     duration_s: float,
     instance: str,
@@ -53,35 +76,81 @@ def command(
 ) -> int:
     """Twin SYSTEM: as `fieldtwin shadow`, and command the plant by rules over what is found.
 
-    Each command is held against the digital model and the limits in the system file first; only what they accept is sent.
+    Each command is held against the digital model and the limits in the system file first; with --what-if, or where the rules say
+    so, against a prototype that begins with what the twin knows and does as commanded. Only what they accept is sent.
     The plant obeys while its own switch says `remote`, inside the limits and the rate in its own file, and no number twice.
     """
-    loaded = load_system(system, tuple(Path(p) for p in profiles))
-    chosen = load_planner(planner, loaded) if planner else RulePlanner(())
+    folders = tuple(Path(p) for p in profiles)
+    loaded = load_system(system, folders)
+    chosen, of_rules = load_planner(planner, loaded) if planner else (RulePlanner(()), None)
+    question = _question(horizon_s, require, finally_) or of_rules
+    questions = [*([question] if question else []), *questions_of(chosen)]
     with Instance(instance or f"{loaded.name}-twin") as here:
         plans = [encode_period(period) for period in periods]
-        talks = ShadowTalk(quiet=as_json)
-
-        def sent(command: COMMAND) -> None:
-            if not as_json:
-                talk.print(f"             command    period {decode_period(command)} s")
-
-        twinning = Twinning(loaded, place, here, store=store, on_verdict=talks, on_command=sent, planner=chosen)
+        talks = TwinTalk(quiet=as_json)
+        subject = Subject(loaded, folders, prototype_file)
+        asking = (
+            Asking(subject, WallClock(), timeout_s, talks.asks)
+            if questions or isinstance(chosen, PythonPlanner)
+            else None
+        )
+        twinning = Twinning(
+            loaded, place, here, store=store, on_verdict=talks, on_command=talks.sent, on_refusal=talks.refused,
+            planner=chosen, asking=asking, question=question,
+        )  # fmt: skip
         for plan in plans:
             twinning.plan(plan)
-        seen = asyncio.run(_run(loaded, place, twinning, duration_s, as_json))
+        seen = asyncio.run(_run(loaded, place, twinning, duration_s, as_json, asking, questions))
     if as_json:
         json.dump(seen, sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
         print_shadow(seen)
-        talk.print(f"  commands   {seen['planned']} planned, {seen['sent']} sent, {seen['refused']} refused")
+        asked = f", {seen['asked']} asked of a prototype" if questions else ""
+        talk.print(f"  commands   {seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused")
     if not seen["origins"]:
         raise Unreachable(f"the plant's thread: {seen['thread'].get('trouble') or 'nothing came'}", where=place)
     return 0 if seen["agreed"] == seen["statuses"] else 1
 
 
-async def _run(system: System, place: str, twinning: Twinning, duration_s: float, as_json: bool) -> dict[str, Any]:
+class TwinTalk(ShadowTalk):
+    """Says as well what is asked, sent and refused."""
+
+    def asks(self, command: COMMAND, question: Question) -> None:
+        self._say("asks", f"a prototype of period {decode_period(command)} s, {question.horizon_s:g} s ahead")
+
+    def sent(self, command: COMMAND) -> None:
+        self._say("command", f"period {decode_period(command)} s")
+
+    def refused(self, why: str) -> None:
+        self._say("refused", why)
+
+    def _say(self, word: str, text: str) -> None:
+        if not self._quiet:
+            talk.print(f"             {word:10} {escape(text)}", soft_wrap=True)
+
+
+def _question(horizon_s: float, require: tuple[str, ...], finally_: tuple[str, ...]) -> Question | None:
+    if not horizon_s and not require and not finally_:
+        return None
+    if not horizon_s or not (require or finally_):
+        raise UsageError(
+            "half a question", expected="--what-if TIME, and what must hold: --require or --finally EXPRESSION"
+        )
+    return Question(horizon_s, require, finally_)
+
+
+async def _run(
+    system: System,
+    place: str,
+    twinning: Twinning,
+    duration_s: float,
+    as_json: bool,
+    asking: Asking | None,
+    questions: list[Question],
+) -> dict[str, Any]:
+    if asking is not None:
+        await asking.check(questions)
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)

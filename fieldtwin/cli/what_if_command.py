@@ -104,7 +104,8 @@ def command(
 
 
 def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> KnownState:
-    from fieldtwin.whatif.state import known_state, of_instance, read_state
+    from fieldtwin.whatif.known import known_state
+    from fieldtwin.whatif.state import of_instance, read_state
     from twin.system import load_system
 
     loaded = load_system(system, folders)

@@ -99,6 +99,7 @@ class Shadowing:
                     nursery.start(self._end.run(), "thread")
                     nursery.start(writer.run(), "knowledge")
                     nursery.start(self._work(writer), "shadow")
+                    await self._beside(nursery, store)
                     ended = nursery.start(stop.wait(), "until stopped")
                     waiting = asyncio.ensure_future(nursery.wait())
                     await asyncio.wait([ended, waiting], timeout=for_s or None, return_when=asyncio.FIRST_COMPLETED)
@@ -107,6 +108,8 @@ class Shadowing:
                     waiting.cancel()
             finally:
                 self._step(writer)
+                self._give_up()
+                self._share(writer)
                 await writer.flush()
                 await self._flush()
                 kinds = await store.origins()
@@ -126,6 +129,12 @@ class Shadowing:
         self.origins.add(origin)
         await to_receivers(self.receiving)(origin, events)
 
+    async def _beside(self, nursery: Nursery, store: KnowledgeStore) -> None:
+        """What else works as long as the shadow does: nothing."""
+
+    def _give_up(self) -> None:
+        """The end: what is still under way is not waited for. A shadow has nothing of the kind."""
+
     async def _flush(self) -> None:
         """Nothing more comes: what is left to be written, beside the knowledge."""
         return
@@ -138,11 +147,18 @@ class Shadowing:
 
     def _step(self, writer: KnowledgeWriter) -> None:
         self.shadow.step()
-        for process in self.shadow.processes:
-            for event in process.collect():
-                writer.observe(event)
+        self._share(writer)
         for verdict in self.shadow.verdicts.drain():
             self._on_verdict(verdict)
+
+    def _share(self, writer: KnowledgeWriter) -> None:
+        for process in self.shadow.processes:
+            for event in process.collect():
+                self._kept(event)
+                writer.observe(event)
+
+    def _kept(self, event: Event) -> None:
+        """This is knowledge of our own, and is about to be kept."""
 
     def describe(self) -> dict[str, Any]:
         """What the shadow knows, and how its thread is."""

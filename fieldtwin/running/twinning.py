@@ -1,20 +1,26 @@
-"""A digital twin at work: the shadow, and the way back. Its commands are a log that the thread brings to the plant."""
+"""A digital twin at work: the shadow, and the way back. Its commands are a log that the thread brings to the plant.
+
+Where it was told to, it asks a prototype first, in a process beside it (`fieldtwin.whatif.asking`).
+"""
 
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing, limits_of
+from fieldtwin.whatif.asking import Asking
 from gateway.core.events import Consumer
+from gateway.core.nursery import Nursery
 from gateway.core.values import COMMAND
-from gateway.store.event import KnowledgeStore
+from gateway.store.event import Event, Kind, KnowledgeStore
 from twin.instance import Instance
 from twin.knowledge import KnowledgeWriter
 from twin.mape.execute import Bounds
 from twin.mape.messages import Verdict
 from twin.mape.plan import Planner
+from twin.mape.what_if import Question
 from twin.system import System
 from twin.thread import DTtoPTConnection, Operator, schema_of
 from twin.thread_end import ThreadEnd
@@ -23,7 +29,10 @@ from twin.twin import DigitalTwin
 
 
 class Twinning(Shadowing):
-    """As `Shadowing`, with a planner. `on_command` is told each command that is sent."""
+    """As `Shadowing`, with a planner. `on_command` is told each command that is sent, `on_refusal` why one is not.
+
+    With `asking` a prototype is asked `question` before each command, or what the planner says of it.
+    """
 
     kind = "twin"
     shadow: DigitalTwin
@@ -37,11 +46,17 @@ class Twinning(Shadowing):
         store: str = "",
         on_verdict: Callable[[Verdict], None],
         on_command: Callable[[COMMAND], None],
+        on_refusal: Callable[[str], None] = lambda why: None,
         planner: Planner,
+        asking: Asking | None = None,
+        question: Question | None = None,
     ) -> None:
         self._planner = planner
+        self._asking = asking
+        self._question = question
         super().__init__(system, place, instance, store=store, on_verdict=on_verdict)
         self._on_command = on_command
+        self._on_refusal = on_refusal
         self._operator = Operator("twin", self.clock)
         self._sent: Consumer[COMMAND] = Consumer(self.shadow.execute.transmitter.event)
         self.shadow.execute.transmitter.subscribe(self._sent)
@@ -53,6 +68,7 @@ class Twinning(Shadowing):
         return DigitalTwin(
             self.receiving, self.clock, self._planner,
             limits=limits_of(system), bounds=Bounds(least_s, most_s, system.commands.per_minute), stale_after_ms=STALE_AFTER_MS,
+            what_if=self._asking, question=self._question,
         )  # fmt: skip
 
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
@@ -66,6 +82,23 @@ class Twinning(Shadowing):
     def plan(self, command: COMMAND) -> None:
         """Somebody's plan, by hand: it goes the way of every other."""
         self.shadow.execute.plans.observe(command)
+
+    async def _arrived(self, origin: str, events: Sequence[Event]) -> None:
+        if self._asking is not None:
+            self._asking.known.take(events)
+        await super()._arrived(origin, events)
+
+    async def _beside(self, nursery: Nursery, store: KnowledgeStore) -> None:
+        if self._asking is not None:
+            await self._asking.recall(store, list(await store.origins()))
+            nursery.start(self._asking.run(), "what if")
+
+    def _give_up(self) -> None:
+        self.shadow.execute.give_up("the twin ended before a prototype had answered")
+
+    def _kept(self, event: Event) -> None:
+        if event.kind == Kind.REFUSAL:
+            self._on_refusal(str(event.value))
 
     async def _flush(self) -> None:
         for command in self._sent.drain():

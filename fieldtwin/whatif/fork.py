@@ -54,14 +54,24 @@ class Fork:
 def answer(fork: Fork, plan: Plan) -> Outcome:
     """Run `plan` in a fork. What fails in it is in the outcome's `error`; raises `FileInvalid` or `UsageError` for what cannot be
     begun at all."""
-    if not 0 < fork.horizon_s <= MAX_HORIZON_S:
-        raise UsageError("the horizon", expected="over 0 s to 30 days", got=f"{fork.horizon_s:g} s")
+    _check_horizon(fork)
     run = _ForkRun(fork, plan)
     clock = WallClock()
     began_ns = clock.monotonic_ns()
     run.run()
     run.outcome.took_s = (clock.monotonic_ns() - began_ns) / NS_PER_S
     return run.outcome
+
+
+def check(fork: Fork, plan: Plan) -> None:
+    """Whether a fork can be begun and what the plan requires can be looked at; nothing is run. Raises as `answer`."""
+    _check_horizon(fork)
+    _ForkRun(fork, plan)
+
+
+def _check_horizon(fork: Fork) -> None:
+    if not 0 < fork.horizon_s <= MAX_HORIZON_S:
+        raise UsageError("the horizon", expected="over 0 s to 30 days", got=f"{fork.horizon_s:g} s")
 
 
 class _ForkRun:

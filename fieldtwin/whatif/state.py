@@ -1,6 +1,6 @@
 """What is known of a system at one instant: the values of its devices, and the variables of its programs.
 
-Read from a file, from a knowledge store (SQLite file or PostgreSQL), or from an instance that runs. What was not good is not
+Read from a file or from an instance that runs; from a knowledge store by `fieldtwin.whatif.known`. What was not good is not
 known. It must never know how a fork is begun with it.
 """
 
@@ -16,12 +16,7 @@ from typing import Any
 import msgspec
 
 from gateway.core.control import ControlClient
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.statemachine import STATES, encode_period
-from gateway.core.values import Quality
-from gateway.store.event import Kind
-from gateway.store.knowledge import open_knowledge
-from twin.model import DigitalModel
+from gateway.core.errors import FileInvalid
 from twin.system import System
 
 VERSION = 1
@@ -86,49 +81,6 @@ def read_state(path: Path, system: System) -> KnownState:
             expected = ", ".join(system.plc.programs)
             raise FileInvalid(f"the system has no program {program!r}", path=str(path), expected=expected)
     return KnownState(form.values, form.programs, form.utc_ms, str(path))
-
-
-async def known_state(place: str, system: System, origin: str = "") -> KnownState:
-    """The last that a knowledge store knows of an origin; without a name, of its only one. Raises `FileInvalid` or
-    `UsageError`. Nothing older is used where the last value of a tag was bad.
-    """
-    store = await open_knowledge(place)
-    try:
-        origins = list(await store.origins())
-        if not origin and len(origins) != 1:
-            raise UsageError(
-                "which origin of the knowledge?", expected=", ".join(origins) or "one with events", got="none"
-            )
-        name = origin or origins[0]
-        if name not in origins:
-            raise UsageError(f"nothing is known of {name!r}", expected=", ".join(origins) or "an origin with events")
-        values: dict[str, Number] = {}
-        programs: dict[str, Mapping[str, Number]] = {}
-        latest_ms = 0
-        async for events in store.replay(name, 0, 1 << 62):
-            for event in events:
-                if event.kind == Kind.VALUE:
-                    latest_ms = max(latest_ms, event.t_ms)
-                    if event.quality >= Quality.BAD or event.value is None or isinstance(event.value, bytes):
-                        values.pop(event.name, None)
-                    else:
-                        values[event.name] = event.value
-                elif event.kind == Kind.STATE and isinstance(event.value, int):
-                    latest_ms = max(latest_ms, event.t_ms)
-                    programs[event.name.partition(".")[0]] = of_period(event.value)
-        known = {n: v for n, v in values.items() if n.partition(".")[0] in system.devices}
-        return KnownState(
-            known, {p: v for p, v in programs.items() if p in system.plc.programs}, latest_ms, f"{place}: {name}"
-        )
-    finally:
-        await store.aclose()
-
-
-def of_period(period_s: int) -> dict[str, Number]:
-    """The variables of a program with the reference state machine, after a command of `period_s`."""
-    model = DigitalModel()
-    state = model.process_event(encode_period(period_s))
-    return {"period": period_s, "period_s": period_s, "state": list(STATES).index(state.name)}
 
 
 async def of_instance(run_dir: Path) -> KnownState:

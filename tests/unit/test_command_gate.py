@@ -124,7 +124,7 @@ def test_a_system_file_says_what_may_be_commanded(tmp_path: Path) -> None:
 def test_rules_are_read_and_the_first_that_fits_decides(tmp_path: Path) -> None:
     rules = tmp_path / "rules.yaml"
     rules.write_text("rules:\n  - {when: outside, of: ctd.pressure, period_s: 1}\n  - {when: stale, period_s: 0}\n")
-    planner, model = load_planner(str(rules), load_system(str(OBSERVATORY))), DigitalModel()
+    (planner, _), model = load_planner(str(rules), load_system(str(OBSERVATORY))), DigitalModel()
     command = planner.plan(verdict("outside", "ctd.pressure", "", 0), model)
     assert command is not None
     assert decode_period(command) == 1

@@ -13,14 +13,17 @@ from support import run
 from fieldtwin.cli.what_if_command import command
 from fieldtwin.running.shore import Scripted
 from fieldtwin.whatif.fork import Fork, answer
+from fieldtwin.whatif.known import known_state
+from fieldtwin.whatif.last_known import of_period
 from fieldtwin.whatif.many import answers
 from fieldtwin.whatif.plan import Plan, load_plans
 from fieldtwin.whatif.plan import command as parsed
-from fieldtwin.whatif.state import KnownState, known_state, of_period, read_state
+from fieldtwin.whatif.state import KnownState, read_state
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.values import Quality, Reason
 from gateway.store.event import Event, Kind
 from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from twin.status import encode_status
 from twin.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -128,7 +131,8 @@ def test_the_last_that_a_store_knows(tmp_path: Path) -> None:
                     Event(0, 1000, Kind.VALUE, "ctd.pressure", 100.0, Quality.GOOD, 0),
                     Event(0, 2000, Kind.VALUE, "ctd.pressure", 101.5, Quality.GOOD, 0),
                     Event(0, 2000, Kind.VALUE, "ctd.temperature", 8.0, Quality.GOOD, 0),
-                    Event(0, 2500, Kind.STATE, "relay", 2),
+                    Event(0, 2500, Kind.STATE, "relay", encode_status("ACTIVE", 2).data),
+                    Event(0, 2600, Kind.STATE, "relay", b"none"),
                     Event(0, 3000, Kind.VALUE, "ctd.temperature", None, Quality.BAD, Reason.TIMEOUT),
                 ],
             )

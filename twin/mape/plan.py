@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.errors import FieldtwinError
 from gateway.core.events import Consumer, Producer
 from gateway.core.statemachine import encode_period
 from gateway.core.values import COMMAND, DATA
+from gateway.store.event import Kind
 from twin.mape.messages import Verdict
 from twin.mape.what_if import PlannedCommand, Question
 from twin.model import DigitalModel
@@ -34,7 +36,7 @@ _ABOUT = {
 
 
 class Planner(Protocol):
-    """Planning: DATA to COMMAND. None: there is nothing to do about it."""
+    """Planning: DATA to COMMAND; None: there is nothing to do about it. A `FieldtwinError` it raises is kept as a refusal."""
 
     def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None: ...
 
@@ -86,7 +88,7 @@ class Plan(DTDigitalThreadProcess):
         self.consumer: Consumer[Verdict] = Consumer("analyzed", CAPACITY)
         self.emitter: Producer[COMMAND] = Producer("planned")
         self.digital_model = model
-        self.planned = self.too_old = self.overtaken = 0
+        self.planned = self.too_old = self.overtaken = self.failed = 0
         self._planner = planner
         self._waiting: deque[Verdict] = deque()
 
@@ -112,7 +114,12 @@ class Plan(DTDigitalThreadProcess):
         """Plan because of the first finding that waits. False: none does."""
         if not self._waiting:
             return False
-        command = self._planner.plan(self._waiting.popleft(), self.digital_model)
+        try:
+            command = self._planner.plan(self._waiting.popleft(), self.digital_model)
+        except FieldtwinError as e:
+            self.failed += 1
+            self.share(Kind.REFUSAL, self.name, str(e))
+            return True
         if command is not None:
             self.planned += 1
             self.emitter.emit(command)

@@ -1,0 +1,165 @@
+"""Asks a prototype on behalf of a digital twin: a process for each question, bounded in time, beside the twin that goes on.
+
+No answer is an objection: a prototype that fails, that takes too long or that nobody can fork lets no command through.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from fieldtwin.whatif.last_known import LastKnown
+from fieldtwin.whatif.state import Number
+from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from gateway.core.errors import Bug, FieldtwinError, Unreachable, UsageError
+from gateway.core.statemachine import decode_period
+from gateway.core.values import COMMAND
+from gateway.store.event import KnowledgeStore
+from twin.child import command as child_command
+from twin.mape.what_if import Question
+from twin.system import System
+
+TIMEOUT_S = 60.0
+TOLD_WITHIN_S = 12.0
+"""So long after its beginning a twin knows of everything: a plant tells every ten seconds what does not change."""
+LOOK_MS = 100
+MAX_ANSWER = 1 << 20
+
+
+class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A question as it goes to the process `fieldtwin.whatif.asked`.
+
+    `require`, `finally_`, `horizon_s` and `settle_s` as in `twin.mape.what_if.Question`.
+    """
+
+    system: str
+    horizon_s: float
+    require: tuple[str, ...]
+    finally_: tuple[str, ...]
+    settle_s: float
+    profiles: tuple[str, ...] = ()
+    prototype_file: str = ""
+    period_s: int = 0
+    values: dict[str, Number] = {}
+    programs: dict[str, dict[str, Number]] = {}
+    only_check: bool = False
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is forked: the system that the twin has, and where its prototype is described."""
+
+    system: System
+    profiles: tuple[Path, ...] = ()
+    prototype_file: Path | None = None
+
+
+class Asking:
+    """A `WhatIf`. `run` belongs to the twin's nursery; `known` is kept up by whoever sees the events."""
+
+    def __init__(
+        self,
+        subject: Subject,
+        clock: Clock,
+        timeout_s: float = TIMEOUT_S,
+        on_ask: Callable[[COMMAND, Question], None] = lambda command, question: None,
+    ) -> None:
+        self.known = LastKnown(subject.system)
+        self._subject = subject
+        self._clock = clock
+        self._timeout_s = timeout_s
+        self._on_ask = on_ask
+        self._began_ns: int | None = None
+        self._asked: tuple[COMMAND, Question] | None = None
+        self._answer: str | None = None
+        self._wake = asyncio.Event()
+
+    def ask(self, command: COMMAND, question: Question) -> None:
+        if self._asked is not None:
+            raise Bug("a question while another one is asked")
+        self._asked, self._answer = (command, question), None
+        self._wake.set()
+
+    def answer(self) -> str | None:
+        return self._answer
+
+    async def recall(self, store: KnowledgeStore, origins: Sequence[str]) -> None:
+        """Begin with what the twin knew before it was restarted."""
+        from fieldtwin.whatif.known import recall
+
+        for origin in origins:
+            await recall(store, origin, self.known)
+
+    async def check(self, questions: Sequence[Question]) -> None:
+        """Whether the prototype can be made and what is required can be looked at. Raises `UsageError`."""
+        for question in questions:
+            found = await self._process(self._form(question, only_check=True))
+            if found:
+                raise UsageError(f"a prototype of {self._subject.system.name} cannot be asked: {found}")
+
+    async def run(self) -> None:
+        """Answer questions, for good."""
+        self._began_ns = self._clock.monotonic_ns()
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            if self._asked is not None:
+                command, question = self._asked
+                self._on_ask(command, question)
+                self._answer = await self._find_out(command, question)
+                self._asked = None
+
+    async def _find_out(self, command: COMMAND, question: Question) -> str:
+        assert self._began_ns is not None
+        enough_ns = self._began_ns + round(TOLD_WITHIN_S * NS_PER_S)
+        while self.known.unknown and self._clock.monotonic_ns() < enough_ns:
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_MS * NS_PER_MS)
+        if not self.known.utc_ms:
+            return "a prototype was to be asked, and nothing is known of the plant to begin with"
+        try:
+            found = await self._process(self._form(question, command))
+        except FieldtwinError as e:
+            found = str(e)
+        return f"a prototype was asked: {found}" if found else ""
+
+    def _form(self, question: Question, command: COMMAND | None = None, *, only_check: bool = False) -> Asked:
+        state = self.known.state("")
+        return Asked(
+            str(self._subject.system.path),
+            question.horizon_s,
+            question.require,
+            question.finally_,
+            question.settle_s,
+            tuple(str(p) for p in self._subject.profiles),
+            str(self._subject.prototype_file or ""),
+            decode_period(command) if command is not None else 0,
+            dict(state.values),
+            {name: dict(variables) for name, variables in state.programs.items()},
+            only_check,
+        )
+
+    async def _process(self, asked: Asked) -> str:
+        """The objection of a process of its own. Raises `Unreachable` when it took too long or died."""
+        process = await asyncio.create_subprocess_exec(
+            *child_command("fieldtwin.whatif.asked"),
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        try:
+            async with asyncio.timeout(self._timeout_s):
+                out, err = await process.communicate(msgspec.json.encode(asked))
+        except TimeoutError as e:
+            raise Unreachable(f"no answer within {self._timeout_s:g} s") from e
+        finally:
+            if process.returncode is None:
+                process.kill()
+                await process.wait()
+        try:
+            found = msgspec.json.decode(out[:MAX_ANSWER], type=dict[str, str])
+            return found["objection"]
+        except (msgspec.MsgspecError, KeyError) as e:
+            last = err.decode(errors="replace").strip().rpartition("\n")[2]
+            raise Unreachable(f"it ended with code {process.returncode}: {last or 'without a word'}") from e

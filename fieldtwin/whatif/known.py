@@ -1,0 +1,54 @@
+"""The last that a knowledge store knows of a plant: an SQLite file, or PostgreSQL."""
+
+from __future__ import annotations
+
+from fieldtwin.whatif.last_known import LastKnown
+from fieldtwin.whatif.state import KnownState
+from gateway.core.errors import UsageError
+from gateway.store.event import KnowledgeStore
+from gateway.store.knowledge import open_knowledge
+from twin.system import System
+
+RECENT = 100_000
+"""Events of the end of a log. A plant tells again every ten seconds what does not change, so the last minutes have everything."""
+BLOCK = 5_000
+
+
+async def known_state(place: str, system: System, origin: str = "") -> KnownState:
+    """The last that a knowledge store knows of an origin; without a name, of its only one that tells of tags or states.
+    Raises `FileInvalid` or `UsageError`. Nothing older is used where the last value of a tag was bad.
+    """
+    store = await open_knowledge(place)
+    try:
+        origins = list(await store.origins())
+        if origin and origin not in origins:
+            raise UsageError(f"nothing is known of {origin!r}", expected=", ".join(origins) or "an origin with events")
+        found = {}
+        for name in [origin] if origin else origins:
+            known = LastKnown(system)
+            await recall(store, name, known)
+            if known.utc_ms or origin:
+                found[name] = known
+        if len(found) != 1:
+            raise UsageError(
+                "which origin of the knowledge?",
+                expected=", ".join(found or origins) or "one with events",
+                got="none",
+                hint="--origin NAME" if found else "",
+            )
+        [(name, known)] = found.items()
+        return known.state(f"{place}: {name}")
+    finally:
+        await store.aclose()
+
+
+async def recall(store: KnowledgeStore, origin: str, known: LastKnown) -> None:
+    """Let `known` take the end of what a store has of an origin."""
+    first, last = await store.span(origin)
+    at = max(first, last - RECENT + 1)
+    while at <= last:
+        events = await store.read(origin, at, BLOCK)
+        if not events:
+            return
+        known.take(events)
+        at = events[-1].sequence + 1

@@ -10,6 +10,7 @@ Control verbs (gateway.core.control, on the configured Unix socket):
     force     {"tag": ..., "value": ..., "by": ...}: until `unforce` {"tag": ...}, or all with {"all": true}
     pause     execute nothing more, outputs stay; `go` goes on; `step` {"count": n} executes n scans while paused
     why       {"tag": ...}: which program last changed it, when, and what it saw
+    limits    {"tags": {name: [low, high] or null}}: other limits than those in the image's layout, after a reload
     restart   make the programs anew: {"cold": true} without what is retained
     stop      outputs safe, then the process ends
 
@@ -64,6 +65,7 @@ class PlcProcess:
                 "go": self._go,
                 "step": self._step,
                 "why": self._why,
+                "limits": self._limits,
                 "restart": self._restart,
             }
         )
@@ -184,12 +186,26 @@ class PlcProcess:
     async def _why(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"changes": self._runner.why(_text(args, "tag"))}
 
+    async def _limits(self, args: dict[str, Any]) -> dict[str, Any]:
+        tags = args.get("tags")
+        if not isinstance(tags, dict) or not all(limits is None or _is_pair(limits) for limits in tags.values()):
+            raise UsageError(
+                "limits of tags", expected='{"ctd.period": [0, 60]}, or null for none', got=repr(tags)[:80]
+            )
+        self._runner.limit({str(tag): tuple(limits) if limits else None for tag, limits in tags.items()})
+        return {"limited": len(tags)}
+
     async def _restart(self, args: dict[str, Any]) -> dict[str, Any]:
         cold = args.get("cold") is True
         self._note("restart", args, cold=cold)
         self._runner.restart(cold=cold)
         self._loop.call_soon(self._loop.stop)  # a wait that began while nothing ran is too long now
         return {"start": self._runner.retained.start}
+
+
+def _is_pair(limits: Any) -> bool:
+    numbers = isinstance(limits, list) and len(limits) == 2 and all(type(n) in (int, float) for n in limits)
+    return numbers and limits[0] <= limits[1]
 
 
 def _by(args: dict[str, Any]) -> str:

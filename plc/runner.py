@@ -10,8 +10,8 @@ Driven like a `CyclicTask`: by `deadline_ns` and `run_once`, on the wall clock o
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,7 @@ class Runner:
         self.programs: list[BoundProgram] = []
         self.outputs: OutputImage
         self.retained: Retained
+        self._limits: dict[str, tuple[float, float] | None] = {}
         self._on_change = on_change
         self._image = image
         self._now_ns = now_ns
@@ -262,6 +263,15 @@ class Runner:
         for entry in self.entries:
             entry.task.paused, entry.task.steps = on, 0
 
+    def limit(self, limits: Mapping[str, tuple[float, float] | None]) -> None:
+        """From now on these tags have other smallest and largest values than the image's layout says; None: none. Tags that
+        the image does not hold are passed over."""
+        self._limits |= limits
+
+    def as_limited(self, spec: TagSpec) -> TagSpec:
+        """`spec` with the limits that its tag has by now."""
+        return replace(spec, limits=self._limits[spec.name]) if spec.name in self._limits else spec
+
     def check_step(self) -> None:
         """Raises `UsageError` while it is not paused."""
         if not self.paused:
@@ -286,7 +296,7 @@ class Runner:
             for spec in region.tags:
                 if spec.name == tag:
                     if region.name != INPUTS:
-                        _inside(spec, value)
+                        _inside(self.as_limited(spec), value)
                     for program, name in self._variables_of(tag, region.name == INPUTS):
                         program.check(name, checked(spec, value))
                     if record is not None:

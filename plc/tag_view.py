@@ -50,14 +50,16 @@ class TagView:
         for name in names:
             row = {}
             if spec := self._specs[INPUTS].get(name):
-                row = _row(spec, runner.input(name), runner.forces.inputs.get(name), now_ns, utc_ns)
+                row = _row(runner.as_limited(spec), runner.input(name), runner.forces.inputs.get(name), now_ns, utc_ns)
                 seen = {
                     variable: {"value": as_seen.value, "quality": str(as_seen.quality)}
                     for variable, as_seen in runner.seen_otherwise(name).items()
                 }
                 rows.append({**row, "side": "input", "seen": seen})
             if spec := self._specs[OUTPUTS].get(name):
-                row = _row(spec, snapshot.value(name), runner.forces.outputs.get(name), now_ns, utc_ns)
+                row = _row(
+                    runner.as_limited(spec), snapshot.value(name), runner.forces.outputs.get(name), now_ns, utc_ns
+                )
                 rows.append({**row, "side": "output", "seen": {}})
             if not row:
                 raise UsageError(f"no tag {name!r} in the process image", expected="one that `image` lists")

@@ -1,7 +1,7 @@
 """The gateway's process: ``python -m twin.controller CONFIG.json``. The same for a plant and for its prototype.
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
-mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, command, stop.
+mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, command, reload, stop.
 """
 
 from __future__ import annotations
@@ -25,16 +25,19 @@ from gateway.core.nursery import Nursery
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.learnt import LearntFile, describe_learnt
+from gateway.runtime.reconfigure import reconfigure
 from gateway.runtime.status import describe
 from gateway.store.exchange_log import ExchangeLog
 from gateway.wallclock import WallClock, run
 from twin.mapping import MappedConnector, mapping_from_json
-from twin.physical import EmbeddedControlSystem, attached
-from twin.system import load_system
+from twin.physical import EmbeddedControlSystem, attached, gateway_config
+from twin.reloading import compare, limits_changed
+from twin.system import System, load_system
 from twin.watching import TagWatch
 
 FLUSH_EVERY_NS = NS_PER_S // 2
 MOST_COMMAND_BYTES = 64
+MOST_CHANGES_TOLD = 20
 PUBLISHED_AT_ONCE = 20_000
 """What a line of the control channel takes."""
 
@@ -48,6 +51,8 @@ class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mapping: dict[str, str] | None = None
     profiles: tuple[str, ...] = ()
     capture: str = ""
+    lent: tuple[str, ...] = ()
+    """Transmitters whose mailboxes belong to the digital thread."""
 
 
 class GatewayProcess:
@@ -58,10 +63,16 @@ class GatewayProcess:
         self._clock = WallClock()
         self._stop = asyncio.Event()
         self._store_error = ""
+        self._reloads = 0
+        self._changed: list[str] = []
+        self._reloading = asyncio.Lock()
+
+    def _load(self) -> System:
+        return load_system(self._config.system, [Path(p) for p in self._config.profiles])
 
     async def run(self) -> int:
         run_dir = Path(self._config.run_dir)
-        system = load_system(self._config.system, [Path(p) for p in self._config.profiles])
+        system = self._system = self._load()
         connector: Connector = OsConnector()
         if self._config.mapping is not None:
             connector = MappedConnector(connector, mapping_from_json(self._config.mapping))
@@ -71,7 +82,7 @@ class GatewayProcess:
 
             tap = TapFile(Path(self._config.capture))
             connector = TappedConnector(connector, [tap], self._clock)
-        audit = AuditLog(run_dir / "audit.jsonl", self._clock)
+        audit = self._audit = AuditLog(run_dir / "audit.jsonl", self._clock)
         log = ExchangeLog(run_dir / "store.sqlite", system=system.name, prototype=self._config.mapping is not None)
         try:
             ecs = EmbeddedControlSystem(system)
@@ -84,6 +95,7 @@ class GatewayProcess:
                     log,
                     allow_writes=self._config.allow_writes,
                     free_ports=self._config.mapping is not None,
+                    lent=self._config.lent,
                 )
                 # What emulators teach is no fact about the devices of a plant.
                 kept = "learnt.json" if self._config.mapping is None else "learnt.prototype.json"
@@ -107,6 +119,7 @@ class GatewayProcess:
                 "published": self._published,
                 "watch": self._watch,
                 "command": self._command,
+                "reload": self._reload,
                 "stop": self._request_stop,
             }
         )
@@ -152,6 +165,7 @@ class GatewayProcess:
             **describe(self._gateway, self._clock.monotonic_ns()),
             "learnt": describe_learnt(self._gateway.drivers.values()),
             "store_error": self._store_error,
+            "config": {"hash": self._system.hash, "reloads": self._reloads, "changed": self._changed},
         }
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
@@ -178,6 +192,30 @@ class GatewayProcess:
             raise UsageError("a command's payload", expected=f"1 to {MOST_COMMAND_BYTES} bytes", got=str(len(payload)))
         return {"taken": self._gateway.pumps[0].command(payload, str(args.get("by", "digital twin")))}
 
+    async def _reload(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Read the files again and take over what is otherwise in them: all of it, or nothing where some needs a restart.
+
+        With "check" nothing is taken over. Polls go on meanwhile. Raises `FileInvalid` for files that are not right; `limits` in
+        the answer are for the PLC.
+        """
+        async with self._reloading:
+            new = await asyncio.to_thread(self._load)
+            changes = await asyncio.to_thread(compare, self._system, new)
+            told = [{"where": c.where, "what": str(c), "live": c.live} for c in changes]
+            if args.get("check") is True or not all(c.live for c in changes):
+                return {"applied": False, "changes": told, "limits": {}, "hash": self._system.hash}
+            limits = await asyncio.to_thread(limits_changed, self._system, new)
+            if changes:
+                texts = [str(c) for c in changes]
+                self._audit.note("reload", new.name, by=str(args.get("by", ""))[:64], result="asked", changes=texts)
+                writes, free = self._config.allow_writes, self._config.mapping is not None
+                await reconfigure(
+                    self._gateway, gateway_config(new, allow_writes=writes, free_ports=free, lent=self._config.lent)
+                )
+                self._reloads, self._changed = self._reloads + 1, texts[:MOST_CHANGES_TOLD]
+            self._system = new
+            return {"applied": bool(changes), "changes": told, "limits": limits, "hash": new.hash}
+
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""
         safe = await self._gateway.shut_down()
@@ -198,7 +236,7 @@ def main(argv: list[str]) -> int:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=ControllerConfig)
         return run(GatewayProcess(config).run())
     except FieldtwinError as e:
-        print(f"fieldtwin gateway: {e}", file=sys.stderr)
+        print(e, file=sys.stderr)
         return e.exit_code
 
 

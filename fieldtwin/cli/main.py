@@ -16,6 +16,7 @@ from fieldtwin.__about__ import __version__
 
 COMMANDS = {
     "run": ("fieldtwin.cli.run_command", "Run a system: the plant, or its prototype."),
+    "reload": ("fieldtwin.cli.reload_command", "Let a running instance read its files again, between two polls."),
     "emulate": ("fieldtwin.cli.emulate_command", "Emulate the field side of a system, or one device."),
     "plc": (
         "fieldtwin.cli.plc_command",
@@ -63,7 +64,10 @@ COMMANDS = {
     "doctor": ("fieldtwin.cli.doctor_command", "Check what this computer can do, and say what to change."),
 }
 SECTIONS = {
-    "Run a system, or parts of it": ("run", "emulate", "with", "plc", "shore", "link", "bridge", "can-bus", "draw"),
+    "Run a system, or parts of it": (
+        *("run", "reload", "emulate", "with", "plc"),
+        *("shore", "link", "bridge", "can-bus", "draw"),
+    ),
     "Meet a device": (
         *("line", "scan", "identify", "read", "write", "watch", "dump", "diff", "infer"),
         *("record", "import", "export", "compare", "check", "report"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import shlex
 import signal
 import sys
@@ -339,7 +340,8 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
                 print_metrics(service.url)
             if hasattr(signal, "SIGHUP"):
                 # From a terminal it says that nobody watches any more; to a service, that its configuration changed.
-                loop.add_signal_handler(signal.SIGHUP, service.hang_up if notifier.wanted else interrupt)
+                watched = not notifier.wanted and any(map(os.isatty, range(3)))
+                loop.add_signal_handler(signal.SIGHUP, interrupt if watched else service.hang_up)
             async with LiveView(session, quiet=as_json or service_options.log is not None):
                 await session.wait()
     notifier.close()

@@ -19,11 +19,12 @@ from fieldtwin.running.children import Child
 from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.oracle import Oracle
+from fieldtwin.running.reloading import Reloaded, reload
 from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from gateway.core.control import ControlClient
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from gateway.core.errors import FieldtwinError, Unreachable
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 from twin.controller import ControllerConfig
@@ -302,6 +303,16 @@ class RunSession:
             await self.oracle.update(gateway, self._field.client)
         except FieldtwinError:
             pass  # as above
+
+    async def reload(self, by: str) -> Reloaded:
+        """The gateway reads its files again (`fieldtwin.running.reloading`); no poll is lost by that."""
+        if "gateway" not in self._clients:
+            raise Unreachable("the gateway is gone")
+        own = await ControlClient.connect_unix(self.instance.path("gateway.sock"))  # statuses are asked for meanwhile
+        try:
+            return await reload(own, self._clients.get("plc"), by)
+        finally:
+            await own.aclose()
 
     # -- stopping -------------------------------------------------------------------------------------------------------
 

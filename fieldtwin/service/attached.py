@@ -7,6 +7,7 @@ hangs is as bad as one that is gone, and systemd then stops all of it in order a
 from __future__ import annotations
 
 import asyncio
+import sys
 from dataclasses import dataclass
 from types import TracebackType
 
@@ -17,10 +18,12 @@ from fieldtwin.service.journal import EventLog, Format
 from fieldtwin.service.metrics import Snapshot, families
 from fieldtwin.service.metrics_server import MetricsServer, parse_place
 from fieldtwin.service.notify import Notifier
+from gateway.core.errors import FieldtwinError
 from gateway.core.nursery import Nursery
 
 LOOK_S = 0.5
 STATUS_S = 5.0
+MOST_NAMED = 8
 NEEDED = ("gateway", "plc")
 
 
@@ -75,6 +78,7 @@ class Service:
         self._nursery = Nursery()
         self._log = EventLog(options.log, session.system.name, session.clock.utc_ns) if options.log else None
         self._seen: Snapshot | None = None
+        self._hung_up = asyncio.Event()
         self.url = ""
 
     async def __aenter__(self) -> Service:
@@ -85,6 +89,7 @@ class Service:
             if self._log is not None:
                 self._log.write(self._started())
                 self._nursery.start(self._tell(), "events")
+            self._nursery.start(self._reload(), "reload")
             if self._notifier.wanted:
                 self._notifier.ready(f"{self._session.system.name}: started")
                 self._nursery.start(self._feed(), "watchdog")
@@ -114,9 +119,41 @@ class Service:
             self._log.write(event)
 
     def hang_up(self) -> None:
-        """SIGHUP: nothing is read anew while a plant runs (docs/service.md); and it is no reason to end, as it else would be."""
-        text = "SIGHUP: the configuration is read at the start only; restart to use another"
-        self.note(Event(Priority.WARNING, "not_reloaded", text))
+        """SIGHUP: read the files again. One that comes while another is carried out is carried out behind it."""
+        self._hung_up.set()
+
+    async def _reload(self) -> None:
+        while True:
+            await self._hung_up.wait()
+            self._hung_up.clear()
+            self._notifier.reloading(self._session.clock.monotonic_ns())
+            event = await self._reloaded()
+            if event is not None:
+                self.note(event)
+                if self._log is None:
+                    print(f"fieldtwin: {event.message}", file=sys.stderr)
+            self._notifier.ready(event.message if event is not None else "read again")
+
+    async def _reloaded(self) -> Event | None:
+        """What a reload came to; None where something was taken over, which the statuses tell."""
+        try:
+            done = await self._session.reload("SIGHUP")
+        except FieldtwinError as e:
+            text = f"not reloaded, nothing was changed: {e}"
+            return Event(Priority.ERROR, "not_reloaded", text, {"error": str(e)})
+        if done.restart:
+            named = "; ".join(f"{c['where']}: {c['what']}" for c in done.restart[:MOST_NAMED])
+            more = f"; {len(done.restart) - MOST_NAMED} more" if len(done.restart) > MOST_NAMED else ""
+            text = f"not reloaded, nothing was changed; these need a restart: {named}{more}"
+            return Event(Priority.ERROR, "not_reloaded", text, {"error": "needs a restart"})
+        if done.applied and self._log is not None:
+            return None
+        what = (
+            "reloaded: " + "; ".join(c["what"] for c in done.changes[:MOST_NAMED])
+            if done.applied
+            else ("reloaded: nothing is otherwise in the files")
+        )
+        return Event(Priority.NOTICE, "reloaded", what, {"count": len(done.changes)})
 
     def healthy(self, seen: Snapshot, patience_s: float) -> bool:
         """Whether gateway and PLC both answered within `patience_s` seconds."""

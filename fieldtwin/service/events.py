@@ -41,6 +41,7 @@ def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
         *_buses(_part(before, "buses"), _part(now, "buses")),
         *_devices(_part(before, "devices"), _part(now, "devices")),
         *_plc(before.plc if before else None, now.plc),
+        *_reloaded(before.gateway if before else None, now.gateway),
         *_dropped(before.gateway if before else None, now.gateway),
     ]
 
@@ -99,6 +100,14 @@ def _plc(before: Status | None, now: Status | None) -> list[Event]:
     priority = Priority.NOTICE if now["state"] == "running" else Priority.ERROR
     text = f"PLC: {now['state']}" + (f": {now['error']}" if now["error"] else "")
     return [Event(priority, "plc_state", text, {"state": now["state"], "error": now["error"]})]
+
+
+def _reloaded(before: Status | None, now: Status | None) -> list[Event]:
+    """Whoever asked for it."""
+    if before is None or now is None or before["config"]["reloads"] == now["config"]["reloads"]:
+        return []
+    text = "reloaded: " + "; ".join(now["config"]["changed"])
+    return [Event(Priority.NOTICE, "reloaded", text, {"hash": now["config"]["hash"]})]
 
 
 def _dropped(before: Status | None, now: Status | None) -> list[Event]:

@@ -1,0 +1,57 @@
+"""Telling a running instance to read its files again: the gateway judges and takes over, the PLC hears of new limits.
+
+The same for SIGHUP and for `fieldtwin reload`. No output of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.running.plc_client import choose
+from gateway.core.control import ControlClient
+
+PATIENCE_S = 120.0
+"""A device whose group takes long has its new configuration when that group was read."""
+
+
+@dataclass(frozen=True)
+class Reloaded:
+    """`applied`: something changed, and all of it counts. Else nothing does; `restart` says what cannot change while it runs.
+
+    Changes are ``{"where": "plant.yaml:12:5", "what": "devices.ctd...: 1000 -> 500", "live": true}``.
+    """
+
+    applied: bool
+    changes: list[dict[str, Any]]
+    hash: str
+
+    @property
+    def restart(self) -> list[dict[str, Any]]:
+        return [change for change in self.changes if not change["live"]]
+
+
+async def reload(gateway: ControlClient, plc: ControlClient | None, by: str, *, check: bool = False) -> Reloaded:
+    """Let the instance behind these two read its files again. With `check` nothing is taken over.
+
+    Raises `RemoteError` where a file is invalid, with its line, and what reaching them may raise; nothing has changed then.
+    """
+    answer = await gateway.call("reload", timeout_s=PATIENCE_S, by=by, check=check)
+    if answer["applied"] and answer["limits"] and plc is not None:
+        await plc.call("limits", tags=answer["limits"])
+    return Reloaded(answer["applied"], answer["changes"], answer["hash"])
+
+
+async def reload_instance(instance: str, by: str, *, check: bool = False) -> Reloaded:
+    """As `reload`, for an instance by its name; "" is the only one that runs."""
+    plc_socket: Path = choose(instance)
+    gateway = await ControlClient.connect_unix(plc_socket.with_name("gateway.sock"))
+    try:
+        plc = await ControlClient.connect_unix(plc_socket)
+        try:
+            return await reload(gateway, plc, by, check=check)
+        finally:
+            await plc.aclose()
+    finally:
+        await gateway.aclose()

@@ -125,10 +125,9 @@ class Runner:
         self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text})
         expected = got = ""
         verdict = Verdict.PASSED
-        names: list[str] = []
         try:
             self._look_at_all()
-            names = await self._do(n, word, step) or []
+            await self._do(n, word, step)
             self._look_at_all()
         except _Broken as broken:
             verdict, expected, got = self._judged_on_time(broken, since_s)
@@ -143,10 +142,20 @@ class Runner:
             expected,
             got,
             where=self.scenario.line("steps", n),
-            names=tuple(names),
+            names=self._about(n, step),
         )
         self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text, "verdict": verdict.value})
         return result
+
+    def _about(self, n: int, step: Step) -> tuple[str, ...]:
+        """The tags, variables or device that a step looks at; whatever came of it."""
+        if step.wait is not None:
+            return tuple(self.scenario.expression(step.wait.until, "steps", n, "wait", "until").names)
+        if step.expect is None:
+            return ()
+        if step.expect.that is not None:
+            return tuple(self.scenario.expression(step.expect.that, "steps", n, "expect", "that").names)
+        return (step.expect.wire or step.expect.tag or "",)
 
     def _judged_on_time(self, broken: _Broken, since_s: float) -> tuple[Verdict, str, str]:
         """What is broken; where the host itself was late by a good part of the time that it is about, nobody knows."""
@@ -156,7 +165,7 @@ class Runner:
             return Verdict.INCONCLUSIVE, broken.expected, got
         return broken.verdict, broken.expected, broken.got
 
-    async def _do(self, n: int, word: str, step: Step) -> list[str] | None:
+    async def _do(self, n: int, word: str, step: Step) -> None:
         bench = self.bench
         if word in ("send", "set", "fault", "clear"):
             self._stimulus_s = bench.now_s()
@@ -175,10 +184,8 @@ class Runner:
         elif step.wait is not None:
             expression = self.scenario.expression(step.wait.until, "steps", n, "wait", "until")
             await self._wait(expression, seconds(step.wait.within))
-            return expression.names
         elif step.expect is not None:
-            return await self._expect(n, step.expect)
-        return None
+            await self._expect(n, step.expect)
 
     async def _wait(self, expression: Expression, within_s: float) -> None:
         deadline_s = self.bench.now_s() + within_s
@@ -190,14 +197,14 @@ class Runner:
                 )
             await self._tick(deadline_s)
 
-    async def _expect(self, n: int, expect: Expect) -> list[str]:
+    async def _expect(self, n: int, expect: Expect) -> None:
         within_s = seconds(expect.within) if expect.within is not None else 0.0
         during_s = seconds(expect.during) if expect.during is not None else 0.0
         if expect.that is not None:
             expression = self.scenario.expression(expect.that, "steps", n, "expect", "that")
             await self._wait(expression, within_s)
             await self._throughout(expression, during_s)
-            return expression.names
+            return
         watched = Watched(self.bench, self.scenario.system, self.bench.now_s(), self._stimulus_s, self.exchanges)
         if expect.wire is not None:
             dropped = self._dropped
@@ -209,7 +216,7 @@ class Runner:
             said = judge_wire(expect, watched)
             if said is not None:
                 raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
-            return [expect.wire]
+            return
         assert expect.tag is not None
         if expect.updates_per_s is not None:
             await self._until(self.bench.now_s() + max(during_s, 1.0))
@@ -225,7 +232,6 @@ class Runner:
                 if (said := await judge_tag(expect, watched)) is not None:
                     raise _Broken(Verdict.FAILED, *said, during_s)
             self._looked_all_the_time(end_s - during_s, during_s)
-        return [expect.tag]
 
     async def _throughout(self, expression: Expression, during_s: float) -> None:
         end_s = self.bench.now_s() + during_s

@@ -63,6 +63,8 @@ def test_what_does_not_hold_fails_with_what_was_seen(tmp_path: Path, steps: str,
     assert failed.verdict is Verdict.FAILED
     assert expected in failed.expected
     assert got in failed.got
+    assert failed.names, "a report shows first what the check was about"
+    assert all(name in steps.splitlines()[-1] for name in failed.names)
     assert failed.where == f"{tmp_path / 'x.scenario.yaml'}:{3 + len(result.checks)}"
     assert result.reproduce.startswith("fieldtwin test ")
 

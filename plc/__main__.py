@@ -18,7 +18,7 @@ def main() -> int:
     try:
         return plc_main(PlcConfig.load(Path(sys.argv[1])))
     except FieldtwinError as e:
-        print(f"plc: {e}", file=sys.stderr)
+        print(e, file=sys.stderr)
         return e.exit_code
 
 

@@ -163,7 +163,7 @@ def main(argv: list[str]) -> int:
         config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=FieldConfig)
         return run(FieldProcess(config).run())
     except FieldtwinError as e:
-        print(f"fieldtwin field side: {e}", file=sys.stderr)
+        print(e, file=sys.stderr)
         return e.exit_code
 
 

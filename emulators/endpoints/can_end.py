@@ -178,17 +178,24 @@ async def _hang_up(writer: asyncio.StreamWriter) -> None:
         writer.transport.abort()
 
 
+def _no_interface(endpoint: Endpoint) -> Unreachable:
+    """Whether it is the interface that is missing, or CAN in the whole kernel."""
+    instead = "or use the software bus: can:fieldtwin/HOST:PORT"
+    try:
+        socket.socket(socket.PF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):  # AttributeError: a system, or a Python, that never heard of it
+        return Unreachable("this kernel has no SocketCAN", where=str(endpoint), hint=f"modprobe can_raw, {instead}")
+    make = f"ip link add {endpoint.path} type vcan && ip link set {endpoint.path} up"
+    return Unreachable(f"there is no interface {endpoint.path}", where=str(endpoint), hint=f"{make}, {instead}")
+
+
 def _open_kernel_end(endpoint: Endpoint) -> KernelCanEnd:
     link = Path("/sys/class/net") / endpoint.path
     try:
         kind = (link / "type").read_text().strip()
         up = int((link / "flags").read_text(), 16) & 1
     except OSError as e:
-        raise Unreachable(
-            f"there is no interface {endpoint.path}",
-            where=str(endpoint),
-            hint="create it, or use the software bus: can:fieldtwin/HOST:PORT",
-        ) from e
+        raise _no_interface(endpoint) from e
     if kind != ARPHRD_CAN:
         raise Unreachable(f"{endpoint.path} is no CAN interface", where=str(endpoint))
     if not up:

@@ -34,7 +34,8 @@ def print_mapping(session: RunSession) -> None:
         _print_thread(session)
         return
     talk.print(
-        f"[bold]prototype[/bold] of {session.system.name}; instance {session.instance.name} in {session.instance.dir}"
+        f"[bold]prototype[/bold] of {session.system.name}; instance {session.instance.name} in {session.instance.dir}",
+        soft_wrap=True,
     )
     for plant, target in session.mapping.items():
         talk.print(f"  {plant}  →  {target}" if plant != target else f"  {plant}  (the plant's own)", soft_wrap=True)
@@ -362,6 +363,7 @@ def _exchange_text(row: dict[str, Any]) -> str:
         text += f", {gateway['pdos']} PDOs, {gateway['heartbeats']} heartbeats"
     if "emulators" in row:
         text += f"; emulators {row['emulators']['requests']} / {row['emulators']['replies']}"
+        text += f", with those of {row['shared']}" if "shared" in row else ""
     if row["timeouts"] or row["crc_errors"]:
         text += f"; {row['timeouts']} timeouts, {row['crc_errors']} CRC errors"
     return text

@@ -26,7 +26,8 @@ class RotatingFile:
 
     A new part begins when `max_bytes` would be exceeded, or with the first line `max_s` seconds behind the first of a part
     (0: never). At most `keep` parts stay (0: all), the oldest go; `removed` counts those. Raises `FileInvalid` when a part
-    exists already or the disk refuses; what was written before is whole.
+    exists already or the disk refuses; what was written before is whole. As a context manager it leaves no file behind
+    when an error ends the block before the first line: the name is free for the next try.
     """
 
     def __init__(
@@ -51,6 +52,8 @@ class RotatingFile:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+        if error is not None and not self.lines:
+            self.path.unlink(missing_ok=True)
 
     def line(self, t_s: float, line: bytes) -> None:
         """Append `line` (newline included), which is of the time `t_s`."""

@@ -51,6 +51,12 @@ def _waivers() -> dict[str, Any]:
     return WaiversForm.model_json_schema()
 
 
+def _rules() -> dict[str, Any]:
+    from fieldtwin.running.twin_rules import RulesForm
+
+    return RulesForm.model_json_schema()
+
+
 SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "system": _system,
     "prototype": _prototype,
@@ -58,6 +64,7 @@ SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "faults": _faults,
     "scenario": _scenario,
     "waivers": _waivers,
+    "rules": _rules,
 }
 """What a user writes, by its kind."""
 
@@ -74,6 +81,7 @@ def command(kind: str) -> int:
     faults      what goes wrong, for run --faults and link --faults
     scenario    what is done and what must be seen, for test
     waivers     failures that somebody answers for, for check and test
+    rules       what a digital twin commands by what it finds, for twin --plan
     """
     schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", **SCHEMAS[kind]()}
     json.dump(schema, sys.stdout, indent=2)

@@ -268,7 +268,7 @@ def test_every_command_explains_itself(invoke: Invoke, command: str) -> None:
     assert out.startswith("Usage: fieldtwin " + command)
 
 
-@pytest.mark.parametrize("kind", ["system", "prototype", "profile", "faults", "scenario", "waivers"])
+@pytest.mark.parametrize("kind", ["system", "prototype", "profile", "faults", "scenario", "waivers", "rules"])
 def test_schemas_are_json_and_refuse_unknown_keys(invoke: Invoke, kind: str) -> None:
     code, out, err = invoke("schema", kind)
     assert (code, err) == (0, "")

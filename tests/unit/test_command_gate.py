@@ -15,6 +15,7 @@ from gateway.store.event import Event, Kind
 from twin.command_gate import CommandGate
 from twin.mape.execute import Bounds
 from twin.mape.messages import verdict
+from twin.mape.plan import Plan
 from twin.model import DigitalModel
 from twin.system import load_system
 
@@ -156,3 +157,25 @@ def test_a_planner_in_python_is_made_or_refused(tmp_path: Path) -> None:
         load_planner("python: no_such_module:Planner", system)
     with pytest.raises(FileInvalid, match="not a planner"):
         load_planner("python: collections:OrderedDict", system)
+
+
+def test_what_a_planner_in_python_raises_or_gives_is_a_refusal_and_the_twin_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "failing_planner.py").write_text(
+        "class Planner:\n"
+        "    given = 0\n"
+        "    def plan(self, data, model):\n"
+        "        self.given += 1\n"
+        "        return [1 / 0 if data.finding == 'bad' else None, 5][self.given > 1]\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    planner, _ = load_planner("python: failing_planner:Planner", load_system(str(OBSERVATORY)))
+    plan = Plan(DigitalModel(), planner, Hands())
+    for finding in ("bad", "good"):
+        plan.consumer.observe(verdict(finding, "ctd.pressure", "", NOW_MS))
+    plan.plan()
+    assert (plan.planned, plan.failed) == (0, 2)
+    raised, gave = [str(e.value) for e in plan.collect() if e.kind == Kind.REFUSAL]
+    assert "'python: failing_planner:Planner' failed: ZeroDivisionError: division by zero" in raised
+    assert "expected a COMMAND or None; got int" in gave

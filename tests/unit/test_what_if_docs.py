@@ -1,13 +1,23 @@
-"""The plans that docs/what-if.md shows can be read."""
+"""The plans that docs/what-if.md shows can be read, and the rules and the planner of docs/twin.md."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
-from fieldtwin.whatif.plan import load_plans
+import pytest
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "what-if.md"
+from fieldtwin.running.twin_rules import PythonPlanner, load_planner, questions_of
+from fieldtwin.whatif.plan import load_plans
+from gateway.core.statemachine import decode_period
+from twin.mape.messages import verdict
+from twin.mape.plan import RulePlanner
+from twin.model import DigitalModel
+from twin.system import load_system
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = DOCS / "what-if.md"
 
 
 def test_the_plans_of_the_page(tmp_path: Path) -> None:
@@ -17,3 +27,34 @@ def test_the_plans_of_the_page(tmp_path: Path) -> None:
     assert system == "observatory"
     assert [len(plan.require) for plan in plans] == [1, 1, 1]
     assert plans[2].faults[0]["device"] == "modem"
+
+
+def fences(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / "twin.md").read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_the_rules_of_the_page_on_twins(tmp_path: Path) -> None:
+    system, asked = load_system("observatory"), []
+    for number, text in enumerate(fences("yaml")):
+        (tmp_path / f"{number}.yaml").write_text(text, encoding="utf-8")
+        planner, question = load_planner(str(tmp_path / f"{number}.yaml"), system)
+        assert isinstance(planner, RulePlanner)
+        asked.append((len(planner.rules), question is not None, len(questions_of(planner))))
+    assert asked == [(3, False, 0), (3, True, 1)]
+
+
+def test_the_planner_of_the_page_on_twins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    [text] = fences("python")
+    (tmp_path / "planner.py").write_text(text, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    system = replace(load_system("observatory"), path=tmp_path / "observatory.yaml")
+    planner, _ = load_planner("python: planner:Planner", system)
+    assert isinstance(planner, PythonPlanner)
+    model, commanded = DigitalModel(), []
+    for finding, subject in (("inside", "a"), ("outside", "a"), ("outside", "b"), ("inside", "a"), ("inside", "b")):
+        command = planner.plan(verdict(finding, subject, "", 0), model)
+        if command is not None:
+            model.process_event(command)
+            commanded.append(decode_period(command))
+    assert commanded == [60, 30, 15, 7, 60]
+    assert planner.plan(verdict("good", "a", "", 0), model) is None

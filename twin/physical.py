@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mmap
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +20,7 @@ from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
 from gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
 from gateway.core.profile import Tag
 from gateway.devices.canopen_device import CanopenDriver
+from gateway.devices.config import DeviceConfig
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
@@ -138,16 +139,22 @@ def _check_variables(system: System, bound: BoundProgram) -> None:
 
 
 def gateway_config(
-    system: System, *, allow_writes: bool, free_ports: bool = False, true_silences: bool | None = None
+    system: System,
+    *,
+    allow_writes: bool,
+    free_ports: bool = False,
+    true_silences: bool | None = None,
+    lent: Sequence[str] = (),
 ) -> GatewayConfig:
     """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host.
-    Without `true_silences` no line is strict about them: those of virtual ports say nothing, which `free_ports` implies."""
+    Without `true_silences` no line is strict about them: those of virtual ports say nothing, which `free_ports` implies. The
+    mailboxes of the transmitters `lent` are left to a digital thread."""
     true_silences = not free_ports if true_silences is None else true_silences
     serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
     outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
     return GatewayConfig(
         buses={name: replace(bus, strict=bus.strict and true_silences) for name, bus in system.buses.items()},
-        devices=system.devices,
+        devices={n: _without_inbox(d) if n in lent else d for n, d in system.devices.items()},
         cycle_ms=fastest_ms(system),
         plc_lost_ms=max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system)),
         outputs=frozenset(outputs),
@@ -156,7 +163,12 @@ def gateway_config(
         remote=system.remote == "remote",
         serve=serving.serve,
         bridges=serving.bridges,
+        lent=frozenset(lent),
     )
+
+
+def _without_inbox(device: DeviceConfig) -> DeviceConfig:
+    return replace(device, poll={group: ms for group, ms in device.poll.items() if group != "inbox"})
 
 
 def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfig:
@@ -240,11 +252,12 @@ class EmbeddedControlSystem:
         free_ports: bool = False,
         true_silences: bool | None = None,
         listen: Listen = TcpListener.open,
+        lent: Sequence[str] = (),
     ) -> Gateway:
         """The gateway with its drivers. Which wires `connector` opens, and where `listen` lets clients in, nobody from here
         on knows."""
         config = gateway_config(
-            self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences
+            self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences, lent=lent
         )
         return Gateway(config, connector, clock, image, audit, log, listen)
 

@@ -20,7 +20,9 @@ from typing import Any
 
 import msgspec
 
+from gateway.connections.os_connector import OsConnector
 from gateway.core.clock import NS_PER_MS, Clock
+from gateway.core.connection import Connector
 from gateway.core.control import ControlClient, ControlServer
 from gateway.core.errors import FieldtwinError
 from gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
@@ -28,18 +30,20 @@ from gateway.core.image_region import Snapshot
 from gateway.core.nursery import Nursery
 from gateway.core.statemachine import STATE_CODES, STATES
 from gateway.core.values import COMMAND, RESPONSE, TagValue
+from gateway.runtime.audit import AuditLog
 from gateway.store.event import Event, Kind, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
 from gateway.wallclock import WallClock, run
 from twin.command_gate import CommandGate
 from twin.knowledge import KnowledgeWriter
 from twin.mape.execute import Bounds
+from twin.mapping import MappedConnector, mapping_from_json
 from twin.physical import attached, image_layout
 from twin.status import encode_status
 from twin.system import System, load_system
 from twin.thread import PTtoDTConnection, schema_of
 from twin.thread_end import ThreadEnd
-from twin.thread_place import plant_carrier
+from twin.thread_place import lent_transmitter, plant_carrier
 from twin.thread_process import PTDigitalThreadProcess
 
 LOOK_MS = 50
@@ -49,7 +53,8 @@ NAMES = list(STATES)
 
 
 class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the process is told. `place` is where the thread goes (`twin.thread_place`), `store` a file or a database."""
+    """What the process is told. `place` is where the thread goes (`twin.thread_place`), `store` a file or a database. `mapping`
+    is None on a plant. `every_ms`: a tag's new value is shared at most so often, however often it changes."""
 
     system: str
     run_dir: str
@@ -57,17 +62,20 @@ class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     store: str
     prototype: bool
     profiles: tuple[str, ...] = ()
+    mapping: dict[str, str] | None = None
+    every_ms: int = 0
 
 
 class ImageProcess(PTDigitalThreadProcess):
-    """Shares what the process image shows: `look` at both regions, as often as changes are not to be missed."""
+    """Shares what the process image shows: `look` at both regions, as often as changes are not to be missed. Of a tag whose
+    quality stays, a new value is shared at most every `every_ms`; states and messages always."""
 
-    def __init__(self, system: System, layout: ImageLayout, clock: Clock) -> None:
+    def __init__(self, system: System, layout: ImageLayout, clock: Clock, every_ms: int = 0) -> None:
         super().__init__("image", clock)
+        self._every_ms = every_ms
         tags = {tag.name: tag for region in layout.regions for tag in region.tags}
-        self._plain = [
-            n for n, t in tags.items() if t.kind is not TagKind.MESSAGE and n.partition(".")[0] in system.devices
-        ]
+        known = frozenset(schema_of(system).names)  # of a device's tags; not how far its messages were taken
+        self._plain = [n for n, t in tags.items() if t.kind is not TagKind.MESSAGE and n in known]
         self._machines = {
             p: form.outputs.get("period_s", f"{p}.period_s")
             for p, form in system.plc.programs.items()
@@ -97,7 +105,7 @@ class ImageProcess(PTDigitalThreadProcess):
 
     def _value(self, name: str, value: TagValue, now_ms: int, offset_ns: int) -> None:
         what = (value.value, value.quality, value.reason)
-        if self._due(name, what, now_ms):
+        if self._due(name, what, now_ms) and not self._too_soon(name, what, now_ms):
             fresh = value.t_ns and value.good and self._said.get(name, (None, 0))[0] != what
             self._said[name] = (what, now_ms)
             self.share(Kind.VALUE, name, value, (value.t_ns + offset_ns) // NS_PER_MS if fresh else now_ms)
@@ -114,6 +122,10 @@ class ImageProcess(PTDigitalThreadProcess):
         if name and self._due(f"{program}.", what, now_ms):
             self._said[f"{program}."] = (what, now_ms)
             self.share(Kind.STATE, program, encode_status(*what), now_ms)
+
+    def _too_soon(self, name: str, what: tuple[object, ...], now_ms: int) -> bool:
+        said, at_ms = self._said.get(name, (None, 0))
+        return isinstance(said, tuple) and said[1:] == what[1:] and now_ms - at_ms < self._every_ms
 
     def _due(self, name: str, what: object, now_ms: int) -> bool:
         said, at_ms = self._said.get(name, (None, 0))
@@ -137,7 +149,14 @@ class PlantThread:
             store = await open_knowledge(c.store)
             stack.push_async_callback(store.aclose)
             origin = await store.own("plant", system=system.name, prototype=c.prototype, log=secrets.token_hex(4))
-            carrier, self._place = await plant_carrier(c.place, system, clock)
+            if lent := lent_transmitter(c.place, system):
+                audit = AuditLog(Path(c.run_dir) / "audit.jsonl", clock)
+                stack.callback(audit.close)
+                audit.note("lend", lent, by="digital thread", result="its mailboxes are the thread's")
+            connector: Connector = OsConnector()
+            if c.mapping is not None:
+                connector = MappedConnector(connector, mapping_from_json(c.mapping))
+            carrier, self._place = await plant_carrier(c.place, system, clock, connector)
             stack.push_async_callback(carrier.aclose)
             least_s, most_s = system.commands.period_s
             bounds = Bounds(least_s, most_s, system.commands.per_minute)
@@ -151,7 +170,7 @@ class PlantThread:
             self._writer = KnowledgeWriter(
                 store, origin, clock, on_written=self._end.appended, make_room=self._end.make_room
             )
-            process = ImageProcess(system, layout, clock)
+            process = ImageProcess(system, layout, clock, c.every_ms)
             connection = PTtoDTConnection(self._end, [process, self._gate], self._writer, clock)
             image = stack.enter_context(attached(layout, Path(c.run_dir) / "image"))
             readers = image.reader(INPUTS), image.reader(OUTPUTS)

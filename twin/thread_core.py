@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.store.event import Event, merged
+from gateway.store.event import Event, Kind, merged
 from twin.thread_frames import MAX_RUNS, Ack, Ask, Data, Frame, Hello, Lost, Refused, tag_of
 
 WINDOW = 2000
@@ -28,6 +28,9 @@ FAR_AHEAD = 100_000
 RTO_FIRST_NS, RTO_MIN_NS, RTO_MAX_NS = NS_PER_S, 200 * NS_PER_MS, 60 * NS_PER_S
 MAX_STREAMS = 16
 MAX_RANGES = 1000
+
+URGENT = frozenset((Kind.COMMAND, Kind.STATE))
+"""What waits for nobody."""
 
 Fit = Callable[[bytes, Sequence[Event]], int]
 """How many of these events one frame of the carrier takes (`FrameCodec.fit`)."""
@@ -79,6 +82,8 @@ class Outgoing:
         self.refused = False
         """The other side does not have our schema. It is asked again now and then: it may get it."""
         self.resent = 0
+        self.linger_ns = 0
+        """How long events wait for others that fill the frame; a matter of the carrier."""
         self.contradicted = False
         """The other side has more of our log than we: our store went back in time. What is new here would pass for old there."""
         self._schema = schema
@@ -87,6 +92,8 @@ class Outgoing:
         self._window: OrderedDict[int, _Slot] = OrderedDict()
         self._loaded = 0
         self._to_send: deque[int] = deque()
+        self._gathers_ns: int | None = None
+        """Since when what is to be sent waits for more."""
         self._known = False
         self._hello_ns: int | None = 0
         """When to say HELLO next; None while the other side knows us and nothing is due."""
@@ -250,12 +257,24 @@ class Outgoing:
         self._time_out(now_ns)
         events = self._next_events()
         if not events:
+            self._gathers_ns = None
             return None
+        if self._gathers_ns is None:
+            self._gathers_ns = now_ns
+        if not self._to_send and self._may_wait(events, now_ns):
+            self._to_send.extend(event.sequence for event in events)
+            return None
+        self._gathers_ns = None
         for event in events:
             slot = self._window[event.sequence]
             slot.sent_ns = now_ns
             slot.tries += 1
         return Data(self.tag, tuple(events))
+
+    def _may_wait(self, events: Sequence[Event], now_ns: int) -> bool:
+        """Whether these, of which there are no more, wait for others."""
+        assert self._gathers_ns is not None
+        return now_ns < self._gathers_ns + self.linger_ns and not any(event.kind in URGENT for event in events)
 
     def _time_out(self, now_ns: int) -> None:
         """Send again what waits for its ACK for too long; the oldest is enough to know."""
@@ -299,8 +318,10 @@ class Outgoing:
         """When `next_frame` may have something although nothing came; None: never."""
         if not self._known:
             return self._hello_ns
-        if self._to_send or self._lost:
+        if self._lost or (self._to_send and self._gathers_ns is None):
             return now_ns
+        if self._to_send and self._gathers_ns is not None:
+            return max(now_ns, self._gathers_ns + self.linger_ns)
         oldest = next(iter(self._window.values()), None)
         if oldest is not None:
             return oldest.sent_ns + self._rto.now_ns

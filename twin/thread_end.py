@@ -104,6 +104,7 @@ class ThreadEnd:
             finally:
                 self.connected = False
                 if self._link is not None:
+                    self.trouble = self.trouble or self._link.trouble
                     await self._link.aclose()
                     self._link = None
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + retry_ns)
@@ -115,6 +116,7 @@ class ThreadEnd:
         self.trouble = ""
         self.into.ack_delay_ns = link.ack_delay_ns
         if self.out is not None:
+            self.out.linger_ns = link.linger_ns
             self.out.connected(self._clock.monotonic_ns())
         async with Nursery() as nursery:
             nursery.start(self._listen(link), f"{self._carrier.name}: what comes")
@@ -236,5 +238,5 @@ class ThreadEnd:
             "waiting": self.waiting,
             "resent": self.out.resent if self.out is not None else 0,
             "duplicates": self.into.duplicates,
-            "trouble": self.trouble,
+            "trouble": self.trouble or (self._link.trouble if self._link is not None else ""),
         }

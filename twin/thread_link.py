@@ -16,8 +16,13 @@ from twin.thread_frames import Frame, FrameCodec, Schema
 class Link(ABC):
     """A way to the other side, until it is lost. One reader and one writer."""
 
+    trouble = ""
+    """Why nothing gets through now although the link is not lost; empty when all is well."""
     ack_delay_ns = 0
     """How long an ACK may wait for others: one that takes a second on the way serves for many frames."""
+
+    linger_ns = 0
+    """How long events may wait for others: a frame that takes a second on the way had better be full."""
 
     @abstractmethod
     async def send(self, frame: Frame) -> None:

@@ -25,6 +25,7 @@ from twin.thread_link import Carrier, DatagramLink
 TICK_NS = 20 * NS_PER_MS
 ACK_DELAY_NS = 1000 * NS_PER_MS
 """A frame takes a second or more on the way: one ACK confirms several."""
+LINGER_NS = 500 * NS_PER_MS
 HALT_S = 0.5
 
 
@@ -44,6 +45,7 @@ class ModemLink(DatagramLink):
     """A link through a transmitter's mailboxes. It stays while the modem is away: what it holds is sent when it is back."""
 
     ack_delay_ns = ACK_DELAY_NS
+    linger_ns = LINGER_NS
 
     def __init__(self, driver: TransmitterDriver, bus: ModbusBus, clock: Clock, schemas: Sequence[Schema]) -> None:
         assert driver.profile.outbox is not None
@@ -73,6 +75,13 @@ class ModemLink(DatagramLink):
             self._news.clear()
             await self._news.wait()
         return self._inbox.consume().data
+
+    @property
+    def trouble(self) -> str:  # type: ignore[override]
+        """The modem does not answer."""
+        if self._bus.online(self._driver):
+            return ""
+        return f"the modem at {self._bus.config.endpoint}: {self._bus.error or 'it does not answer yet'}"
 
     def _look(self) -> None:
         if (failure := self._nursery.failure()) is not None:

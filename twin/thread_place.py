@@ -1,6 +1,8 @@
 """Where a thread goes, as a URL: ``tcp://127.0.0.1:PORT`` on one computer, ``tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE`` between
-two (the plant listens, its twin comes, both show a certificate), or a broker with Sparkplug B,
-``mqtt://[USER@]HOST[:PORT]/GROUP/NODE[?host=NAME]``. A password stands in FIELDTWIN_MQTT_PASSWORD, never in a URL.
+two (the plant listens, its twin comes, both show a certificate), a broker with Sparkplug B,
+``mqtt://[USER@]HOST[:PORT]/GROUP/NODE[?host=NAME]``, or the modems of the system: ``modem:`` or ``modem:DEVICE`` on the plant,
+which lends its mailboxes to the thread, and ``modem:[DEVICE@]tcp://HOST:PORT``, the far modem, at its twin. A password stands in
+FIELDTWIN_MQTT_PASSWORD, never in a URL.
 """
 
 from __future__ import annotations
@@ -13,20 +15,47 @@ from urllib.parse import parse_qsl, urlsplit
 from gateway.connections.listeners import TcpListener
 from gateway.connections.os_connector import OsConnector
 from gateway.core.clock import Clock
+from gateway.core.connection import Connector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
+from gateway.devices.config import BusConfig, DeviceConfig
 from twin.system import System
 from twin.thread import schema_of
 from twin.thread_link import Carrier
 from twin.thread_tcp import TcpDialler, TcpListening
 
-EXPECTED = "tcp://127.0.0.1:PORT, tls://HOST:PORT?..., or mqtt://HOST/GROUP/NODE"
+EXPECTED = "tcp://127.0.0.1:PORT, tls://HOST:PORT?..., mqtt://HOST/GROUP/NODE, or modem:"
+MODEM = "modem:"
+MODEM_POLL_MS = 200
 DEFAULT_HOST = "fieldtwin"
 MQTT_PORT = 1883
 
 
-async def plant_carrier(place: str, system: System, clock: Clock) -> tuple[Carrier, str]:
-    """The plant's side, and where it is to be found: a free port is taken where the URL says 0. Raises `UsageError`."""
+def lent_transmitter(place: str, system: System) -> str:
+    """The transmitter whose mailboxes the plant lends to a thread that goes to `place`; empty for other carriers.
+
+    Raises `UsageError` when there is none, or when it is not said which.
+    """
+    return _transmitter(place.removeprefix(MODEM), system) if place.startswith(MODEM) else ""
+
+
+def _transmitter(name: str, system: System) -> str:
+    there = [d.name for d in system.devices.values() if d.profile.inbox is not None]
+    if name and name not in there:
+        raise UsageError(f"{name!r} is no transmitter of {system.name}", expected=", ".join(there) or "none has one")
+    if not name and len(there) != 1:
+        raise UsageError("which transmitter?", expected=" or ".join(MODEM + n for n in there) or "a system with one")
+    return name or there[0]
+
+
+async def plant_carrier(
+    place: str, system: System, clock: Clock, connector: Connector | None = None
+) -> tuple[Carrier, str]:
+    """The plant's side, and where it is to be found: a free port is taken where the URL says 0. `connector` opens the bus of a
+    modem. Raises `UsageError`."""
+    if device := lent_transmitter(place, system):
+        bus = system.buses[system.devices[device].bus]
+        return _modem(system, device, bus.endpoint, connector or OsConnector(), clock), place
     if place.startswith("mqtt:"):
         return _mqtt(place, clock, system), place
     endpoint = _stream(place)
@@ -41,6 +70,11 @@ async def plant_carrier(place: str, system: System, clock: Clock) -> tuple[Carri
 
 def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
     """The digital twin's side. Raises `UsageError`."""
+    if place.startswith(MODEM):
+        name, _, far = place.removeprefix(MODEM).rpartition("@")
+        if not far.startswith("tcp:"):
+            raise UsageError("where is the far modem?", expected="modem:[DEVICE@]tcp://HOST:PORT", got=place)
+        return _modem(system, _transmitter(name, system), Endpoint.parse(far), OsConnector(), clock)
     if place.startswith("mqtt:"):
         return _mqtt(place, clock, None)
     return TcpDialler(_stream(place), OsConnector(), [schema_of(system)])
@@ -58,6 +92,22 @@ def _is_loopback(host: str) -> bool:
         return host == "localhost" or ip_address(host.strip("[]")).is_loopback
     except ValueError:
         return False
+
+
+def _modem(system: System, device: str, endpoint: Endpoint, connector: Connector, clock: Clock) -> Carrier:
+    """The mailboxes of `device`'s modem, or of its peer, at `endpoint`."""
+    from twin.thread_modem import ModemCarrier
+
+    config = system.devices[device]
+    poll = {"inbox": config.poll.get("inbox", MODEM_POLL_MS)}
+    name = f"{device}_thread"
+    return ModemCarrier(
+        DeviceConfig(name=name, profile=config.profile, bus=name, address=config.address, poll=poll),
+        BusConfig(name, endpoint, system.buses[config.bus].timeout_s, 1),
+        connector,
+        clock,
+        [schema_of(system)],
+    )
 
 
 def _mqtt(place: str, clock: Clock, plant: System | None) -> Carrier:

@@ -101,10 +101,18 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     "--thread",
     default="",
     metavar="URL",
-    help="A digital thread for `fieldtwin shadow` and `twin`: tcp://127.0.0.1:PORT or tls://... to listen on, or mqtt://HOST/GROUP/NODE.",
+    help="A digital thread for `fieldtwin shadow` and `twin`: tcp://127.0.0.1:PORT or tls://... to listen on, "
+    "mqtt://HOST/GROUP/NODE, or modem: for the system's own modem.",
 )
 @click.option(
     "--thread-store", default="", metavar="FILE|URL", help="What keeps the thread's log; default: in the run directory."
+)
+@click.option(
+    "--thread-every",
+    "thread_every_s",
+    type=Duration(),
+    default=None,
+    help="A tag's new value goes into the thread at most so often; default: each one, over a modem one a second.",
 )
 @click.option(
     "--metrics",
@@ -148,6 +156,7 @@ def command(
     faults: str,
     thread: str,
     thread_store: str,
+    thread_every_s: float | None,
     metrics: str,
     log: Format | None,
     trust: bool,
@@ -174,8 +183,8 @@ def command(
     if prototype and allow_writes:
         raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
     system = system_file(system, lambda template: trust or ask_about_code(template), plant=plant)
-    if thread_store and not thread:
-        raise UsageError("--thread-store goes with --thread")
+    if (thread_store or thread_every_s is not None) and not thread:
+        raise UsageError("--thread-store and --thread-every go with --thread")
     if virtual:
         if plant or field_host or listen or can or capture or thread or metrics or log:
             raise UsageError(
@@ -219,11 +228,16 @@ def command(
         speed=speed,
         listen=pairs(listen, "--listen"),
         can=can,
-        commands=parse_periods(commands) if commands is not None else DEFAULT_SCRIPT,
+        commands=parse_periods(commands)
+        if commands is not None
+        else ()
+        if thread.startswith("modem:")
+        else DEFAULT_SCRIPT,
         capture=Path(capture) if capture else None,
         cold=cold,
         thread=thread,
         thread_store=thread_store,
+        thread_every_s=thread_every_s,
         faults=_faults(faults, system, profiles) if faults else (),
     )
     return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), as_json))

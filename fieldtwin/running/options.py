@@ -31,6 +31,8 @@ class RunOptions:
     """Where the plant's side of a digital thread goes (`twin.thread_place`), empty for none."""
     thread_store: str = ""
     """What keeps its log; a file of the instance where nothing is said."""
+    thread_every_s: float | None = None
+    """A tag's new value goes into it at most so often. None: each one; over a modem, one a second."""
     seed: int | None = None
     """Of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()

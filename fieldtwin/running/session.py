@@ -24,7 +24,7 @@ from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from gateway.core.control import ControlClient
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, Unreachable
+from gateway.core.errors import FieldtwinError, Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 from twin.controller import ControllerConfig
@@ -33,11 +33,14 @@ from twin.mapping import mapping_to_json
 from twin.physical import PhysicalTwin
 from twin.plant_thread import PlantThreadConfig
 from twin.system import System, load_system
+from twin.thread_place import MODEM, lent_transmitter
 
 if TYPE_CHECKING:
     from fieldtwin.running.bridge_cable import BridgeCable
     from twin.field_process import FieldConfig
 
+MODEM_EVERY_S = 1.0
+"""So often, at most, a tag goes over a modem: it takes some thirty events a second."""
 WATCH_S = 0.02
 ORACLE_S = 1.0
 MAX_ERRORS = 100
@@ -57,6 +60,7 @@ class RunSession:
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
         self.twin = PhysicalTwin(self.system)
+        self.lent = self._lent_to_the_thread()
         if options.prototype and not options.field_host:
             from twin.field_process import resolve  # here and below: a plant has no emulators installed
 
@@ -84,6 +88,21 @@ class RunSession:
         self._nursery = Nursery()
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
+
+    def _lent_to_the_thread(self) -> str:
+        """The transmitter whose mailboxes the thread has, if any. Raises `UsageError` where it cannot have them."""
+        o = self.options
+        lent = lent_transmitter(o.thread, self.system)
+        if lent and not o.prototype and not o.allow_writes:
+            raise UsageError(
+                f"a thread over {lent!r} writes into its mailbox", expected="--allow-writes", got=f"--thread {o.thread}"
+            )
+        if lent and o.commands:
+            raise UsageError(
+                f"the far end of {lent!r} is the digital twin's", expected="--commands none",
+                hint="`fieldtwin twin ... --command 1` commands over the thread",
+            )  # fmt: skip
+        return lent
 
     @property
     def disturbed(self) -> bool:
@@ -123,6 +142,7 @@ class RunSession:
             mapping=mapping_to_json(self.mapping) if self.options.prototype else None,
             profiles=tuple(str(p.resolve()) for p in self.options.profiles),
             capture=str(self.options.capture.resolve()) if self.options.capture else "",
+            lent=(self.lent,) if self.lent else (),
         )
         await self._start_child("gateway", "twin.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
@@ -144,9 +164,15 @@ class RunSession:
             store=o.thread_store or str(run_dir / "knowledge.sqlite"),
             prototype=o.prototype,
             profiles=tuple(str(p.resolve()) for p in o.profiles),
+            mapping=mapping_to_json(self.mapping) if o.prototype else None,
+            every_ms=round(
+                1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.lent else 0)
+            ),
         )
         client = await self._start_child("thread", "twin.plant_thread", self._write("thread.json", config))
         self.thread_place = str((await client.call("get"))["place"])
+        if self.lent in self.far:
+            self.thread_place = f"{MODEM}{self.far[self.lent]}"
 
     def _field_config(self, run_dir: Path) -> FieldConfig:
         from twin.field_process import FieldConfig

@@ -48,6 +48,8 @@ class GatewayConfig:
     remote: bool = False
     serve: tuple[ServeConfig, ...] = ()
     bridges: tuple[BridgeConfig, ...] = ()
+    lent: frozenset[str] = frozenset()
+    """Transmitters whose mailboxes belong to a digital thread."""
 
 
 def make_driver(config: DeviceConfig, bus: BusConfig, tags: TagTable, clock: Clock) -> RegisterDriver | CanopenDriver:
@@ -106,7 +108,14 @@ class Gateway:
         self.bridges = [Bridge(b, modbus, connector, clock, audit, self._blocked, listen) for b in config.bridges]
         self.outputs = OutputWriter(self._make_outputs(), self.tags, audit, config.allow_writes)
         self.pumps = [
-            MailboxPump(d, self._modbus(d), audit, allow_writes=config.allow_writes, remote=config.remote)
+            MailboxPump(
+                d,
+                self._modbus(d),
+                audit,
+                allow_writes=config.allow_writes,
+                remote=config.remote,
+                lent=d.config.name in config.lent,
+            )
             for d in self.drivers.values()
             if isinstance(d, TransmitterDriver)
         ]

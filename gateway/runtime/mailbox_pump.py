@@ -1,7 +1,8 @@
 """Between a transmitter's mailboxes and the control logic: acknowledge what was consumed, send when there is room.
 
 A mailbox is acknowledged only when the PLC has consumed its message, so a command survives a gateway that dies in between.
-A plant whose switch says `local` takes no commands: they are acknowledged, refused and on record.
+A plant whose switch says `local` takes no commands: they are acknowledged, refused and on record. Mailboxes that are lent to a
+digital thread are its own: here nothing is read from them, and nothing written.
 """
 
 from __future__ import annotations
@@ -26,16 +27,25 @@ class MailboxPump:
     """Drives one transmitter. `inbox` holds what came and the PLC was not given yet; `tick` never waits."""
 
     def __init__(
-        self, driver: TransmitterDriver, bus: ModbusBus, audit: AuditLog, *, allow_writes: bool, remote: bool
+        self,
+        driver: TransmitterDriver,
+        bus: ModbusBus,
+        audit: AuditLog,
+        *,
+        allow_writes: bool,
+        remote: bool,
+        lent: bool = False,
     ) -> None:
         self.driver = driver
         self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=64)
-        driver.emitter.subscribe(self.inbox)
+        if not lent:
+            driver.emitter.subscribe(self.inbox)
         self.commands_refused = 0
         self._bus = bus
         self._audit = audit
         self._allow_writes = allow_writes
         self._remote = remote
+        self._lent = lent
         self._busy = False
         self._sending = 0
         self._next_ns = 0
@@ -54,7 +64,9 @@ class MailboxPump:
         return self._remote
 
     def offer(self, payloads: list[bytes]) -> None:
-        """The control logic sent these, in order."""
+        """The control logic sent these, in order. Where the mailbox is lent, its thread has seen them in the process image."""
+        if self._lent:
+            return
         for payload in payloads:
             self.driver.consumer.observe(RESPONSE(payload))
 

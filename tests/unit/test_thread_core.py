@@ -481,3 +481,23 @@ def test_large_events_go_in_pieces_through_loss(seed: int) -> None:
     net = Net(seed, loss=0.2, repeat=0.1, delay_ms=300)
     net.sides[1].log(Event(0, 5, Kind.REFUSAL, "execute", "no " * 300))
     net.until_equal(within_s=2000)
+
+
+def test_on_a_slow_carrier_events_wait_for_company_and_what_is_urgent_does_not() -> None:
+    net = Net(1, delay_ms=2)
+    plant, shore = net.sides
+    plant.out.linger_ns = 500 * NS_PER_MS
+    for n in range(12):
+        plant.log(value(n))
+        net.run(0.1)
+    net.until_equal(within_s=2)
+    frames = net.sent
+    assert frames < 12, "six in a frame, and their ACKs"
+    net.run(5)
+    assert net.sent == frames, "and then it is silent"
+    plant.log(value(1))
+    net.run(0.3)
+    assert len(shore.store.logs["plant:1"]) == 12
+    plant.log(Event(0, 5, Kind.STATE, "relay", b"\1\0\0"))
+    net.run(0.1)
+    assert len(shore.store.logs["plant:1"]) == 14

@@ -147,6 +147,7 @@ def _tags(page: Page, gateway: Status) -> None:
     page.counter("published", "Values published.").add(gateway["published"])
     page.counter("logged", "Entries of the exchange log.").add(gateway["logged"])
     page.counter("log_dropped", "Entries that the exchange log lost.").add(gateway["log_dropped"])
+    page.counter("reloads", "Times that a changed configuration was taken over.").add(gateway["config"]["reloads"])
     page.gauge("store_ok", "Whether the disk took the log when that was tried last.").add(
         int(not gateway.get("store_error"))
     )

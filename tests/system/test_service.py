@@ -5,16 +5,33 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import urllib.request
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from procs import CHECKOUT, Asking, wait_for
 from prometheus_client.parser import text_string_to_metric_families
+
+VALUES = "010400000"  # unit 1, function 04 from the first input register on
+"""How a read of the sensor's values begins, in hex."""
+
+
+def ctd_polls(capture: Path) -> list[float]:
+    """When the gateway asked for the sensor's values, in seconds, by its own clock."""
+    lines = [json.loads(line) for line in capture.read_text(encoding="ascii").splitlines() if line.endswith("}")]
+    return [x["t_ns"] / 1e9 for x in lines if x["direction"] == "sent" and x["hex"].startswith(VALUES)]
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -37,7 +54,11 @@ def test_a_run_under_systemd(tmp_path: Path) -> None:
             "NOTIFY_SOCKET": str(tmp_path / "notify"),
             "WATCHDOG_USEC": "2000000",
         }
-        command = [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--log", "json"]
+        fieldtwin = [sys.executable, "-m", "fieldtwin"]
+        for name in ("observatory.yaml", "observatory.prototype.yaml"):
+            shutil.copy(CHECKOUT / "profiles" / "systems" / name, tmp_path)
+        system, capture = tmp_path / "observatory.yaml", tmp_path / "wires.jsonl"
+        command = [*fieldtwin, "run", str(system), "--prototype", "--log", "json", "--capture", str(capture)]
         process = subprocess.Popen(
             [*command, "--metrics", "0"], cwd=CHECKOUT, env=environment, stdout=subprocess.DEVNULL, stderr=said
         )
@@ -50,10 +71,35 @@ def test_a_run_under_systemd(tmp_path: Path) -> None:
                 samples = [s for f in text_string_to_metric_families(answer.read().decode()) for s in f.samples]
             assert {s.labels["process"] for s in samples if s.name == "fieldtwin_up"} == {"gateway", "plc", "field"}
 
+            # Three seconds of polls on either side of a reload, as the wire had them.
+            gateway_socket = Asking(str(run_dir / "observatory" / "gateway.sock"))
+            wait_for(lambda: len(ctd_polls(capture)) > 3)
+            edit(system, "values: {every_ms: 500}", "values: {every_ms: 1000}")
             process.send_signal(signal.SIGHUP)
-            wait_for(lambda: "not_reloaded" in Path(said.name).read_text(), what="SIGHUP is answered")
+            assert hear("RELOADING=1")
+            assert hear("READY=1")
+            before = len(ctd_polls(capture))
+            wait_for(lambda: '"reloaded"' in Path(said.name).read_text())
+            edit(system, "values: {every_ms: 1000}", "values: {every_ms: -1}")
+            process.send_signal(signal.SIGHUP)
+            wait_for(lambda: "not_reloaded" in Path(said.name).read_text(), what="a file that is not right is refused")
+            edit(system, "values: {every_ms: -1}", "values: {every_ms: 300}")
+            edit(system, "baudrate=19200", "baudrate=9600")
+            asked = subprocess.run(
+                [*fieldtwin, "reload", "observatory"], env=environment, cwd=CHECKOUT, capture_output=True, text=True
+            )
+            assert asked.returncode == 1
+            assert f"{system}:7:11: buses.line1.url" in asked.stdout
+            assert "Nothing was changed" in asked.stderr
+            wait_for(lambda: len(ctd_polls(capture)) >= before + 3)
+            slow = [b - a > 0.75 for a, b in pairwise(ctd_polls(capture)[1:])]
+            assert slow == sorted(slow), "first every 500 ms, and then every 1000"
+            assert 3 <= sum(slow) < len(slow)
+            status = gateway_socket("get")
+            assert status["config"]["reloads"] == 1
+            assert status["buses"]["line1"]["counters"]["missed_polls"] == 0
 
-            gateway = Asking(str(run_dir / "observatory" / "gateway.sock"))("ready")["pid"]
+            gateway = gateway_socket("ready")["pid"]
             os.kill(gateway, signal.SIGSTOP)
             try:
                 hear("STATUS=")  # a line of status that feeds no watchdog
@@ -70,4 +116,5 @@ def test_a_run_under_systemd(tmp_path: Path) -> None:
         events = [json.loads(line)["event"] for line in Path(said.name).read_text().splitlines()]
     assert events[0] == "started"
     assert {"bus_open", "device_online", "plc_state"} <= set(events)
+    assert [e for e in events if "reloaded" in e] == ["reloaded", "not_reloaded"]
     assert events[-1] == "stopping"

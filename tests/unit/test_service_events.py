@@ -42,6 +42,7 @@ def test_what_changes_is_told_once() -> None:
     after.gateway["buses"]["line1"].update(connected=False, error="no such device")
     after.gateway["writes"]["safe"] = True
     after.gateway["log_dropped"] = 4
+    after.gateway["config"] = {**after.gateway["config"], "reloads": 4}
     after = replace(after, plc={**after.plc, "state": "stopped", "error": "division by zero"})
     told = changes(before, after)
     assert names(told) == [
@@ -50,11 +51,13 @@ def test_what_changes_is_told_once() -> None:
         "device_online",
         "device_emcy",
         "plc_state",
+        "reloaded",
         "log_dropped",
         "outputs_safe",
     ]
     assert told[1].fields == {"device": "ctd0", "bus": "line1", "error": "no reply"}
     assert told[4].priority is Priority.ERROR
+    assert told[5].message == "reloaded: devices.ctd0.poll.values.every_ms: 500 -> 250"
     assert changes(after, after) == []
 
 

@@ -66,6 +66,7 @@ def gateway_status(devices: int = 1) -> dict[str, Any]:
         "published": 83,
         "logged": 2,
         "log_dropped": 1,
+        "config": {"hash": "ab12", "reloads": 3, "changed": ["devices.ctd0.poll.values.every_ms: 500 -> 250"]},
         "store_error": "",
     }
 

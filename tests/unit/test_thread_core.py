@@ -469,7 +469,7 @@ def test_who_comes_with_an_empty_store_is_given_everything_from_the_first(seed: 
     shore.origin = "shore:2"
     shore.restart(net.now_ns)
     shore.log(value(1))
-    if seed % 3 == 0:  # on a carrier that is a link from one to the other this is noticed at once, by brokers and modems not
+    if seed % 3 == 0:  # over TCP this is noticed at once, with brokers and modems between it is not
         plant.out.connected(net.now_ns)
     plant.log(value(400))
     net.until_equal(within_s=3600)

@@ -2,14 +2,14 @@
 #
 #   docker build -t fieldtwin . && docker run --rm fieldtwin run observatory --prototype --for 20s
 #
-# For a real serial port or CAN interface add --device=/dev/ttyUSB0 or --network=host.
+# For a real serial port or CAN interface add --device=/dev/ttyUSB0 or --network=host. docs/compose.md has the rest.
 FROM python:3.11-slim-bookworm AS build
 WORKDIR /src
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_ROOT_USER_ACTION=ignore
 RUN python -m venv --without-pip /opt/fieldtwin
-# What fieldtwin stands on, in a layer of its own: a change of our code does not fetch it again.
+# What fieldtwin stands on, and its client of a broker, in a layer of its own: a change of our code does not fetch it again.
 COPY pyproject.toml ./
-RUN python -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['dependencies'], sep='\n')" \
+RUN python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['project']; print(*p['dependencies'], *p['optional-dependencies']['mqtt'], sep='\n')" \
       > /tmp/requirements.txt \
  && pip --python /opt/fieldtwin/bin/python install -r /tmp/requirements.txt
 COPY . .
@@ -20,8 +20,11 @@ RUN pip --python /opt/fieldtwin/bin/python install --no-deps . \
 
 FROM python:3.11-slim-bookworm
 LABEL org.opencontainers.image.title="fieldtwin" org.opencontainers.image.licenses="Apache-2.0"
+# iproute2 makes the host's vcan0 (docker-compose's profile vcan); nothing else uses it.
+RUN apt-get update -qq && apt-get install -y -qq --no-install-recommends iproute2 \
+ && rm -rf /var/lib/apt/lists/* /var/cache/apt/*
 RUN useradd --uid 10001 --no-create-home --home-dir /nonexistent --shell /usr/sbin/nologin fieldtwin \
- && install -d -o fieldtwin -g fieldtwin -m 700 /run/fieldtwin
+ && install -d -o fieldtwin -g fieldtwin -m 700 /run/fieldtwin /var/lib/fieldtwin
 COPY --from=build /opt/fieldtwin /opt/fieldtwin
 COPY --from=build /src/scripts/container-health /usr/local/bin/container-health
 ENV PATH=/opt/fieldtwin/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin \

@@ -1,7 +1,8 @@
 """A system that runs in processes as a scenario's bench: asked over control channels, process image and capture file.
 
 A `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. What it can do is what can be reached: no field
-side, no faults; no capture, no wire. It starts nothing and ends nothing but its own connections.
+side, no faults; no capture, no wire. It starts nothing and ends nothing but its own connections. Where no gateway of ours runs, a
+scenario that is about probes only judges somebody else's controller, with the field side alone.
 """
 
 from __future__ import annotations
@@ -118,14 +119,9 @@ class ControlBench:
         await self._stack.aclose()
 
     async def _open(self) -> None:
-        where, layout = self._where, image_layout(self.system)
-        self._gateway = await self._connect("gateway")
-        self._plc = await self._connect("plc")
-        known = set((await self._gateway.call("get"))["tags"])
-        self._asked = [name for name in self._names if name in known]
-        image = self._stack.enter_context(attached(layout, where.run_dir / "image"))
-        self._outputs = image.reader(OUTPUTS)
-        self._words = {f"{p}.state": w for p, w in state_words(layout, self.system.plc.programs).items()}
+        where = self._where
+        if not self._foreign():
+            await self._open_controller()
         can = set()
         if not where.plant:
             await self._open_field()
@@ -151,6 +147,24 @@ class ControlBench:
         self._start_ns = self._clock.monotonic_ns()
         await self._refresh()
         self._updates.clear()
+
+    def _foreign(self) -> bool:
+        """No gateway of ours is here, and nothing is asked of one."""
+        probed = {name for probe in self._probe for name in probe.names}
+        asked = any(probe.serve for probe in self._probe) or not probed.issuperset(self._names)
+        return (
+            bool(probed) and not asked and not self._where.plant and not (self._where.run_dir / "gateway.sock").exists()
+        )
+
+    async def _open_controller(self) -> None:
+        where, layout = self._where, image_layout(self.system)
+        self._gateway = await self._connect("gateway")
+        self._plc = await self._connect("plc")
+        known = set((await self._gateway.call("get"))["tags"])
+        self._asked = [name for name in self._names if name in known]
+        image = self._stack.enter_context(attached(layout, where.run_dir / "image"))
+        self._outputs = image.reader(OUTPUTS)
+        self._words = {f"{p}.state": w for p, w in state_words(layout, self.system.plc.programs).items()}
 
     async def _connect(self, name: str) -> ControlClient:
         client = await ControlClient.connect_unix(self._where.run_dir / f"{name}.sock")
@@ -214,6 +228,8 @@ class ControlBench:
         return None if value is None else Reading(value, "good", "", 0.0, 0)
 
     def late_ms(self) -> float:
+        if self._plc is None:
+            raise UsageError("nobody can tell how late the scans of somebody else's controller are", where="plc.late")
         return self._late_ms
 
     def host_late_s(self, since_s: float) -> float:
@@ -271,16 +287,7 @@ class ControlBench:
         gone = self._gone()
         if gone is not None:
             raise gone
-        assert self._gateway is not None
-        answer = await self._gateway.call("watch", since=self._since, names=self._asked)
-        self._tags, self._seen_ns = answer["tags"], answer["now_ns"]
-        events: list[Event] = []
-        for number, t_ns, tag, value, quality, reason in answer["changes"]:
-            self._since = number
-            self._updates[tag] = self._updates.get(tag, 0) + 1
-            data = {"value": value, "quality": quality, "reason": reason.replace(" ", "_")}
-            events.append(Event(t_ns - self._start_ns, Kind.TAG, tag, data))
-        events += self._changed_states()
+        events = await self._changed_tags() + self._changed_states()
         if self._probes is not None:
             events += self._probes.changes(self._start_ns)
         if self._tail is not None:
@@ -288,12 +295,26 @@ class ControlBench:
         for event in sorted(events, key=lambda e: e.t_ns):
             if event.t_ns >= 0:
                 self.trace.note(*event)
-        if self.now_s() >= self._plc_due_s:
+        if self._plc is not None and self.now_s() >= self._plc_due_s:
             await self._ask_plc()
+
+    async def _changed_tags(self) -> list[Event]:
+        if self._gateway is None:
+            return []
+        answer = await self._gateway.call("watch", since=self._since, names=self._asked)
+        self._tags, self._seen_ns = answer["tags"], answer["now_ns"]
+        events = []
+        for number, t_ns, tag, value, quality, reason in answer["changes"]:
+            self._since = number
+            self._updates[tag] = self._updates.get(tag, 0) + 1
+            data = {"value": value, "quality": quality, "reason": reason.replace(" ", "_")}
+            events.append(Event(t_ns - self._start_ns, Kind.TAG, tag, data))
+        return events
 
     def _changed_states(self) -> list[Event]:
         """What programs show, looked at now; between two looks a value may have been another one unseen."""
-        assert self._outputs is not None
+        if self._outputs is None:
+            return []
         snapshot = self._outputs.snapshot()
         if not snapshot.counter:
             return []

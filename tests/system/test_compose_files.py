@@ -22,6 +22,8 @@ from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wai
 
 from fieldtwin.cli.main import cli
 from fieldtwin.running.field_contact import reachable
+from fieldtwin.running.shadowing import Shadowing
+from fieldtwin.running.twinning import Twinning
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from twin.prototype_file import load_prototype
@@ -33,35 +35,87 @@ PROTOTYPE_FILE = SYSTEMS / "observatory.compose.yaml"
 DOCKERFILE = (CHECKOUT / "Dockerfile").read_text(encoding="utf-8")
 COMPOSE: dict[str, Any] = yaml.safe_load((CHECKOUT / "docker-compose.yml").read_text(encoding="utf-8"))
 SERVICES: dict[str, Any] = COMPOSE["services"]
+OURS = {name: service for name, service in SERVICES.items() if service["image"].startswith("fieldtwin")}
+VARIABLE = r"\$\{[A-Z_]+:-([^}]*)\}"
+"""As the file writes one: with what it is by default."""
 SCRIPTS = [*sorted(p for p in (CHECKOUT / "scripts").iterdir() if p.is_file() and not p.suffix), CHECKOUT / ".ci/run"]
 
 
 # -- the compose file -----------------------------------------------------------------------------------------------
 
 
-def test_three_services_without_privileges_and_without_published_ports() -> None:
-    assert set(SERVICES) == {"field", "controller", "shore"}
+def profile(name: str) -> set[str]:
+    return {service for service, form in SERVICES.items() if name in form["profiles"]}
+
+
+def test_profiles_have_the_services_that_they_are_for() -> None:
+    assert profile("prototype") == {"field", "controller", "shore"}
+    assert profile("physical") == {"controller-physical"}
+    assert profile("twin") == {"field", "controller-twin", "shore-twin", "broker", "shadow", "twin"}
+    assert profile("vcan") == {"vcan", "field-vcan", "controller-vcan"}
+    assert profile("own-plc") == {"field-own-plc"}
+    assert (CHECKOUT / ".env").read_text(encoding="utf-8").splitlines()[-1] == "COMPOSE_PROFILES=prototype"
+
+
+def test_who_is_waited_for_comes_up_with_the_same_profile() -> None:
+    """Both compose 1.29 and 2 refuse a service that depends on one which its profile leaves out."""
+    for name, service in SERVICES.items():
+        for other in service.get("depends_on", {}):
+            assert set(service["profiles"]) <= set(SERVICES[other]["profiles"]), (name, other)
+
+
+def test_no_privileges_but_one_and_no_published_ports_but_one() -> None:
     for name, service in SERVICES.items():
         assert service["read_only"] is True, name
         assert service["cap_drop"] == ["ALL"], name
         assert "no-new-privileges:true" in service["security_opt"], name
-        asked = {"privileged", "cap_add", "devices", "ports", "network_mode", "pid", "user", "volumes"} & set(service)
-        assert not asked, (name, asked)
+        assert not {"privileged", "pid", "ipc", "userns_mode", "container_name", "external"} & set(service), name
+    assert {n: s["cap_add"] for n, s in SERVICES.items() if "cap_add" in s} == {"vcan": ["NET_ADMIN"]}
+    assert {n for n, s in SERVICES.items() if s.get("user") == "0:0"} == {"vcan"}, "and it ends at once"
+    assert {n for n, s in SERVICES.items() if "devices" in s} == {"controller-physical"}
+    assert {n for n, s in SERVICES.items() if s.get("network_mode") == "host"} == {
+        "controller-physical", *profile("vcan"),
+    }  # fmt: skip
+    ports = {n: s["ports"] for n, s in SERVICES.items() if "ports" in s}
+    assert ports == {"field-own-plc": ["${FIELDTWIN_BIND:-127.0.0.1}:${FIELDTWIN_PORT:-1502}:1502"]}
+    assert COMPOSE["networks"]["field"] == {"internal": True}
     assert re.search(r"^USER fieldtwin$", DOCKERFILE, re.MULTILINE)
+
+
+def test_one_image_and_the_broker_s() -> None:
+    images = {service["image"] for service in SERVICES.values()}
+    assert images == {"fieldtwin:compose", "eclipse-mosquitto:2"}
+    assert {s["build"] for s in OURS.values()} == {"."}
 
 
 def test_services_wait_for_health_and_never_sleep() -> None:
     assert SERVICES["controller"]["depends_on"] == {"field": {"condition": "service_healthy"}}
     assert SERVICES["shore"]["depends_on"] == {"controller": {"condition": "service_healthy"}}
-    for name in ("field", "controller"):
-        assert SERVICES[name]["healthcheck"]["test"][:2] == ["CMD", "container-health"]
+    ended = {"shore", "shore-twin", "vcan"}
+    for name, service in OURS.items():
+        assert (name in ended) or service["healthcheck"]["test"][:2] == ["CMD", "container-health"]
     assert "sleep" not in str(COMPOSE)
     assert "version" not in COMPOSE  # compose 2 warns about it; 1.29 reads the file as the specification without it
 
 
-@pytest.mark.parametrize("service", SERVICES)
+def test_a_folder_that_is_mounted_is_there_and_read_only() -> None:
+    for name, service in SERVICES.items():
+        for volume in service.get("volumes", []):
+            source, _, rest = re.sub(VARIABLE, r"\1", volume).partition(":")
+            if source.startswith("."):
+                assert (CHECKOUT / source).exists(), name
+                assert rest.endswith(":ro")
+            else:
+                assert source in COMPOSE["volumes"], "a named one: of this project, so that a second one has its own"
+
+
+@pytest.mark.parametrize("service", [name for name in OURS if name != "vcan"])
 def test_a_service_s_command_line_and_variables_are_known_to_the_program(service: str) -> None:
-    name, *args = (a.replace(IMAGE_SHARE, f"{CHECKOUT}/") for a in SERVICES[service]["command"])
+    mounts = {m.split(":")[1]: m.split(":")[0] for m in mounted(service) if m.startswith(".")}
+    texts = [re.sub(VARIABLE, r"\1", a).replace(IMAGE_SHARE, f"{CHECKOUT}/") for a in SERVICES[service]["command"]]
+    for inside, outside in mounts.items():
+        texts = [text.replace(f"{inside}/", f"{CHECKOUT / outside}/") for text in texts]
+    name, *args = texts
     command = cli.get_command(click.Context(cli), name)
     assert command is not None
     context = command.make_context(name, list(args))  # raises for an unknown option or a file that is not there
@@ -69,9 +123,15 @@ def test_a_service_s_command_line_and_variables_are_known_to_the_program(service
     judging = cli.get_command(click.Context(cli), "test")  # runs in a service's container, beside it
     assert judging is not None
     variables |= {f"FIELDTWIN_TEST_{(p.name or '').upper()}" for p in judging.params}
-    assert set(SERVICES[service]["environment"]) <= variables
-    token = SERVICES[service]["environment"][f"FIELDTWIN_{name.upper()}_TOKEN"]
-    assert token == "${FIELDTWIN_TOKEN:-for-demonstration-only}"
+    environment = SERVICES[service].get("environment", {})
+    assert set(environment) <= variables
+    if "token" in {p.name for p in context.command.params} and service != "controller-physical":
+        token = environment[f"FIELDTWIN_{name.upper()}_TOKEN"]
+        assert token == "${FIELDTWIN_TOKEN:-for-demonstration-only}"
+
+
+def mounted(service: str) -> list[str]:
+    return [re.sub(VARIABLE, r"\1", volume) for volume in SERVICES[service].get("volumes", [])]
 
 
 def test_the_memory_disk_is_the_run_directory_and_belongs_to_the_image_s_user() -> None:
@@ -79,13 +139,25 @@ def test_the_memory_disk_is_the_run_directory_and_belongs_to_the_image_s_user() 
     uid = re.search(r"useradd --uid (\d+)", DOCKERFILE)
     assert match
     assert uid
-    for service in SERVICES.values():
+    for service in OURS.values():
         where, _, options = service["tmpfs"][0].partition(":")
         assert where == match[1]
         assert {f"uid={uid[1]}", "mode=700"} <= set(options.split(","))
-    assert SERVICES["field"]["healthcheck"]["test"][2:] == [f"{match[1]}/observatory-field/field.sock"]
-    sockets = [f"{match[1]}/observatory/{p}.sock" for p in ("gateway", "plc")]
-    assert SERVICES["controller"]["healthcheck"]["test"][2:] == sockets
+    checked = {name: s["healthcheck"]["test"][2:] for name, s in OURS.items() if "healthcheck" in s}
+    plain = [f"{match[1]}/observatory/{p}.sock" for p in ("gateway", "plc")]
+    assert checked["field"] == checked["field-vcan"] == [f"{match[1]}/observatory-field/field.sock"]
+    assert checked["controller"] == checked["controller-twin"] == checked["controller-vcan"] == plain
+    assert checked["controller-physical"] == [f"{match[1]}/plant/{p}.sock" for p in ("gateway", "plc")]
+    assert checked["field-own-plc"] == [f"{match[1]}/field/field.sock"]
+    assert checked["shadow"] == [f"{match[1]}/observatory-shadow/{Shadowing.kind}.sock"]
+    assert checked["twin"] == [f"{match[1]}/observatory-twin/{Twinning.kind}.sock"]
+
+
+def test_what_is_kept_is_where_the_image_s_user_may_write() -> None:
+    kept = re.search(r"install -d -o fieldtwin -g fieldtwin -m 700 (.*)$", DOCKERFILE, re.MULTILINE)
+    assert kept
+    for service in ("controller-twin", "shadow", "twin"):
+        assert [m.split(":")[1] for m in mounted(service)] == [kept[1].split()[1]]
 
 
 # -- what goes into the image -----------------------------------------------------------------------------------------
@@ -103,14 +175,20 @@ def test_the_build_sees_everything_that_the_wheel_is_made_of() -> None:
     assert "scripts/container-health" in let_in
 
 
-def test_the_prototype_file_differs_from_the_shipped_one_in_where_it_listens_only() -> None:
+@pytest.mark.parametrize("name", ["observatory.compose.yaml", "observatory.vcan.yaml"])
+def test_the_prototype_file_differs_from_the_shipped_one_in_where_it_listens_only(name: str) -> None:
     system = load_system(str(SYSTEMS / "observatory.yaml"))
-    here, there = load_prototype(system), load_prototype(system, PROTOTYPE_FILE)
+    here, there = load_prototype(system), load_prototype(system, SYSTEMS / name)
     for bus in there.buses.values():
         assert bus.listen is not None
-        assert bus.listen.address[0] == "0.0.0.0"
-        assert bus.listen.address[1] != 0, "other containers and firewalls want to know the port beforehand"
         assert bus.pace == here.buses[bus.name].pace
+        if name == PROTOTYPE_FILE.name:
+            assert bus.listen.address[0] == "0.0.0.0"
+            assert bus.listen.address[1] != 0, "other containers and firewalls want to know the port beforehand"
+        elif bus.name == "can0":
+            assert str(bus.listen) == "can:socketcan/vcan0"
+        else:
+            assert bus.listen.address == ("127.0.0.1", 0), "a host's network: nobody else's business, and no clash"
     assert there.seed == here.seed
     for name, device in there.devices.items():
         ours = here.devices[name].form.model_dump(exclude={"far"})

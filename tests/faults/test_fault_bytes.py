@@ -382,7 +382,9 @@ def publish(payload: bytes, first: int = 0x30) -> bytes:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    st.lists(st.binary(min_size=1, max_size=300) | st.binary(min_size=16400, max_size=16400), max_size=4),
+    st.lists(
+        st.binary(min_size=1, max_size=300) | st.integers(0, 255).map(lambda byte: bytes([byte]) * 16400), max_size=4
+    ),
     st.sampled_from([Framing.THREAD, Framing.MQTT]),
     st.randoms(use_true_random=False),
 )

@@ -27,15 +27,22 @@ class ExchangeLog:
         self.dropped = 0
         try:
             self._db = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
-            refuse_newer(self._db, path)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            migrate(self._db, path)
-            self._db.execute("INSERT INTO run (system, prototype) VALUES (?, ?)", (system, prototype))
-            self._run = self._db.execute("SELECT max(id) FROM run").fetchone()[0]
+            try:
+                self._begin(system, prototype)
+            except BaseException:
+                self._db.close()
+                raise
         except sqlite3.DatabaseError as e:
             raise FileInvalid(
                 f"not a store of ours: {e}", path=str(path), hint="move it away; a new one is made"
             ) from e
+
+    def _begin(self, system: str, prototype: bool) -> None:
+        refuse_newer(self._db, self._path)
+        self._db.execute("PRAGMA journal_mode=WAL")
+        migrate(self._db, self._path)
+        self._db.execute("INSERT INTO run (system, prototype) VALUES (?, ?)", (system, prototype))
+        self._run = self._db.execute("SELECT max(id) FROM run").fetchone()[0]
 
     def append(self, rows: list[tuple[str, int, int, bytes]]) -> None:
         """Queue rows of (tag, sequence, monotonic ns, payload)."""

@@ -117,7 +117,7 @@ class Decoder:
         return f"{where}: {data.get('text', '')}"
 
     def _tag_value(self, where: str, value: Any) -> str:
-        device, _, name = where.partition(".")
+        device, _, name = where.rpartition(".")
         config = self._system.devices.get(device) if self._system else None
         if config is None or not isinstance(value, bool | int | float | str | None):
             return show_value(value)

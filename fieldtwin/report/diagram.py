@@ -59,7 +59,7 @@ def timing_diagram(window: Window, system: System | None, title: str) -> Markup:
 
 
 def _buses(window: Window) -> list[str]:
-    named = {name.partition(".")[0] for name in window.check.names}
+    named = {name.rpartition(".")[0] for name in window.check.names}
     buses = dict.fromkeys(e.bus for e in window.exchanges)
     about = {e.bus for e in window.exchanges if e.device in named or e.bus in named}
     return sorted(buses, key=lambda b: b not in about)[:MOST_BUSES]
@@ -69,11 +69,11 @@ def _chosen(window: Window, lanes: dict[str, list[Step]]) -> list[str]:
     """Those named; then of the same devices, then others; words before numbers, and what changed most. What is not named and
     always the same is left out, but for a state in words."""
     names = window.check.names
-    devices = {name.partition(".")[0] for name in names}
+    devices = {name.rpartition(".")[0] for name in names}
 
     def rank(name: str) -> tuple[int, bool, int]:
         steps = lanes[name]
-        about = 0 if name in names else 1 if name.partition(".")[0] in devices else 2
+        about = 0 if name in names else 1 if name.rpartition(".")[0] in devices else 2
         return about, not _in_words(steps), -len({(str(s.value), s.quality) for s in steps})
 
     def tells(name: str) -> bool:
@@ -90,7 +90,7 @@ def _in_words(steps: list[Step]) -> bool:
 
 
 def _tag(system: System | None, name: str) -> Tag | None:
-    device, _, tag = name.partition(".")
+    device, _, tag = name.rpartition(".")
     config = system.devices.get(device) if system else None
     return config.profile.tags.get(tag) if config else None
 

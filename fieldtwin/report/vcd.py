@@ -153,7 +153,7 @@ def _changes(events: Iterable[Event], system: System | None, machines: dict[str,
         data, t_ns = event.data, max(0, event.t_ns)
         match event.kind:
             case Kind.TAG:
-                scope, _, name = event.where.partition(".")
+                scope, _, name = event.where.rpartition(".")
                 if data.get("value") is not None and event.where not in secrets:
                     yield t_ns, scope, name or "value", data["value"], 0
                 yield t_ns, scope, f"{name}_quality", _QUALITIES.get(data.get("quality", ""), 4), _QUALITY_BITS

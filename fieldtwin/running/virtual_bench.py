@@ -5,11 +5,12 @@ A `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `Virtua
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
+from emulators.models.packet_link import ModemEnd
 from emulators.virtual.loop import VirtualLoop
 from fieldtwin.conformance.case import Danger
 from fieldtwin.running.probes import Probes
@@ -38,6 +39,7 @@ class VirtualBench:
     """``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
 
     `commands` is what the far end commands by itself; a scenario does that with `send`. `far_end` False leaves it out.
+    `water`: the ends of transmitters that are in a network's.
     """
 
     def __init__(
@@ -52,12 +54,20 @@ class VirtualBench:
         commands: list[Scripted] | None = None,
         far_end: bool = True,
         probes: Sequence[Probe] = (),
+        water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
         self.system = system
         self.trace = trace
         self.loop = loop
         self.run = VirtualPrototype(
-            system, prototype, loop, run_dir, seed=seed, taps=[_FrameTap(self, system)], on_change=self._changed
+            system,
+            prototype,
+            loop,
+            run_dir,
+            seed=seed,
+            taps=[_FrameTap(self, system)],
+            on_change=self._changed,
+            water=water,
         )
         self.shore: Shore | None = None
         self._commands = commands or []

@@ -13,6 +13,7 @@ from fieldtwin.report.coverage import Collector
 from fieldtwin.report.machines import machines_of
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner
@@ -24,8 +25,9 @@ from twin.prototype_file import load_prototype
 
 def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | None = None) -> ScenarioResult:
     """Run it. `seed` before the scenario's own and the prototype file's."""
-    prototype = load_prototype(scenario.system, prototype_of(scenario))
-    chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else prototype.seed
+    prototype = load_prototype(scenario.system, prototype_of(scenario)) if scenario.network is None else None
+    own = prototype.seed if prototype is not None else scenario.network.seed if scenario.network is not None else 0
+    chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else own
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
     loop = VirtualLoop()
@@ -37,6 +39,10 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
         trace.listeners.append(collector.feed)
 
         async def main() -> ScenarioResult:
+            if scenario.network is not None:
+                async with VirtualNetwork(scenario.network, loop, Path(folder), trace, seed=chosen) as whole:
+                    return await Runner(scenario, whole.bench).run()
+            assert prototype is not None
             async with VirtualBench(
                 scenario.system, prototype, loop, Path(folder), trace, seed=chosen, probes=scenario.probes
             ) as bench:

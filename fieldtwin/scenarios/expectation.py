@@ -55,7 +55,7 @@ async def judge_tag(expect: Expect, watched: Watched) -> Said:
 
 def is_secret(system: System, name: str) -> bool:
     """Whether nobody is to see the value of DEVICE.TAG."""
-    device, _, tag = name.partition(".")
+    device, _, tag = name.rpartition(".")
     found = system.devices[device].profile.tags.get(tag) if device in system.devices else None
     return found is not None and found.secret
 
@@ -75,7 +75,7 @@ async def _judge_value(expect: Expect, watched: Watched, reading: Reading) -> Sa
 async def _like_held(expect: Expect, watched: Watched, value: object, reading_age_s: float) -> Said:
     """The tag against what its device holds, or held when the tag was read."""
     assert expect.tag is not None
-    device, _, name = expect.tag.partition(".")
+    device, _, name = expect.tag.rpartition(".")
     tag = watched.system.devices[device].profile.tags[name]
     held = await watched.bench.held(expect.tag)
     can = watched.system.buses[watched.system.devices[device].bus].endpoint.is_can

@@ -10,14 +10,16 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from emulators.faults.schema import checked, parse_fault, seconds
+from emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.expression import Expression, NotUnderstood
 from fieldtwin.scenarios.probe_form import Probe, ProbeForm, read_probe
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.fault_aims import target
+from twin.network import WATER, Network, load_network, network_file
 from twin.system import System, load_system
+from twin.water_faults import check_water_fault
 
 Time = str | float | int
 Number = float | int
@@ -165,8 +167,12 @@ class Scenario:
     never: tuple[Expression | WireForm, ...]
     known: tuple[str, ...] = ()
     """What expressions may name."""
+    own: tuple[str, ...] = ()
+    """Of these, what is the system's."""
     probes: tuple[Probe, ...] = ()
     profiles: tuple[Path, ...] = ()
+    network: Network | None = None
+    """Of which `system` is the whole, if it is a network's scenario."""
     used: set[str] = field(default_factory=set, compare=False)
     """The tags and variables that it is about."""
 
@@ -200,10 +206,12 @@ class Scenario:
         )  # fmt: skip
 
 
-def names_of(system: System) -> list[str]:
-    """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE."""
+def names_of(system: System, network: Network | None = None) -> list[str]:
+    """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE; in a network behind the name of their system."""
     from twin.physical import image_layout
 
+    if network is not None:
+        return [f"{m.name}.{name}" for m in network.members.values() for name in names_of(m.system)]
     tags = [f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()]
     variables = [spec.name for region in image_layout(system).regions for spec in region.tags]
     return list(dict.fromkeys([*tags, *variables]))
@@ -219,15 +227,22 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
     file = load(path)
     form = validate(file, ScenarioForm)
     beside = path.parent / form.system
-    system = load_system(str(beside) if beside.exists() else form.system.removesuffix(".yaml"), list(profiles))
+    named = str(beside) if beside.exists() else form.system.removesuffix(".yaml")
+    at = network_file(named, profiles)
+    network = load_network(at, profiles) if at is not None else None
+    if network is not None:
+        _check_of_network(file, form)
+    system = network.whole if network is not None else load_system(named, list(profiles))
     served = [one.name for one in system.serving.serve]
     probes = tuple(read_probe(file, name, one, served) for name, one in form.probes.items())
-    own = names_of(system)
+    own = names_of(system, network)
     for probe in probes:
         if probe.name in system.devices or probe.name in system.plc.programs:
             raise file.error(("probes", probe.name), f"{probe.name!r} is a device or program of the system already")
     known = tuple(dict.fromkeys([*own, *(name for probe in probes for name in probe.names)]))
-    scenario = Scenario(path, form, file, system, _needs(file, form), (), (), known, probes, profiles)
+    scenario = Scenario(
+        path, form, file, system, _needs(file, form), (), (), known, tuple(own), probes, profiles, network
+    )
     always = tuple(scenario.expression(text, "always", n) for n, text in enumerate(form.always))
     never: list[Expression | WireForm] = []
     for n, one in enumerate(form.never):
@@ -287,18 +302,35 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
     try:
         if step.fault is not None:
             spec = parse_fault(step.fault, file, (*loc, "fault"), n + 1)
-            checked(lambda one: target(scenario.system, one), spec, file, (*loc, "fault"))
+            checked(lambda one: _aim(scenario, one), spec, file, (*loc, "fault"))
         if step.wait is not None:
             scenario.expression(step.wait.until, *loc, "wait", "until")
             seconds(step.wait.within)
         if step.pause is not None:
             seconds(step.pause)
         if step.set is not None:
-            _known(file, (*loc, "set", "tag"), "tag", step.set.tag, names_of(scenario.system))
+            _known(file, (*loc, "set", "tag"), "tag", step.set.tag, scenario.own)
         if step.expect is not None:
             _check_expect(scenario, step.expect, (*loc, "expect"))
     except UsageError as e:
         raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+
+
+def _aim(scenario: Scenario, spec: FaultSpec) -> None:
+    """Raises `WrongAim` for what is not there, in the system or between the systems of a network."""
+    if scenario.network is not None and spec.aim.bus == WATER:
+        check_water_fault(scenario.network, spec)
+    else:
+        target(scenario.system, spec)
+
+
+def _check_of_network(file: YamlFile, form: ScenarioForm) -> None:
+    """What is of one system only."""
+    for key in ("probes", "prototype"):
+        if getattr(form, key):
+            raise file.error(
+                (key,), f"{key!r} says nothing about a network", expected="a scenario of one of its systems"
+            )
 
 
 def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> None:
@@ -316,7 +348,7 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
         raise scenario.file.error(loc, "a rate is one of some time", expected="during: 10s")
     if expect.quality is not None:
         _known(scenario.file, (*loc, "quality"), "quality", expect.quality, _QUALITIES)
-    if expect.like is not None and (expect.tag or "").partition(".")[0] not in scenario.system.devices:
+    if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
         raise scenario.file.error((*loc, "like"), "only what a device holds can be like it", expected="tag: DEVICE.TAG")
     if expect.tag is not None:
         _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known)

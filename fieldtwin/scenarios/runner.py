@@ -173,7 +173,7 @@ class Runner:
             self._sent_s = bench.now_s()
             await bench.send(step.send.period_s)
         elif step.set is not None:
-            device, _, tag = step.set.tag.partition(".")
+            device, _, tag = step.set.tag.rpartition(".")
             await bench.set_value(device, tag, step.set.value)
         elif step.fault is not None:
             await bench.inject({"id": f"step {n + 1}", **step.fault})

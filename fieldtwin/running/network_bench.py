@@ -1,0 +1,141 @@
+"""Several running systems and the water between them as one scenario's bench: names are ``SYSTEM.DEVICE.TAG``.
+
+Each system has a bench of its own and knows of no other; here they are asked by name, and what they note goes into one trace. It
+starts and ends nothing: that is for who makes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from fieldtwin.conformance.case import Danger
+from fieldtwin.running.shore import Shore
+from fieldtwin.scenarios.bench import Bench, Can, Reading
+from fieldtwin.scenarios.trace import Kind, Trace
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import UsageError
+from twin.network import WATER, Network
+from twin.water_faults import WaterFaults
+
+
+class MemberTrace(Trace):
+    """What one system's bench notes, in the trace of all, under its name. `later_ns`: by how much it began later."""
+
+    def __init__(self, whole: Trace, member: str, later_ns: Callable[[], int]) -> None:
+        super().__init__(0)
+        self._later_ns = later_ns
+        self._whole = whole
+        self._prefix = f"{member}."
+
+    @property
+    def offset_ns(self) -> int:
+        return self._later_ns()
+
+    def note(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
+        if kind is Kind.FAULT:
+            if data.get("target"):
+                data = {**data, "target": self._prefix + data["target"]}
+        else:
+            where = self._prefix + where
+        self._whole.note(t_ns + self.offset_ns, kind, where, data)
+
+
+@dataclass
+class Part:
+    """One system of the network: its bench, and where that notes."""
+
+    bench: Bench
+    trace: MemberTrace
+
+
+class NetworkBench:
+    """A `fieldtwin.scenarios.bench.Bench`. `parts` by the names of the network's members; `shore` commands from the ship."""
+
+    def __init__(self, network: Network, trace: Trace, target: str, faults: WaterFaults) -> None:
+        self.network = network
+        self.trace = trace
+        self.target = target
+        self.allowed = Danger.DISRUPT
+        self.parts: dict[str, Part] = {}
+        self.shore: Shore | None = None
+        self.faults = faults
+        self._where: dict[str, str] = {}
+        """Fault to the system, or the water, that it is in."""
+
+    @property
+    def can(self) -> frozenset[Can]:
+        """What all can; commands come from the ship."""
+        can = frozenset.intersection(*(part.bench.can for part in self.parts.values())) - {Can.SEND_COMMAND, Can.PROBE}
+        return can | ({Can.SEND_COMMAND} if self.shore is not None else frozenset())
+
+    def _part(self, name: str) -> tuple[Part, str]:
+        member, local = self.network.split(name)
+        return self.parts[member], local
+
+    def now_ns(self) -> int:
+        """Since the start."""
+        return round(self.now_s() * NS_PER_S)
+
+    # -- Bench ----------------------------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        """The first system began first."""
+        return next(iter(self.parts.values())).bench.now_s()
+
+    async def sleep_until_s(self, t_s: float) -> None:
+        for part in self.parts.values():  # behind the first nobody waits any more, but looks
+            await part.bench.sleep_until_s(t_s - part.trace.offset_ns / NS_PER_S)
+
+    def names(self) -> list[str]:
+        return [f"{member}.{name}" for member, part in self.parts.items() for name in part.bench.names()]
+
+    def reading(self, name: str) -> Reading | None:
+        part, local = self._part(name)
+        return part.bench.reading(local)
+
+    def late_ms(self) -> float:
+        return max(part.bench.late_ms() for part in self.parts.values())
+
+    def host_late_s(self, since_s: float) -> float:
+        return max(part.bench.host_late_s(since_s - part.trace.offset_ns / NS_PER_S) for part in self.parts.values())
+
+    async def send(self, period_s: int) -> None:
+        if self.shore is None:
+            raise UsageError("nobody can command this network", expected="`ship:` in its file")
+        self.shore.send(period_s)
+
+    async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
+        part, local = self._part(device)
+        await part.bench.set_value(local, tag, value)
+
+    async def inject(self, fault: dict[str, Any]) -> None:
+        aim = str(fault.get("device") or fault.get("bus") or "")
+        if fault.get("bus") == WATER:
+            id = self.faults.inject(fault)
+            self._where[id] = WATER
+            target = f"{WATER} {fault.get('device', '')}".strip()
+            self.trace.note(
+                self.now_ns(), Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault}
+            )
+            return
+        part, _ = self._part(aim)
+        local = {key: self.network.split(fault[key])[1] if key in ("device", "bus") else fault[key] for key in fault}
+        await part.bench.inject(local)
+        self._where[str(fault["id"])] = self.network.split(aim)[0]
+
+    async def clear(self, id: str) -> None:
+        where = self._where.pop(id, None)
+        if where is None:
+            raise UsageError(f"no fault {id!r} is in", expected=", ".join(self._where) or "one; there is none")
+        if where == WATER:
+            self.faults.clear(id)
+            self.trace.note(self.now_ns(), Kind.FAULT, id, {"name": "", "on": False, "target": ""})
+        else:
+            await self.parts[where].bench.clear(id)
+
+    async def held(self, name: str) -> list[tuple[float, bytes]]:
+        part, local = self._part(name)
+        offset_s = part.trace.offset_ns / NS_PER_S
+        return [(t_s + offset_s, raw) for t_s, raw in await part.bench.held(local)]

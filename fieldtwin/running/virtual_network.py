@@ -1,0 +1,108 @@
+"""A network in virtual time: the prototypes of all its systems in one loop, with the water between their modems and one seed.
+
+Each system is as it is alone (`VirtualBench`); what they hear of each other comes through their modems.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from dataclasses import replace
+from pathlib import Path
+
+from emulators.models.acoustic_link import AcousticLink
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.ports import MemoryNet
+from fieldtwin.running.network_bench import MemberTrace, NetworkBench, Part
+from fieldtwin.running.shore import Scripted, Shore
+from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
+from gateway.core.nursery import Nursery
+from twin.network import Network
+from twin.ship import Ship
+from twin.water_faults import WaterFaults
+
+SEEDS_APART = 1_000_003
+"""Between the systems of a run: none plays another one's chances."""
+
+
+class VirtualNetwork:
+    """``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`; `it.bench` is a scenario's.
+
+    `folder` takes each system's audit log. `commands` is what the ship commands by itself; a scenario does that with `send`.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        loop: VirtualLoop,
+        folder: Path,
+        trace: Trace,
+        *,
+        seed: int,
+        commands: list[Scripted] | None = None,
+    ) -> None:
+        self.network = network
+        self.trace = trace
+        self.faults = WaterFaults(network, seed)
+        self.medium = network.medium(seed, self.faults.spoils)
+        self.bench = NetworkBench(network, trace, "virtual", self.faults)
+        self.systems: dict[str, VirtualBench] = {}
+        self._loop = loop
+        self._folder = folder
+        self._seed = seed
+        self._commands = commands or []
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> VirtualNetwork:
+        try:
+            await self._start()
+        except BaseException:
+            await self._stack.aclose()
+            raise
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        await self._stack.aclose()
+
+    async def _start(self) -> None:
+        for number, (name, member) in enumerate(self.network.members.items()):
+            folder = self._folder / name
+            folder.mkdir()
+            notes = MemberTrace(self.trace, name, self._later(name))
+            seed = member.prototype.seed + SEEDS_APART * self._seed + number
+            bench = VirtualBench(
+                member.system,
+                replace(member.prototype, seed=seed),
+                self._loop,
+                folder,
+                notes,
+                far_end=False,
+                water={member.modem: AcousticLink(self.medium, name)},
+            )
+            self.systems[name] = bench
+            await self._stack.enter_async_context(bench)
+            self.bench.parts[name] = Part(bench, notes)
+        self.faults.start_ns = next(iter(self.systems.values())).run.started_ns
+        if self.network.ship is not None:
+            await self._board()
+
+    def _later(self, name: str) -> Callable[[], int]:
+        """By how much a system began later than the first."""
+        return lambda: self.systems[name].run.started_ns - next(iter(self.systems.values())).run.started_ns
+
+    async def _board(self) -> None:
+        """The ship, and who commands from it."""
+        clock, net = VirtualClock(self._loop), MemoryNet(self._loop)
+        ship = Ship(self.network, self.medium, clock)
+        endpoint = await ship.open(net)
+        self._stack.push_async_callback(ship.aclose)
+        self.bench.shore = shore = Shore(ship.like.system, ship.like.modem, endpoint, clock, net)
+        shore.on_send = self._commanded
+        nursery = await self._stack.enter_async_context(Nursery())
+        nursery.start(shore.run(self._commands), "ship")
+
+    def _commanded(self, period_s: int) -> None:
+        data = {"text": f"commands {period_s} s", "period_s": period_s}
+        self.trace.note(self.bench.now_ns(), Kind.NOTE, FAR_END, data)

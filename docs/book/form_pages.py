@@ -17,6 +17,7 @@ KINDS = {
     "scenario": "What is done and what must be seen. `NAME.scenario.yaml`",
     "faults": "What goes wrong, for `run --faults` and `link --faults`.",
     "waivers": "Failures that somebody answers for, for `check` and `test`.",
+    "rules": "What a digital twin commands by what it finds, for `twin --plan`.",
 }
 PROFILES = Path(__file__).resolve().parents[2] / "profiles" / "devices"
 

@@ -125,12 +125,18 @@ def test_lines_stay_in_a_narrow_terminal():
         assert max(map(len, leaves)) <= 80
 
 
-@pytest.mark.parametrize("name", SHIPPED)
-def test_the_pictures_of_the_book_are_of_today(name: str):
-    command = f"fieldtwin draw {name} --prototype -o docs/wires/{name}.svg"
-    path = ROOT / "docs" / "wires" / f"{name}.svg"
-    assert path.is_file(), command
-    assert path.read_text("utf-8") == svg(of(name)), command
+PICTURES = sorted((ROOT / "docs" / "wires").glob("*.svg"))
+
+
+@pytest.mark.parametrize("picture", PICTURES, ids=lambda path: path.stem)
+def test_a_picture_of_the_book_is_of_today_and_on_its_page(picture: Path):
+    command = f"fieldtwin draw {picture.stem} --prototype -o docs/wires/{picture.name}"
+    assert picture.read_text("utf-8") == svg(of(picture.stem)), command
+    assert f"(wires/{picture.name})" in (ROOT / "docs" / "systems.md").read_text("utf-8")
+
+
+def test_the_book_has_the_wires_of_each_kind_of_system():
+    assert {picture.stem for picture in PICTURES} >= {"observatory", "lab_vehicle", "silage_tractor"}
 
 
 def test_the_command_prints_text_data_or_a_picture(tmp_path: Path):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from fieldtwin.testing.outcome import Outcome
     from fieldtwin.testing.results import Results
     from fieldtwin.testing.runner import Runner
+    from fieldtwin.testing.running_plc import RunningPlc
     from fieldtwin.testing.scenario_file import ScenarioFile
     from fieldtwin.testing.wire import Wire
 
@@ -199,14 +200,20 @@ def wire(request: pytest.FixtureRequest) -> Wire:
 
 
 @pytest.fixture
-def plc(request: pytest.FixtureRequest) -> Iterator[Plc]:
+def plc(request: pytest.FixtureRequest) -> Iterator[Plc | RunningPlc]:
     """The program that ``@pytest.mark.fieldtwin(plc=...)`` names: a source as in a system file, beside the test; with
-    ``system=``, a program of that system."""
+    ``system=``, a program of that system. Without ``plc=``, the gateway and PLC of `prototype`, as they run."""
     from fieldtwin.testing.handles import Plc
+    from fieldtwin.testing.running_plc import RunningPlc
 
     said, runner = _said(request), _runner(request.config)
+    if "plc" not in said and "system" in said:
+        whole: Prototype = request.getfixturevalue("prototype")
+        places = _places(request)
+        yield _or_fail(lambda: RunningPlc(runner, whole.id, places["profiles"]))
+        return  # it ends with the field side
     if "plc" not in said:
-        pytest.fail('which program? @pytest.mark.fieldtwin(plc="pump.st")', pytrace=False)
+        pytest.fail('which program? @pytest.mark.fieldtwin(plc="pump.st"), or system="observatory"', pytrace=False)
     folders = (str(request.node.path.parent),)
     made: Plc = _or_fail(
         lambda: Plc(runner, said["plc"], folders, said.get("cycle_ms", 10.0), system=said.get("system", ""))

@@ -1,4 +1,4 @@
-"""What one test has: a field side on wires of its own, with what is said on them, or a program that it steps.
+"""What one test has: a field side on wires of its own, with what is said on them, and if it wants, the gateway and PLC before it.
 
 A `Bench` lives from `open` to `aclose`; its folder holds its files and virtual serial ports, and goes with it.
 """
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.testhost.one_device import endpoint_words
+from fieldtwin.testhost.running_plc import RunningPlc
 from fieldtwin.testhost.wire_log import WireLog
 from gateway.core.clock import Clock
 from gateway.core.connection import CanConnection
@@ -33,6 +34,8 @@ class Bench:
         self.system = system
         self.field = FieldSide(system, prototype, folder, clock)
         self.log = WireLog(system, clock)
+        self.plc: RunningPlc | None = None
+        self._clock = clock
         self._folder = folder
         self._nursery = Nursery()
         self._ears: list[CanConnection] = []
@@ -54,7 +57,16 @@ class Bench:
         except ConnectionLost:
             await asyncio.Event().wait()  # the bus is gone, the test may go on
 
+    async def control(self, profiles: tuple[str, ...] = ()) -> None:
+        """Start the system's gateway and PLC against this field side. Once is enough."""
+        if self.plc is None:
+            plc = RunningPlc(self.system, self.field, self._clock, self._folder)
+            await plc.open(profiles)
+            self.plc = plc
+
     async def aclose(self) -> None:
+        if self.plc is not None:
+            await self.plc.aclose()
         await self._nursery.__aexit__(None, None, None)
         for ear in self._ears:
             await ear.aclose()
@@ -90,6 +102,8 @@ class Bench:
         failure = self._nursery.failure()
         if failure is not None:
             raise failure
+        if self.plc is not None:
+            self.plc.alive()
 
     def set(self, device: str, tag: str, value: Any) -> None:
         """From now on `device` holds `value` for `tag`; None: what it says by itself again."""

@@ -17,6 +17,7 @@ from typing import Any
 from fieldtwin.__about__ import __version__
 from fieldtwin.testhost.bench import Bench, new_folder
 from fieldtwin.testhost.one_device import Wanted, write_system
+from fieldtwin.testhost.running_plc import RunningPlc
 from fieldtwin.testhost.stepped_program import SteppedProgram
 from gateway.core.control import MAX_LINE, ControlServer
 from gateway.core.errors import UsageError
@@ -75,6 +76,10 @@ class Host:
             "fault": self._fault,
             "clear": self._clear,
             "exchanges": self._exchanges,
+            "control": self._control,
+            "image": self._image,
+            "steer": self._steer,
+            "send": self._send,
             "program": self._program,
             "input": self._input,
             "scan": self._scan,
@@ -176,6 +181,29 @@ class Host:
         log = self._bench(args).log
         found = log.since(int(args.get("since") or 0))
         return {"exchanges": found, "last": log.number}
+
+    # -- gateway and PLC before a field side ------------------------------------------------------------------------------
+
+    async def _control(self, args: dict[str, Any]) -> dict[str, Any]:
+        bench = self._bench(args)
+        await bench.control(tuple(args.get("profiles") or ()))
+        return {"names": await self._plc(args).names()}
+
+    def _plc(self, args: dict[str, Any]) -> RunningPlc:
+        plc = self._bench(args).plc
+        if plc is None:
+            raise UsageError("no PLC runs there", hint="`control` starts one")
+        return plc
+
+    async def _image(self, args: dict[str, Any]) -> dict[str, Any]:
+        return await self._plc(args).tag(str(args.get("tag", "")))
+
+    async def _steer(self, args: dict[str, Any]) -> dict[str, Any]:
+        return await self._plc(args).steer(str(args.get("do", "")), dict(args.get("args") or {}))
+
+    async def _send(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._plc(args).send(int(args.get("period_s") or 0))
+        return {}
 
     # -- programs -------------------------------------------------------------------------------------------------------
 

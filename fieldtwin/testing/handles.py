@@ -81,6 +81,7 @@ class Prototype:
     """The emulated field side of a system. ``prototype["ctd"]`` is a `Device`; `buses` and `far` say where things are."""
 
     def __init__(self, runner: Runner, description: dict[str, Any]) -> None:
+        self.id: int = description["id"]
         self.system: str = description["system"]
         self.file: str = description["file"]
         self.buses = {name: Endpoint(words) for name, words in description["buses"].items()}

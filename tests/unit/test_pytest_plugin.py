@@ -142,11 +142,30 @@ def test_no_such_device(device): ...
 def test_a_node_on_can(device, wire):
     assert (device.interface, device.node) == ("fieldtwin", 9)
     assert device.held("slope_long") is not None
+
+@pytest.mark.fieldtwin(system="observatory")
+def test_a_running_plc_is_steered(prototype, plc):
+    with pytest.raises(KeyError, match="relay.state"):
+        plc["relay.stat"]
+    with pytest.raises(AssertionError, match="'ACTIVE' within 0.1 s; it is 'STANDBY', good"):
+        plc.wait("relay.state", "ACTIVE", within_s=0.1)
+    plc.pause()
+    plc.step(2)
+    plc.go()
+    with plc.force("ctd.pressure", 3.0):
+        assert plc.tag("ctd.pressure")["forced"]["by"] == "test"
+        assert plc.quality("ctd.pressure") == "simulated"
+    assert plc.tag("ctd.pressure")["forced"] is None
+    plc.send(1)
+    plc.wait("relay.state", "ACTIVE")
+    assert plc.why("relay.state")[0]["program"] == "relay"
+    plc.restart(cold=True)
+    plc.wait("relay.state", "STANDBY")
 """
     pytester.makeconftest(HIDDEN)
     pytester.makepyfile(test_docs=docs, test_more=fails)
     result = pytester.runpytest_subprocess(*LOADED, "--junit-xml=out.xml", "-ra")
-    result.assert_outcomes(passed=len(re.findall(r"def test_", docs)) + 1, failed=1, errors=1)
+    result.assert_outcomes(passed=len(re.findall(r"def test_", docs)) + 2, failed=1, errors=1)
     result.stdout.fnmatch_lines(["*on the wire*", "*read input registers 30001*voltage_l1 1.5*"])
     result.stdout.fnmatch_lines(["*no device*eastron-sdm360*"])
     properties = [p.get("value") for p in ElementTree.parse(pytester.path / "out.xml").iter("property")]

@@ -1,0 +1,104 @@
+"""A PLC that runs, with its gateway, against an emulated field side: its tags, states and variables; forces, single scans.
+
+Standard library only: see `fieldtwin.testing.runner`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from difflib import get_close_matches
+from typing import Any
+
+from fieldtwin.testing.runner import Runner
+
+POLL_S = 0.02
+WITHIN_S = 10.0
+
+
+class RunningPlc:
+    """``plc["relay.state"]`` is a program's variable or a tag of a device as the PLC has it now, a state by its name.
+
+    It runs by the wall clock; `wait` waits. What a test steers goes on record as done by ``test``, as what people do.
+    """
+
+    def __init__(self, runner: Runner, bench: int, profiles: Sequence[str] = ()) -> None:
+        self._runner = runner
+        self._bench = bench
+        self.names: tuple[str, ...] = tuple(runner.call("control", id=bench, profiles=list(profiles))["names"])
+
+    def tag(self, name: str) -> dict[str, Any]:
+        """All that is known of it: ``value``, ``quality``, ``reason``, ``age_s``, ``unit``, ``forced``, ``side`` (input or
+        output)."""
+        __tracebackhide__ = True
+        if name not in self.names:
+            near = get_close_matches(name, self.names, n=3) or self.names[:10]
+            raise KeyError(f"no tag or variable {name!r}; there are {', '.join(near)}")
+        row: dict[str, Any] = self._runner.call("image", id=self._bench, tag=name)
+        return row
+
+    def __getitem__(self, name: str) -> Any:
+        __tracebackhide__ = True
+        return self.tag(name)["value"]
+
+    def quality(self, name: str) -> str:
+        """``good``, ``simulated``, ``uncertain``, ``stale`` or ``bad``."""
+        __tracebackhide__ = True
+        return str(self.tag(name)["quality"])
+
+    def wait(self, name: str, value: Any = ..., *, quality: str = "", within_s: float = WITHIN_S) -> Any:
+        """Until it is `value`, or of `quality`, or both; the value then. `AssertionError` with what it was, after `within_s`."""
+        __tracebackhide__ = True
+        until = time.monotonic() + within_s
+        while True:
+            row = self.tag(name)
+            if (value is ... or row["value"] == value) and quality in ("", row["quality"]):
+                return row["value"]
+            if time.monotonic() >= until:
+                wanted = " and ".join([f"{value!r}"] * (value is not ...) + [f"of quality {quality!r}"] * bool(quality))
+                raise AssertionError(
+                    f"{name} was to be {wanted} within {within_s:g} s; it is {row['value']!r}, {row['quality']}"
+                )
+            time.sleep(POLL_S)
+
+    def send(self, period_s: int) -> None:
+        """The far end of the system's transmitter commands a period, as `fieldtwin shore` does."""
+        __tracebackhide__ = True
+        self._runner.call("send", id=self._bench, period_s=period_s)
+
+    @contextmanager
+    def force(self, tag: str, value: float | str | bool) -> Iterator[None]:
+        """``with plc.force("ctd.pressure", 3.5):`` programs see that, with the quality ``simulated``; a forced output is what
+        goes out."""
+        self._steer("force", tag=tag, value=value)
+        try:
+            yield
+        finally:
+            self._steer("unforce", tag=tag)
+
+    def pause(self) -> None:
+        """Execute nothing more, until `go`; outputs stay."""
+        self._steer("pause")
+
+    def step(self, scans: int = 1) -> None:
+        """So many scans, while paused."""
+        self._steer("step", count=scans)
+
+    def go(self) -> None:
+        self._steer("go")
+
+    def restart(self, *, cold: bool = False) -> None:
+        """Make the programs anew; `cold`: without what is retained."""
+        self._steer("restart", cold=cold)
+
+    def why(self, tag: str) -> list[dict[str, Any]]:
+        """Which program changed it last, when, and what it saw."""
+        __tracebackhide__ = True
+        changes: list[dict[str, Any]] = self._steer("why", tag=tag)["changes"]
+        return changes
+
+    def _steer(self, verb: str, **args: Any) -> dict[str, Any]:
+        __tracebackhide__ = True
+        answer: dict[str, Any] = self._runner.call("steer", id=self._bench, do=verb, args=args)
+        return answer

@@ -37,11 +37,16 @@ Kind = Literal[
 ]  # fmt: skip
 DocumentKind = Literal["", "blueprint", "technical-manual", "bill-of-materials", "generic"]
 CODE_SUFFIXES = (".py", ".pyw", ".pyc", ".so", ".pyd", ".dll", ".dylib", ".pth")
-"""What Python would run when it imports something from the folder of a system file."""
+"""What Python would run when it imports something, or is given it as a simulation."""
 
 _BAD_CHARACTER = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|]')
 _DEVICE_NAME = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
 _HASH = re.compile(r"[0-9a-f]{64}")
+
+
+def is_code(path: str) -> bool:
+    """Whether Python would run the file if something named it."""
+    return path.lower().endswith(CODE_SUFFIXES)
 
 
 class TemplateFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
@@ -55,8 +60,8 @@ class TemplateFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     @property
     def is_code(self) -> bool:
-        """Whether it is something that Python runs; documents are never on its path."""
-        return self.kind != "document" and self.kind != "software" and self.path.lower().endswith(CODE_SUFFIXES)
+        """Whether it is something that Python runs, whatever it says of itself."""
+        return is_code(self.path)
 
 
 class Software(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):

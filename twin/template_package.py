@@ -128,7 +128,7 @@ class FolderPackage(Package):
         self.manifest = parse_manifest(_bounded(text, str(path)), str(path / MANIFEST))
         found: list[str] = []
         caches: list[str] = []
-        for name in _names_below(path):
+        for name in names_below(path):
             (caches if f"/{_LOCAL_CACHE}/" in f"/{name}" else found).append(name)
         self.caches = tuple(caches)
         _compare(found, self.manifest, str(path))
@@ -137,7 +137,7 @@ class FolderPackage(Package):
         return open(os.open(self.path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
 
 
-def _names_below(folder: Path) -> Iterator[str]:
+def names_below(folder: Path) -> Iterator[str]:
     """Every file below, with ``/``. Raises `FileInvalid` for what is neither file nor folder: links, pipes, devices."""
     count, waiting = 0, [folder]
     while waiting:

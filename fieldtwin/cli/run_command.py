@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
-from fieldtwin.cli.template_question import ask_about_code
+from fieldtwin.cli.template_question import ask_about
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
@@ -126,7 +126,9 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     default=None,
     help="Instead of a live view, events: as text, JSON lines, or to the journal with fields.",
 )
-@click.option("--trust", is_flag=True, help="Run control logic in Python that a template brings, without asking.")
+@click.option(
+    "--trust", is_flag=True, help="Do not ask about a template's control logic in Python and what its prototype opens."
+)
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
 @json_option
@@ -182,7 +184,13 @@ def command(
         )
     if prototype and allow_writes:
         raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
-    system = system_file(system, lambda template: trust or ask_about_code(template), plant=plant)
+    system = system_file(
+        system,
+        lambda template: trust or ask_about(template),
+        plant=plant,
+        virtual=virtual,
+        prototype_file=Path(prototype_file) if prototype_file else None,
+    )
     if (thread_store or thread_every_s is not None) and not thread:
         raise UsageError("--thread-store and --thread-every go with --thread")
     if virtual:

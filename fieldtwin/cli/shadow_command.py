@@ -16,6 +16,7 @@ from rich.markup import escape
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.talk import talk
 from fieldtwin.running.shadowing import Shadowing
+from fieldtwin.running.template_here import system_file
 from gateway.core.errors import Unreachable
 from twin.instance import Instance
 from twin.mape.messages import Verdict
@@ -67,9 +68,9 @@ def command(
     """Shadow SYSTEM: receive what its plant sees, keep the digital model up with it, and say where the two differ.
 
     Reports a state that is not the model's, values outside their limits, bad and stale ones, and how often and how late
-    the twins agree. A shadow sends no commands: it has nothing to send them with. Exit code 1 when the states differed.
+    the twins agree. SYSTEM may be a template. A shadow sends no commands: it has nothing to send them with. Exit code 1 when the states differed.
     """
-    loaded = load_system(system, tuple(Path(p) for p in profiles))
+    loaded = load_system(system_file(system, lambda template: True, plant=True), tuple(Path(p) for p in profiles))
     with Instance(instance or f"{loaded.name}-shadow") as here:
         seen = asyncio.run(_run(loaded, place, here, store, duration_s, as_json))
     if as_json:

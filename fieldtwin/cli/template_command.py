@@ -16,7 +16,8 @@ from rich.table import Table
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import data, talk
-from fieldtwin.cli.template_question import SHOWN_CODE, ask_about_code
+from fieldtwin.cli.template_question import ask_about, shown
+from fieldtwin.running.template_here import Stranger
 from gateway.core.errors import UsageError
 from gateway.wallclock import WallClock
 from twin.prototype_file import prototype_path
@@ -112,7 +113,7 @@ def unpack_command(template: Path, out: Path | None, as_json: bool) -> int:
     )
     if manifest.code:
         talk.print(
-            f"control logic in Python, not run: {escape(', '.join(manifest.code[:SHOWN_CODE]))}. Read it before you do.",
+            f"control logic in Python, not run: {shown(manifest.code)}. Read it before you do.",
             soft_wrap=True,
         )
     return 0
@@ -137,7 +138,7 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
         here = FolderPackage(folder)
         manifest = here.manifest
         system = examine(folder, manifest)
-        may_run = not here.code or trust or (not as_json and ask_about_code(package))
+        may_run = not here.code or trust or (not as_json and ask_about(Stranger(package.path, package.code)))
         if may_run:
             put_together(manifest, system, folder, WallClock())
     same = manifest.software.modules_sha256 == modules_hash()

@@ -1,4 +1,4 @@
-"""The question before what a template brings is run. A plant asks it too: nothing here knows emulators."""
+"""The question before anything of a template is run. A plant asks it too: nothing here knows emulators."""
 
 from __future__ import annotations
 
@@ -8,20 +8,28 @@ import click
 from rich.markup import escape
 
 from fieldtwin.cli.talk import talk
-from twin.template_package import Package
+from fieldtwin.running.template_here import Stranger
 
-SHOWN_CODE = 5
+SHOWN = 5
 
 
-def ask_about_code(package: Package) -> bool:
-    """Say what Python a template brings and ask whether it may run. Without a terminal the answer is no."""
-    code = package.code
-    more = f", and {len(code) - SHOWN_CODE} more" if len(code) > SHOWN_CODE else ""
-    talk.print(
-        f"{escape(str(package.path))} brings control logic in Python: {escape(', '.join(code[:SHOWN_CODE]))}{more}.\n"
-        "It is a program: run, it can do on this computer whatever you can.",
-        soft_wrap=True,
-    )
+def shown(what: tuple[str, ...], between: str = ", ") -> str:
+    """The first few, and how many more."""
+    more = f"{between}and {len(what) - SHOWN} more" if len(what) > SHOWN else ""
+    return escape(between.join(what[:SHOWN])) + more
+
+
+def ask_about(template: Stranger) -> bool:
+    """Say what a template brings and ask whether it may run. Without a terminal the answer is no."""
+    if template.code:
+        talk.print(
+            f"{escape(str(template.path))} brings control logic in Python: {shown(template.code)}.\n"
+            "It is a program: run, it can do on this computer whatever you can.",
+            soft_wrap=True,
+        )
+    if template.reach:
+        lines = shown(template.reach, "\n  ")
+        talk.print(f"{escape(str(template.path))} does not keep to itself as a prototype:\n  {lines}", soft_wrap=True)
     if not sys.stdin.isatty():
         return False
     return click.confirm("Run it?", default=False, err=True)

@@ -15,6 +15,8 @@ from rich.markup import escape
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.shadow_command import ShadowTalk, print_shadow
 from fieldtwin.cli.talk import talk
+from fieldtwin.cli.template_question import ask_about
+from fieldtwin.running.template_here import system_file
 from fieldtwin.running.twin_rules import PythonPlanner, load_planner, questions_of
 from fieldtwin.running.twinning import Twinning
 from fieldtwin.whatif.asking import Asking, Subject
@@ -56,6 +58,7 @@ from twin.system import System, load_system
     "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -twin.")
+@click.option("--trust", is_flag=True, help="Do not ask about a template's control logic in Python.")
 @profiles_option
 @json_option
 def command(
@@ -71,6 +74,7 @@ def command(
     store: str,
     duration_s: float,
     instance: str,
+    trust: bool,
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
@@ -81,6 +85,8 @@ def command(
     The plant obeys while its own switch says `remote`, inside the limits and the rate in its own file, and no number twice.
     """
     folders = tuple(Path(p) for p in profiles)
+    runs_code = bool(horizon_s or planner)  # what a prototype or a planner in Python needs of a template
+    system = system_file(system, lambda template: trust or not runs_code or ask_about(template), virtual=True)
     loaded = load_system(system, folders)
     chosen, of_rules = load_planner(planner, loaded) if planner else (RulePlanner(()), None)
     question = _question(horizon_s, require, finally_) or of_rules

@@ -11,7 +11,9 @@ import click
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.talk import data, talk
+from fieldtwin.cli.template_question import ask_about
 from fieldtwin.cli.what_if_view import show
+from fieldtwin.running.template_here import system_file
 from fieldtwin.whatif.state import KnownState
 from gateway.core.errors import FileInvalid, UsageError
 
@@ -35,6 +37,7 @@ from gateway.core.errors import FileInvalid, UsageError
 @click.option("--seed", type=int, help="Instead of the prototype file's.")
 @click.option("--prototype-file", type=click.Path(path_type=Path), help="Instead of the one beside the system file.")
 @click.option("--save-state", type=click.Path(path_type=Path), help="Write what is known to a file, and end.")
+@click.option("--trust", is_flag=True, help="Do not ask about a template's control logic in Python.")
 @profiles_option
 @json_option
 def command(
@@ -52,6 +55,7 @@ def command(
     seed: int | None,
     prototype_file: Path | None,
     save_state: Path | None,
+    trust: bool,
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
@@ -72,6 +76,7 @@ def command(
         system = system or (str(beside) if beside.exists() else named)
     if system is None:
         raise UsageError("which system?", expected="SYSTEM, or --plans FILE which names it")
+    system = system_file(system, lambda template: trust or ask_about(template), virtual=True)
     folders = tuple(Path(p) for p in profiles)
     loaded = load_system(system, folders)
     state = _state(source, origin, system, folders)

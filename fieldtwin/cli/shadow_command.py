@@ -68,7 +68,8 @@ def command(
     """Shadow SYSTEM: receive what its plant sees, keep the digital model up with it, and say where the two differ.
 
     Reports a state that is not the model's, values outside their limits, bad and stale ones, and how often and how late
-    the twins agree. SYSTEM may be a template. A shadow sends no commands: it has nothing to send them with. Exit code 1 when the states differed.
+    the twins agree. A shadow sends no commands: it has nothing to send them with. Exit code 1 when the states differed.
+    SYSTEM may be a template.
     """
     loaded = load_system(system_file(system, lambda template: True, plant=True), tuple(Path(p) for p in profiles))
     with Instance(instance or f"{loaded.name}-shadow") as here:

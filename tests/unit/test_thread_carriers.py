@@ -114,10 +114,13 @@ SYSTEM = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observa
 
 
 @asynccontextmanager
-async def modems(net: MemoryNet, clock: VirtualClock, seed: int) -> Any:
-    """The observatory's modems and their link in memory; carriers for both ends."""
+async def modems(net: MemoryNet, clock: VirtualClock, seed: int, **worse: float) -> Any:
+    """The observatory's modems and their link in memory; carriers for both ends. `worse`: as of `far_link`."""
     system = load_system(str(SYSTEM))
     prototype = replace(load_prototype(system), seed=seed)
+    modem = prototype.devices["modem"]
+    form = modem.form.model_copy(update={"far_link": modem.form.far_link.model_copy(update=worse)})
+    prototype = replace(prototype, devices={**prototype.devices, "modem": replace(modem, form=form)})
     field = DigitalTwinPrototype(system, prototype, clock).field(Path("virtual"), net)
     await field.open()
     async with Nursery() as nursery:
@@ -132,14 +135,14 @@ async def modems(net: MemoryNet, clock: VirtualClock, seed: int) -> Any:
     await field.aclose()
 
 
-@pytest.mark.parametrize("loss", [0.0, 0.2])
-def test_over_the_modems_of_the_reference_system_both_logs_are_equal(tmp_path: Path, loss: float) -> None:
-    """64 bytes a message, 400 bytes a second, 200 ms on the way; and frames lost on top of what the link loses."""
+@pytest.mark.parametrize("worse", [{}, {"lost": 0.2, "repeated": 0.1, "overtakes": 0.1}])
+def test_over_the_modems_of_the_reference_system_both_logs_are_equal(tmp_path: Path, worse: dict[str, float]) -> None:
+    """64 bytes a message, 400 bytes a second, 200 ms on the way; and modems that do not send again what they lose."""
 
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
-        async with modems(net, clock, 3) as (near, far):
-            plant = Twin("plant", tmp_path, clock, lambda: ShakyCarrier(near(), 1, loss))
-            shore = Twin("shore", tmp_path, clock, lambda: ShakyCarrier(far(), 2, loss))
+        async with modems(net, clock, 3, **worse) as (near, far):
+            plant = Twin("plant", tmp_path, clock, near)
+            shore = Twin("shore", tmp_path, clock, far)
             await plant.start()
             await shore.start()
             for n in range(24):

@@ -2,13 +2,14 @@
 two (the plant listens, its twin comes, both show a certificate), a broker with Sparkplug B,
 ``mqtt://[USER@]HOST[:PORT]/GROUP/NODE[?host=NAME]``, or the modems of the system: ``modem:`` or ``modem:DEVICE`` on the plant,
 which lends its mailboxes to the thread, and ``modem:[DEVICE@]tcp://HOST:PORT``, the far modem, at its twin. A password stands in
-FIELDTWIN_MQTT_PASSWORD, never in a URL.
+FIELDTWIN_MQTT_PASSWORD, or in the file that FIELDTWIN_MQTT_PASSWORD_FILE names, never in a URL.
 """
 
 from __future__ import annotations
 
 import os
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
@@ -18,6 +19,7 @@ from gateway.core.clock import Clock
 from gateway.core.connection import Connector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
+from gateway.core.url_secrets import without_password
 from gateway.devices.config import BusConfig, DeviceConfig
 from twin.system import System
 from twin.thread import schema_of
@@ -29,6 +31,7 @@ MODEM = "modem:"
 MODEM_POLL_MS = 200
 DEFAULT_HOST = "fieldtwin"
 MQTT_PORT = 1883
+PASSWORD = "FIELDTWIN_MQTT_PASSWORD"
 
 
 def lent_transmitter(place: str, system: System) -> str:
@@ -61,8 +64,8 @@ async def plant_carrier(
     endpoint = _stream(place)
     if endpoint.scheme == "tcp" and not _is_loopback(endpoint.host):
         raise UsageError(
-            "whoever reaches this port may command the plant", expected="a loopback address, or tls://", got=place,
-            hint="tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE asks for a certificate",
+            "whoever reaches this port may command the plant", expected="a loopback address, or tls://",
+            got=without_password(place), hint="tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE asks for a certificate",
         )  # fmt: skip
     listening = await TcpListening.start(endpoint, TcpListener.open, [schema_of(system)])
     return listening, str(listening.bound)
@@ -73,7 +76,9 @@ def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
     if place.startswith(MODEM):
         name, _, far = place.removeprefix(MODEM).rpartition("@")
         if not far.startswith("tcp:"):
-            raise UsageError("where is the far modem?", expected="modem:[DEVICE@]tcp://HOST:PORT", got=place)
+            raise UsageError(
+                "where is the far modem?", expected="modem:[DEVICE@]tcp://HOST:PORT", got=without_password(place)
+            )
         return _modem(system, _transmitter(name, system), Endpoint.parse(far), OsConnector(), clock)
     if place.startswith("mqtt:"):
         return _mqtt(place, clock, None)
@@ -83,7 +88,7 @@ def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
 def _stream(place: str) -> Endpoint:
     endpoint = Endpoint.parse(place)
     if endpoint.scheme not in ("tcp", "tls"):
-        raise UsageError("a thread cannot go there", expected=EXPECTED, got=place)
+        raise UsageError("a thread cannot go there", expected=EXPECTED, got=without_password(place))
     return endpoint
 
 
@@ -121,7 +126,7 @@ def _mqtt(place: str, clock: Clock, plant: System | None) -> Carrier:
     url, names = _split(place)
     group, node = names
     host = dict(parse_qsl(url.query)).get("host", DEFAULT_HOST)
-    broker = Broker(url.hostname or "", url.port or MQTT_PORT, url.username, os.environ.get("FIELDTWIN_MQTT_PASSWORD"))
+    broker = Broker(url.hostname or "", url.port or MQTT_PORT, url.username, _password())
     if plant is None:
         HostApplication(group, node, host)  # names that are none are said at once
         return MqttCarrier(broker, lambda number: HostApplication(group, node, host), clock)
@@ -130,13 +135,28 @@ def _mqtt(place: str, clock: Clock, plant: System | None) -> Carrier:
     return MqttCarrier(broker, lambda number: EdgeNode(group, node, host, schema, types, number), clock)
 
 
+def _password() -> str | None:
+    """The broker's, from the environment, or from the file that it names."""
+    path = os.environ.get(f"{PASSWORD}_FILE")
+    if not path:
+        return os.environ.get(PASSWORD)
+    try:
+        return Path(path).read_text(encoding="utf-8").splitlines()[0].strip()
+    except (OSError, UnicodeDecodeError, IndexError) as e:
+        why = getattr(e, "strerror", None) or "no text in it"
+        raise UsageError(f"the broker's password: {why}", got=f"{PASSWORD}_FILE={path}") from e
+
+
 def _split(place: str) -> tuple[Any, list[str]]:
     try:
         url = urlsplit(place)
         names = url.path.strip("/").split("/")
         port_is_fine = url.port is None or url.port > 0
     except ValueError as e:
-        raise UsageError("no broker", expected=EXPECTED, got=place) from e
-    if not url.hostname or len(names) != 2 or not all(names) or not port_is_fine or url.password is not None:
+        raise UsageError("no broker", expected=EXPECTED, got=without_password(place)) from e
+    if url.password is not None:
+        hint = f"{PASSWORD} in the environment, or {PASSWORD}_FILE"
+        raise UsageError("a password in a URL can be read by everybody", got=without_password(place), hint=hint)
+    if not url.hostname or len(names) != 2 or not all(names) or not port_is_fine:
         raise UsageError("no broker, group and node", expected="mqtt://[USER@]HOST[:PORT]/GROUP/NODE", got=place)
     return url, names

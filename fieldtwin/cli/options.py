@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from gateway.core.errors import UsageError
 
@@ -29,13 +30,17 @@ class Duration(click.ParamType[float]):
 
 
 class Secret(click.ParamType[str]):
-    """A secret: ``@FILE`` for the first line of a file. Others see a command line, and not the environment."""
+    """A secret: ``@FILE`` for the first line of a file, or the environment. A command line everybody on the computer can read:
+    one that stands there is refused, and not repeated in the message."""
 
     name = "secret"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
         text = str(value)
         if not text.startswith("@"):
+            named = param.name if param is not None else None
+            if ctx is not None and named and ctx.get_parameter_source(named) is ParameterSource.COMMANDLINE:
+                self.fail("everybody here can read the command line: @FILE, or the environment", param, ctx)
             return text
         try:
             lines = Path(text[1:]).read_text(encoding="utf-8").splitlines()

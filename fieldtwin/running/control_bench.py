@@ -11,7 +11,7 @@ import asyncio
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,7 @@ class Where:
 
     run_dir: Path
     field_host: str = ""
-    token: str = ""
+    token: str = field(default="", repr=False)
     far: str = ""
     capture: Path | None = None
     plant: bool = False

@@ -23,7 +23,7 @@ class FieldOptions:
     speed: float = 0.0
     listen: dict[str, str] = field(default_factory=dict)
     control: str = ""
-    token: str = ""
+    token: str = field(default="", repr=False)
     instance: str = ""
     profiles: tuple[Path, ...] = ()
 

@@ -6,6 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from gateway.core.errors import UsageError
+from gateway.core.url_secrets import has_password, without_password
+from gateway.store.knowledge import check_place
+
 
 @dataclass(frozen=True)
 class RunOptions:
@@ -19,7 +23,7 @@ class RunOptions:
     profiles: tuple[Path, ...] = ()
     prototype_file: Path | None = None
     field_host: str = ""
-    token: str = ""
+    token: str = field(default="", repr=False)
     recordings: dict[str, str] = field(default_factory=dict)
     speed: float = 0.0
     listen: dict[str, str] = field(default_factory=dict)
@@ -37,3 +41,12 @@ class RunOptions:
     """Of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()
     """As `emulators.faults.schema.load_faults` gives them."""
+
+    def __post_init__(self) -> None:
+        """Raises `UsageError` for a password in a URL, before it is handed on to a process or a file."""
+        check_place(self.thread_store)
+        if has_password(self.thread):
+            raise UsageError(
+                "a password in a URL can be read by everybody", got=without_password(self.thread),
+                hint="FIELDTWIN_MQTT_PASSWORD in the environment, or FIELDTWIN_MQTT_PASSWORD_FILE",
+            )  # fmt: skip

@@ -9,7 +9,7 @@ import shutil
 import signal
 from collections.abc import Callable
 from contextlib import AsyncExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 
@@ -43,7 +43,7 @@ class Target:
     seed: int | None = None
     instance: str = ""
     field_host: str = "field"
-    token: str = ""
+    token: str = field(default="", repr=False)
     far: str = ""
     capture: Path | None = None
     allow: Danger = Danger.READ

@@ -5,16 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 
 from gateway.core.errors import UsageError
+from gateway.core.url_secrets import has_password, without_password
 from gateway.store.event import KnowledgeStore
 from gateway.store.sqlite_knowledge import Offload, SqliteKnowledge
 
 URLS = ("postgresql://", "postgres://")
 
 
+def check_place(place: str) -> None:
+    """Raise `UsageError` where a URL has a password in it, which is not repeated."""
+    if place.startswith(URLS) and has_password(place):
+        raise UsageError(
+            "a password in a URL can be read by everybody", got=without_password(place),
+            hint="PGPASSWORD in the environment, or ~/.pgpass (PGPASSFILE)",
+        )  # fmt: skip
+
+
 async def open_knowledge(place: str, *, max_bytes: int = 0, offload: Offload | None = None) -> KnowledgeStore:
     """A store at a path or URL. `max_bytes` and `offload` are for files. Raises `Unreachable`, `FileInvalid`, `UsageError`."""
     if not place.startswith(URLS):
         return await SqliteKnowledge.open(Path(place), max_bytes=max_bytes, offload=offload)
+    check_place(place)
     try:
         from gateway.store.postgres_knowledge import PostgresKnowledge  # an extra
     except ModuleNotFoundError as e:

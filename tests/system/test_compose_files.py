@@ -240,7 +240,15 @@ def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> N
     port = free_port()
     emulate = ("emulate", "observatory", f"--prototype-file={prototype}", f"--control=0.0.0.0:{port}")
     run = ("run", "observatory", "--prototype", f"--field=localhost:{port}", "--commands=none")
-    shore = ("shore", "observatory", f"--field=localhost:{port}", "--commands=1,2,0,-1", "--for=8s", "--token=s3cret")
+    shore = (
+        "shore",
+        "observatory",
+        f"--field=localhost:{port}",
+        "--commands=1,2,0,-1",
+        "--for=8s",
+        f"--token=@{tmp_path}/right",
+    )
+    (tmp_path / "right").write_text("s3cret\n", encoding="utf-8")
     run_env = {"FIELDTWIN_RUN_TOKEN": "s3cret", "FIELDTWIN_RUN_AS_JSON": "1"}
     field_socket = tmp_path / "observatory-field" / "field.sock"
     sockets = [tmp_path / "observatory" / f"{p}.sock" for p in ("gateway", "plc")]
@@ -248,7 +256,8 @@ def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> N
     assert container_health(field_socket)[0] == 1
     with fieldtwin(tmp_path, *emulate, name="field", env={"FIELDTWIN_EMULATE_TOKEN": "s3cret"}) as field:
         wait_for(lambda: container_health(field_socket) == (0, "ok"), 20, "the field side is healthy")
-        stranger = run_to_end(tmp_path, *run, "--token=wrong", name="stranger")
+        (tmp_path / "wrong").write_text("wrong\n", encoding="utf-8")
+        stranger = run_to_end(tmp_path, *run, f"--token=@{tmp_path}/wrong", name="stranger")
         assert stranger.process.returncode != 0
         assert "token" in stranger.err
         with fieldtwin(tmp_path, *run, name="run", env=run_env) as controller:

@@ -7,12 +7,9 @@ import re
 import tomllib
 from pathlib import Path
 
-import click
-import pytest
 from click.testing import CliRunner
 from test_service_metrics import seen
 
-from fieldtwin.cli.options import Secret
 from fieldtwin.cli.run_command import command
 from fieldtwin.service.metrics import families
 
@@ -58,17 +55,6 @@ def test_the_metrics_in_the_docs_are_served() -> None:
     assert [p for p in parts if not any(name.endswith(p) for name in served)] == []
     in_alerts = set(re.findall(r"(fieldtwin_[a-z_]+)", SERVICE.split("```yaml")[1].split("```")[0]))
     assert in_alerts <= served
-
-
-def test_a_token_comes_from_a_file_or_the_environment(tmp_path: Path) -> None:
-    secret = tmp_path / "token"
-    secret.write_text("s3cret\nnot this\n")
-    for said in (f"@{secret}", "s3cret"):
-        assert Secret().convert(said, None, None) == "s3cret"
-    secret.write_text("")
-    for missing in (f"@{secret}", f"@{tmp_path}/none"):
-        with pytest.raises(click.BadParameter):
-            Secret().convert(missing, None, None)
 
 
 def test_the_unit_begins_read_only_and_names_options_that_there_are() -> None:

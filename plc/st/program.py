@@ -8,6 +8,7 @@ tells. Times are tags in ns, enumerations their numbers, ULINT and LWORD their t
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -185,7 +186,13 @@ def load_file(path: Path, name: str = "") -> type[StProgram]:
         raise FileInvalid(f"cannot read: {e.strerror or e}", path=str(path)) from e
     if is_plcopen(text):
         text = to_st(text, str(path))
-    return program_class(compile_text(text, str(path)), name)
+    return program_class(_compiled(text, str(path)), name)
+
+
+@lru_cache(maxsize=32)
+def _compiled(text: str, path: str) -> CompiledUnit:
+    """A unit is compiled once: a system's file is read more than once, and several systems run the same program."""
+    return compile_text(text, path)
 
 
 def _attribute(variable: ProgramVariable) -> str:

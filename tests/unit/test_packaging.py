@@ -10,6 +10,7 @@ from pathlib import Path
 from click.testing import CliRunner
 from test_service_metrics import seen
 
+from fieldtwin.cli.main import COMMANDS
 from fieldtwin.cli.run_command import command
 from fieldtwin.service.metrics import families
 
@@ -65,6 +66,10 @@ def test_the_unit_begins_read_only_and_names_options_that_there_are() -> None:
     assert "--allow-writes" not in words
     shown = CliRunner().invoke(command, ["--help"]).output
     assert [w for w in words if w.startswith("--") and w not in shown] == []
+    reload = service["ExecReload"].split()
+    assert reload[0] == words[0]
+    assert reload[1] in COMMANDS
+    assert reload[-1] == words[words.index("--instance") + 1]
     assert service["WatchdogSignal"] == "SIGTERM"  # outputs are made safe before the end
     assert service["KillMode"] == "mixed"
     assert int(service["TimeoutStopSec"]) >= 10

@@ -197,7 +197,7 @@ def test_Plan_says_what_is_asked_and_of_which_commands_nothing_is() -> None:
     assert "nobody here can" in str(nobody.twin.execute.collect()[0].value)
 
 
-def test_what_is_found_while_a_prototype_is_asked_waits_and_of_one_subject_the_newest_counts() -> None:
+def test_Plan_what_is_found_while_a_prototype_is_asked_waits_and_of_one_subject_the_newest_counts() -> None:
     rig = Rig(what_if=(prototype := Prototype()))
     rig.give(value(150.0))
     for number in (50.0, 150.0) * 20 + (50.0,):
@@ -209,7 +209,7 @@ def test_what_is_found_while_a_prototype_is_asked_waits_and_of_one_subject_the_n
     assert rig.twin.plan.overtaken == 40
 
 
-def test_a_twin_that_ends_sends_nothing_of_what_it_still_asks_about() -> None:
+def test_Execute_of_a_twin_that_ends_sends_nothing_of_what_it_still_asks_about() -> None:
     rig = Rig(what_if=Prototype())
     rig.give(value(150.0))
     rig.twin.execute.plans.observe(encode_period(7))

@@ -1,0 +1,342 @@
+"""SPEC part 2, rows 1 and 4 to 10, each in small: what whole runs show of them is in tests/interop and tests/system."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from shadow_rig import NOW_MS, Hands, status, value
+from spec_rig import CHECKOUT, CLOCK, Rig, observatory, rig
+from support import eventually, run
+from wire_rig import Crossed, relay, strange_device
+
+from emulators.distorted_registers import DistortedRegisters
+from emulators.replay.replay import ExchangeReplay
+from emulators.replay.unit import ReplayUnit
+from fieldtwin.cli.compare_command import command as compare_command
+from fieldtwin.cli.shadow_command import print_shadow
+from fieldtwin.running.shadowing import Shadowing
+from fieldtwin.whatif.asked import objection
+from fieldtwin.whatif.asking import Asked
+from fieldtwin.whatif.fork import Fork, answer
+from fieldtwin.whatif.last_known import of_period
+from fieldtwin.whatif.plan import Plan
+from fieldtwin.whatif.state import KnownState
+from gateway.connections.listeners import TcpListener
+from gateway.core.endpoint import Endpoint
+from gateway.core.events import Consumer, Producer
+from gateway.core.nursery import Nursery
+from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
+from gateway.core.statemachine import decode_period, encode_period
+from gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.store.event import Event, Kind
+from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from twin.instance import Instance
+from twin.mape.execute import Bounds
+from twin.mape.messages import SeenMeasurement, SeenStatus
+from twin.mape.plan import Rule, RulePlanner
+from twin.prototype import DigitalTwinPrototype
+from twin.prototype_file import load_prototype
+from twin.shadow import DigitalShadow
+from twin.system import load_system
+from twin.thread import schema_of
+from twin.thread_end import ThreadEnd
+from twin.thread_frames import ACK, ASK, REFUSED
+from twin.thread_process import ReceivingEnd
+from twin.thread_tcp import TcpListening
+from twin.twin import DigitalTwin
+
+# -- 1: the driver cannot tell an emulator from the device ----------------------------------------------------------------
+
+
+async def mailbox_talk(r: Rig) -> None:
+    """What a transmitter's driver does: it finds out what was taken, takes a message, acknowledges it, sends one."""
+    driver = r.register_driver("modem")
+    assert isinstance(driver, TransmitterDriver)
+    ear: Consumer[COMMAND] = Consumer(driver.emitter.event)
+    driver.emitter.subscribe(ear)  # type: ignore[arg-type]
+    await driver.synchronise()
+    await driver.receive("inbox")
+    await driver.acknowledge()
+    driver.consumer.observe(RESPONSE(b"\0\5"))
+    await driver.send()
+
+
+def with_message(r: Rig) -> Endpoint:
+    """The emulated modem with a message in its inbox: 1, 2 bytes, a period of 9."""
+    bank = r.unit("modem").bank
+    assert isinstance(bank, DistortedRegisters)
+    bank.bank._cells.poke("holding", 0, 1, 2, 9)  # type: ignore[attr-defined]
+    return r.field.listening["lan"]
+
+
+def swapped(pdu: bytes) -> bytes:
+    return pdu[:2] + pdu[4:6] + pdu[2:4] + pdu[6:] if len(pdu) > 20 else pdu
+
+
+async def both_talks(folder: Path, spoilt: object = bytes) -> tuple[Crossed, Crossed]:
+    """The same driver, the same configuration, against our emulator and against a device that is none of ours."""
+    async with (
+        rig(folder) as emulated,
+        relay(with_message(emulated)) as emulator,
+        rig(folder, carried={"lan": emulator.endpoint}) as r,
+    ):
+        await mailbox_talk(r)
+    async with (
+        strange_device({0: 1, 1: 2, 2: 9}, spoilt) as device,  # type: ignore[arg-type]
+        relay(device) as stranger,
+        rig(folder, carried={"lan": stranger.endpoint}) as r,
+    ):
+        await mailbox_talk(r)
+    return emulator, stranger
+
+
+def exchanges(crossed: Crossed) -> list[Exchange]:
+    """The conversation, one by one."""
+    found = []
+    for request, reply in zip(adus(crossed.there), adus(crossed.back), strict=True):
+        assert request[:2] == reply[:2], "of one transaction"
+        found.append(Exchange(float(len(found)), request[6], request[7:], reply[7:]))
+    return found
+
+
+def adus(stream: bytearray) -> list[bytes]:
+    found = []
+    while stream[len(b"".join(found)) :]:
+        rest = stream[len(b"".join(found)) :]
+        found.append(bytes(rest[: 6 + struct.unpack(">H", rest[4:6])[0]]))
+    return found
+
+
+def test_prose_1_the_same_driver_asks_emulator_and_device_the_same_and_is_answered_alike(tmp_path: Path) -> None:
+    """The flagship, which compares a whole system with tolerances in a reviewed file, is tests/interop/test_flagship.py."""
+    emulator, stranger = run(both_talks(tmp_path))
+    assert emulator.there == stranger.there, "request bytes are identical"
+    assert emulator.back == stranger.back
+    assert len(exchanges(emulator)) >= 6
+
+
+def test_prose_1_a_planted_difference_is_seen(tmp_path: Path) -> None:
+    emulator, stranger = run(both_talks(tmp_path, swapped))
+    assert emulator.back != stranger.back
+
+
+# -- 4: a shadow sends nothing that could change the physical twin --------------------------------------------------------
+
+
+def test_prose_4_the_shadows_modules_load_nothing_that_could_send() -> None:
+    """By construction: what is not imported is not held. The contract of the same name is checked at every commit."""
+    program = "import sys, twin.shadow; print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", program], cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=30
+    ).stdout.split()
+    contracts = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    (contract,) = [c for c in contracts if c["name"] == "a shadow holds nothing that can send a command"]
+    forbidden = contract["forbidden_modules"]
+    assert {"gateway.connections", "gateway.devices", "twin.thread", "twin.thread_end"} <= set(forbidden)
+    assert "twin.shadow" in loaded
+    assert not [m for m in loaded if any(m == f or m.startswith(f"{f}.") for f in forbidden)]
+
+
+def test_prose_4_a_wire_capture_towards_the_plant_holds_no_command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A shadow as `fieldtwin shadow` runs it, opposite a plant that tells it everything, commands that came included."""
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
+    system = observatory()[0]
+    schema = schema_of(system)
+
+    async def main() -> Crossed:
+        store = await SqliteKnowledge.open(tmp_path / "plant.db", offload=in_place)
+        origin = await store.own("plant", system=system.name, prototype=True, log="1")
+        now_ms = CLOCK.utc_ns() // 1_000_000
+        told = [value(1.0, now_ms), status(5, t_ms=now_ms), Event(0, now_ms, Kind.COMMAND, "modem.inbox", b"\0\7")] * 40
+        await store.append(origin, told)
+        carrier = await TcpListening.start(Endpoint.parse("tcp://127.0.0.1:0"), TcpListener.open, [schema])
+        end = ThreadEnd(store, carrier, schema, CLOCK, origin=origin, prototype=True)
+        stop = asyncio.Event()
+        async with relay(carrier.bound) as crossed:
+            with Instance("watching") as here:
+                shadowing = Shadowing(system, str(crossed.endpoint), here, on_verdict=lambda verdict: None)
+                async with Nursery() as nursery:
+                    nursery.start(end.run(), "plant")
+                    watching = nursery.start(shadowing.run(stop), "shadow")
+                    await eventually(lambda: shadowing.shadow.analyze.measurements >= 40 and not end.waiting, 15)
+                    stop.set()
+                    await watching
+        await carrier.aclose()
+        await store.aclose()
+        assert shadowing.shadow.digital_model.period_s == 5
+        return crossed
+
+    crossed = run(main(), timeout_s=40)
+    kinds, at = [], 0
+    while at < len(crossed.there):
+        size = int.from_bytes(crossed.there[at : at + 2])
+        kinds.append(crossed.there[at + 2] & 0x0F)
+        at += 2 + size
+    assert set(kinds) <= {ACK, ASK, REFUSED}, "acknowledgements and questions, which ruling 16 lists"
+    assert ACK in kinds
+    assert len(crossed.back) > 10 * len(crossed.there) / len(kinds)
+
+
+# -- 5 to 7: Monitor, Analyze, Plan, Execute ------------------------------------------------------------------------------
+
+
+class Twins:
+    """A digital twin by rules, and the periods that it commands."""
+
+    def __init__(self, *rules: Rule, bounds: Bounds = Bounds()) -> None:  # noqa: B008
+        self.receiving = ReceivingEnd("from the plant")
+        limits = {"ctd.pressure": (0.0, 100.0)}
+        self.twin = DigitalTwin(self.receiving, Hands(), RulePlanner(rules), limits=limits, bounds=bounds)
+        self._sent: Consumer[COMMAND] = Consumer(self.twin.execute.transmitter.event)
+        self.twin.execute.transmitter.subscribe(self._sent)
+
+    def give(self, *events: Event) -> list[int]:
+        for event in events:
+            self.receiving.observe("plant:1", event)
+        self.twin.step()
+        return [decode_period(command) for command in self._sent.drain()]
+
+
+def test_prose_5_all_that_a_shadow_receives_updates_its_model_and_a_difference_is_reported() -> None:
+    receiving = ReceivingEnd("from the plant")
+    shadow = DigitalShadow(receiving, Hands(), limits={})
+    for event in (status(7), status(5, "OFF"), value(3.0)):
+        receiving.observe("plant:1", event)
+    shadow.step()
+    assert shadow.digital_model.period_s == 5
+    assert [v.finding for v in shadow.verdicts.drain()] == ["agree", "mismatch"]
+
+
+def test_prose_5_it_reuses_the_physical_twins_event_handlers_and_message_types() -> None:
+    """And its transmitter driver: test_schema_digital_thread."""
+    shadow = DigitalShadow(ReceivingEnd("from the plant"), Hands(), limits={})
+    assert issubclass(SeenStatus, STATUS)
+    assert issubclass(SeenMeasurement, MEASUREMENT)
+    assert type(shadow.monitor.emitter) is Producer
+    assert type(shadow.monitor.statuses) is type(shadow.verdicts) is Consumer  # type: ignore[comparison-overlap]
+
+
+def test_prose_6_the_stages_run_one_after_another_and_each_has_the_knowledge(monkeypatch: pytest.MonkeyPatch) -> None:
+    twins = Twins(Rule("outside", "", 1))
+    twin, order = twins.twin, []
+    for stage, name in (
+        (twin.monitor, "handle_state"),
+        (twin.monitor, "handle_measurements"),
+        (twin.analyze, "compare"),
+        (twin.plan, "plan_next"),
+        (twin.execute, "execute"),
+    ):
+        real = getattr(stage, name)
+        monkeypatch.setattr(stage, name, lambda s=stage, n=name, r=real: (order.append(s.name), r())[1])
+    assert twins.give(value(150.0)) == [1]
+    first = list(dict.fromkeys(order))
+    assert [name for name in first if name != "execute"] == ["monitor", "analyze", "plan"]
+    assert order.index("plan") < len(order) - order[::-1].index("execute")
+    assert len({id(stage.digital_model) for stage in twin.processes}) == 1  # type: ignore[attr-defined]
+    assert [event.kind for stage in twin.processes for event in stage.collect()] == [Kind.VERDICT]
+
+
+def test_prose_7_what_the_model_does_not_accept_is_not_sent_and_no_user_steps_in() -> None:
+    twins = Twins(Rule("outside", "", 1), Rule("inside", "", 30), bounds=Bounds(10, 60))
+    assert twins.give(status(20), value(150.0)) == []
+    assert twins.twin.digital_model.period_s == 20
+    assert [e.value for e in twins.twin.execute.collect()] == ["a period of 1 s; allowed are 10 to 60 s"]
+    assert twins.give(value(50.0)) == [30], "by itself"
+
+
+# -- 8: the prototype's own model, and "what if" --------------------------------------------------------------------------
+
+
+def test_prose_8_the_prototypes_digital_model_is_another_instance_than_the_shadows() -> None:
+    prototype = DigitalTwinPrototype(*observatory(), CLOCK)
+    shadow = DigitalShadow(ReceivingEnd("from the plant"), Hands(), limits={})
+    prototype.model.process_event(encode_period(5))
+    assert (prototype.model.period_s, shadow.digital_model.period_s) == (5, 0)
+
+
+def test_prose_8_a_digital_twin_asks_a_prototype_what_if_with_the_full_software_stack() -> None:
+    """The gateway, the PLC and the emulators of a run, ahead in virtual time, from what the twin knows."""
+    stays = ("relay.state == 'ACTIVE'", "quality(ctd.pressure) == 'good'")
+    known = {"ctd.pressure": 50.0}
+    question = Asked("observatory", 8.0, (), stays, 1.0, period_s=1, values=known, programs={"relay": of_period(3)})
+    assert objection(question) == ""
+    stops = Asked("observatory", 8.0, (), stays, 1.0, period_s=0, values=known, programs={"relay": of_period(3)})
+    assert "does not hold 8 s from now; at the end relay.state: 'STANDBY'" in objection(stops)
+
+
+def test_prose_8_a_prototype_can_serve_as_the_digital_twin_itself() -> None:
+    """It goes on from the plant's state and samples as the plant does. Opposite a digital twin in CI: tests/system."""
+    state = KnownState({"ctd.pressure": 50.0}, {"relay": of_period(2)})
+    outcome = answer(Fork("observatory", state, 10.0), Plan("goes on"))
+    assert outcome.error == ""
+    assert [name for _, name in outcome.states["relay"]] == ["ACTIVE"]
+    assert 3 <= outcome.variables["ctd.pressure"].good <= 6, "a sample each two seconds"
+
+
+# -- 9: virtual context ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", sorted(p.name.partition(".")[0] for p in (CHECKOUT / "profiles/systems").glob("*.prototype.yaml"))
+)
+def test_prose_9_virtual_context_is_recorded_data_or_a_simulation(name: str) -> None:
+    system = load_system(name)
+    for device in load_prototype(system).devices.values():
+        form = device.form
+        assert [form.recording, form.simulation, form.model].count(None) == 2, device.name
+
+
+def test_prose_9_a_recording_from_the_field_goes_back_into_CI(tmp_path: Path) -> None:
+    """What went over the wire between the driver and a real device is what an emulator answers from then on."""
+    _, stranger = run(both_talks(tmp_path))
+    seen = exchanges(stranger)
+    header = RecordingHeader(version=1, device="x/modem", kind="exchanges", source="measured")
+    with RecordingWriter(tmp_path / "field.jsonl", header) as writer:
+        for exchange in seen:
+            writer.exchange(exchange)
+    with RecordingReader(tmp_path / "field.jsonl") as reader:
+        unit = ReplayUnit(ExchangeReplay(reader.exchanges()), 1)
+    assert [unit.respond(e.request, i) for i, e in enumerate(seen)] == [e.reply for e in seen]
+
+
+# -- 10: measured figures -------------------------------------------------------------------------------------------------
+
+
+def test_prose_10_fidelity_is_measured_and_printed(tmp_path: Path) -> None:
+    read = bytes.fromhex("0300000001")
+    for name, last in (("device", 5), ("emulator", 6)):
+        header = RecordingHeader(version=1, device="x/y", kind="exchanges", source="measured")
+        with RecordingWriter(tmp_path / f"{name}.jsonl", header) as writer:
+            for i, word in enumerate((1, 2, 3, last)):
+                writer.exchange(Exchange(float(i), 1, read, bytes([3, 2, 0, word]), 0.01))
+    files = [str(tmp_path / "device.jsonl"), str(tmp_path / "emulator.jsonl")]
+    told = CliRunner().invoke(compare_command, files, standalone_mode=False)
+    assert "fidelity: values 75.0 %, timing" in told.output
+    assert told.return_value == 1
+
+
+def test_prose_10_twinning_rate_and_lag_are_measured_and_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    clock, receiving = Hands(), ReceivingEnd("from the plant")
+    shadow = DigitalShadow(receiving, clock, limits={})
+    for n in range(11):
+        clock.now_ms = NOW_MS + 100 * n
+        receiving.observe("plant:1", status(5, t_ms=clock.now_ms - 40))
+        shadow.step()
+    thread = {"links": 1, "duplicates": 0, "trouble": ""}
+    print_shadow({**shadow.describe(), "origins": ["plant:1"], "prototype": True, "thread": thread})
+    told = capsys.readouterr().err
+    assert "10.0 reports a second" in told
+    assert "median 40 ms" in told
+    assert "11, 11 of them as the model" in told
+    assert json.dumps(shadow.describe()), "and as JSON"

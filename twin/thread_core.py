@@ -98,6 +98,10 @@ class Outgoing:
         self._hello_ns: int | None = 0
         """When to say HELLO next; None while the other side knows us and nothing is due."""
         self._hello_sent_ns = -1
+        self._doubt_ns: int | None = None
+        """When to ask with HELLO whether the other side has what it confirmed; None while nobody doubts it."""
+        self._asked_ns: int | None = None
+        """When that was asked first."""
         self._rto = _Rto()
         self._lost: deque[tuple[int, int]] = deque()
         """To be told."""
@@ -145,6 +149,7 @@ class Outgoing:
         """A link is there, perhaps a new one: whatever was under way may be lost, and who is there may be new."""
         self._known = False
         self._hello_ns = now_ns
+        self._doubt_ns = self._asked_ns = None
         self._rto = _Rto()
         self._window.clear()
         self._to_send.clear()
@@ -168,10 +173,9 @@ class Outgoing:
         if ack.through > self.last:
             self.contradicted = True
             return
-        if ack.through < self.through:
-            self._on_less(ack.through, now_ns)
-            if not self._known:
-                return
+        if ack.through < self.through and not self._is_less(ack.through, now_ns):
+            return
+        self._doubt_ns = self._asked_ns = None
         if not self._known:
             self._known, self.refused, self._hello_ns = True, False, None
             self._loaded = max(self._loaded, ack.through)
@@ -192,18 +196,16 @@ class Outgoing:
         if progress:
             self._rto.calm()
 
-    def _on_less(self, through: int, now_ns: int) -> None:
+    def _is_less(self, through: int, now_ns: int) -> bool:
         """The other side has less than it confirmed: an ACK that was late, or one who is there for the first time. HELLO asks,
-        and what answers it is believed: what was confirmed before was to somebody else."""
-        if self._known:
-            self.on_ask(now_ns)
-            return
-        self._window.clear()
-        self._to_send.clear()
-        self._lost.clear()
-        self._told.clear()
+        and what answers it is believed: what was confirmed before was to somebody else. Whether this ACK is taken."""
+        asked_ns = self._asked_ns
+        if self._known and (asked_ns is None or now_ns - asked_ns < self._rto.smoothed_ns // 2):
+            self._doubt_ns = now_ns if self._doubt_ns is None else self._doubt_ns
+            return False
+        self.connected(now_ns)
         self.through = self._loaded = through
-        self._known, self.refused, self._hello_ns = True, False, None
+        return True
 
     def _confirm_run(self, first: int, last_missing: int, last: int, now_ns: int, late_ns: int) -> bool:
         """Numbers from `first` on are missing, those behind `last_missing` are kept."""
@@ -249,7 +251,11 @@ class Outgoing:
             self._hello_sent_ns = now_ns
             self._hello_ns = now_ns + self._rto.now_ns
             self._rto.doubled()
-            return Hello(self.origin, self._schema, self.first, self.last, self._prototype)
+            return self._hello()
+        if self._doubt_ns is not None and now_ns >= self._doubt_ns:
+            self._asked_ns = now_ns if self._asked_ns is None else self._asked_ns
+            self._doubt_ns = now_ns + self._rto.now_ns
+            return self._hello()
         if self._lost:
             first, last = self._lost.popleft()
             self._told[first, last] = now_ns
@@ -270,6 +276,9 @@ class Outgoing:
             slot.sent_ns = now_ns
             slot.tries += 1
         return Data(self.tag, tuple(events))
+
+    def _hello(self) -> Hello:
+        return Hello(self.origin, self._schema, self.first, self.last, self._prototype)
 
     def _may_wait(self, events: Sequence[Event], now_ns: int) -> bool:
         """Whether these, of which there are no more, wait for others."""
@@ -318,6 +327,10 @@ class Outgoing:
         """When `next_frame` may have something although nothing came; None: never."""
         if not self._known:
             return self._hello_ns
+        due_ns = self._wake_ns(now_ns)
+        return due_ns if self._doubt_ns is None else min(self._doubt_ns, due_ns or self._doubt_ns)
+
+    def _wake_ns(self, now_ns: int) -> int | None:
         if self._lost or (self._to_send and self._gathers_ns is None):
             return now_ns
         if self._to_send and self._gathers_ns is not None:

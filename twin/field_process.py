@@ -11,12 +11,14 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from emulators.endpoints.acoustic_end import AcousticEnd
 from gateway.core.control import ControlServer
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, UsageError
@@ -45,6 +47,8 @@ class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     control: str = ""
     token: str = ""
     seed: int | None = None
+    water: dict[str, tuple[str, str]] = {}
+    """Transmitters that are in a network's water: the Unix socket that serves it, and their names there."""
 
 
 def resolve(config: FieldConfig) -> DigitalTwinPrototype:
@@ -82,7 +86,16 @@ class FieldProcess:
     async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
         """Open, call `on_ready`, serve until stopped."""
         run_dir = Path(self._config.run_dir)
-        self._field = resolve(self._config).field(run_dir)
+        twin = resolve(self._config)
+        async with AsyncExitStack() as stack:
+            water = {}
+            for device, (path, name) in self._config.water.items():
+                water[device] = end = await AcousticEnd.open(Path(path), name)
+                stack.push_async_callback(end.aclose)
+            self._field = twin.field(run_dir, water=water)
+            return await self._run(run_dir, on_ready)
+
+    async def _run(self, run_dir: Path, on_ready: Callable[[FieldSide], None] | None) -> int:
         await self._field.open()
         server = ControlServer(
             {

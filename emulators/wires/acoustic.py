@@ -98,6 +98,8 @@ class AcousticMedium:
     ) -> None:
         self.water = water
         self.spoils = spoils
+        self.on_say: Callable[[], None] | None = None
+        """Told that something begins in the water, by whoever speaks: `next_ns` is another one."""
         self._modems = {
             name: _Modem(number, at_m, Random(f"{seed} {name}"))
             for number, (name, at_m) in enumerate(places.items(), 1)
@@ -130,6 +132,8 @@ class AcousticMedium:
             modem.to_say.append((now_ns + n * every_ns, payload))
         self._try(modem, now_ns)
         self.advance(now_ns)
+        if self.on_say is not None:
+            self.on_say()
         return True
 
     def take(self, name: str, now_ns: int) -> bytes | None:

@@ -41,6 +41,8 @@ class RunOptions:
     """Of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()
     """As `emulators.faults.schema.load_faults` gives them."""
+    water: dict[str, tuple[str, str]] = field(default_factory=dict)
+    """Transmitters that are in a network's water (`twin.field_process.FieldConfig`)."""
 
     def __post_init__(self) -> None:
         """Raises `UsageError` for a password in a URL, before it is handed on to a process or a file."""

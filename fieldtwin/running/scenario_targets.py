@@ -18,6 +18,7 @@ from fieldtwin.report.coverage import Collector
 from fieldtwin.report.machines import machines_of
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.control_bench import ControlBench, Where
+from fieldtwin.running.network_local import run_network
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.virtual_scenario import prototype_of, reproduce, run_virtual
@@ -56,6 +57,8 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
     refused = _of_a_plant(scenario, target) if target.name == "real" else ""
+    if scenario.network is not None and target.name != "local":
+        refused = f"a network is a prototype, and the target {target.name} is none: each of its systems is a plant"
     sink = trace_file.open("wb") if trace_file is not None else None
     trace = Trace(sink=sink)
     trace.listeners.append(collector.feed)
@@ -109,6 +112,8 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
     me = asyncio.current_task()
     assert me is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, me.cancel)
+    if scenario.network is not None:
+        return await run_network(scenario, target.seed, trace)
     async with AsyncExitStack() as stack:
         gone: Callable[[], FieldtwinError | None] = lambda: None  # noqa: E731
         if target.name == "compose" or target.instance:

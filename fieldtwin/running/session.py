@@ -190,6 +190,7 @@ class RunSession:
             speed=o.speed,
             listen=listen,
             seed=o.seed,
+            water=o.water,
         )
 
     def _write(self, name: str, config: msgspec.Struct) -> Path:

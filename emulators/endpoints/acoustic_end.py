@@ -1,0 +1,164 @@
+"""The water between processes: one serves the medium on a Unix socket, and the modems of the others have their ends of it here.
+
+A frame is a kind, a length in two bytes (big endian) and so many bytes: `M` the modem's name, first of all; `S` say this; `A` it
+was taken, there is room again; `H` this was heard. Without the server a modem takes nothing and hears nothing, and goes on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from contextlib import suppress
+from pathlib import Path
+
+from emulators.wires.acoustic import AcousticMedium
+from gateway.core.clock import Clock
+from gateway.core.errors import Desync, EndpointBusy, FieldtwinError, Unreachable
+from gateway.core.nursery import Nursery
+
+ROOM = 2
+"""Packets that a modem hands over before the first is taken."""
+HEARD = 64
+_LONGEST = 1024
+
+
+async def _read(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
+    """A frame's kind and content. Raises `asyncio.IncompleteReadError` at the end, `Desync` for what is none."""
+    head = await reader.readexactly(3)
+    length = int.from_bytes(head[1:])
+    if length > _LONGEST:
+        raise Desync("no frame of the water", expected=f"at most {_LONGEST} bytes", got=str(length))
+    return head[:1], await reader.readexactly(length)
+
+
+def _frame(kind: bytes, content: bytes = b"") -> bytes:
+    return kind + len(content).to_bytes(2) + content
+
+
+class AcousticServer:
+    """``await server.open(path)``, then ``await server.run()`` beside it. One connection a modem."""
+
+    def __init__(self, medium: AcousticMedium, clock: Clock) -> None:
+        self._medium = medium
+        self._clock = clock
+        self._server: asyncio.Server | None = None
+        self._writers: dict[str, asyncio.StreamWriter] = {}
+        self._news = asyncio.Event()
+        medium.on_say = self._news.set
+        self._wanted: dict[str, deque[bytes]] = {}
+
+    async def open(self, path: Path) -> None:
+        """Raises `EndpointBusy`."""
+        path.unlink(missing_ok=True)
+        try:
+            self._server = await asyncio.start_unix_server(self._serve, path)
+        except OSError as e:
+            raise EndpointBusy(f"cannot serve the water: {e.strerror}", where=str(path)) from e
+
+    async def run(self) -> None:
+        """Hand on what is heard, until cancelled."""
+        while True:
+            now_ns = self._clock.monotonic_ns()
+            self._medium.advance(now_ns)
+            for name, writer in list(self._writers.items()):
+                self._hand_on(name, writer, now_ns)
+            self._news.clear()
+            await self._until(self._medium.next_ns)
+
+    def _hand_on(self, name: str, writer: asyncio.StreamWriter, now_ns: int) -> None:
+        wanted = self._wanted[name]
+        while wanted and self._medium.say(name, wanted[0], now_ns):
+            wanted.popleft()
+            writer.write(_frame(b"A"))
+        while (heard := self._medium.take(name, now_ns)) is not None:
+            writer.write(_frame(b"H", heard))
+
+    async def _until(self, t_ns: int | None) -> None:
+        """Until something happens in the water, or somebody wants to speak."""
+        left_s = None if t_ns is None else max(0.0, (t_ns - self._clock.monotonic_ns()) / 1e9)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(left_s):
+                await self._news.wait()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        name = ""
+        try:
+            kind, content = await _read(reader)
+            name = content.decode(errors="replace")
+            if kind != b"M" or name not in self._medium.counters or name in self._writers:
+                return
+            self._writers[name], self._wanted[name] = writer, deque()
+            writer.write(_frame(b"A"))  # it is in the water
+            while True:
+                kind, content = await _read(reader)
+                if kind == b"S" and len(self._wanted[name]) < ROOM:
+                    self._wanted[name].append(content)
+                    self._news.set()
+        except (asyncio.IncompleteReadError, OSError, Desync):
+            pass  # the modem's process has ended
+        finally:
+            if self._writers.get(name) is writer:
+                del self._writers[name]
+            writer.close()
+
+    async def aclose(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        for writer in list(self._writers.values()):
+            writer.close()
+        if self._server is not None:
+            await self._server.wait_closed()
+
+
+class AcousticEnd:
+    """A modem's end of water that another process serves (`emulators.models.packet_link.ModemEnd`)."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.sent = self.resent = self.delivered = 0
+        self._reader, self._writer = reader, writer
+        self._heard: deque[bytes] = deque(maxlen=HEARD)
+        self._under_way = 0
+        self._gone = False
+        self._nursery = Nursery()
+        self._nursery.start(self._listen(), "water")
+
+    @classmethod
+    async def open(cls, path: Path, name: str) -> AcousticEnd:
+        """The end of the modem `name`. Raises `Unreachable`."""
+        try:
+            reader, writer = await asyncio.open_unix_connection(path)
+            writer.write(_frame(b"M", name.encode()))
+            await _read(reader)
+        except (OSError, asyncio.IncompleteReadError) as e:
+            raise Unreachable(f"{name} is not in the water", where=str(path)) from e
+        return cls(reader, writer)
+
+    def submit(self, payload: bytes, now_ns: int) -> bool:
+        if self._gone or self._under_way >= ROOM:
+            return False
+        self._writer.write(_frame(b"S", payload))
+        self._under_way += 1
+        self.sent += 1
+        return True
+
+    def arrived(self, now_ns: int) -> bytes | None:
+        if not self._heard:
+            return None
+        self.delivered += 1
+        return self._heard.popleft()
+
+    async def _listen(self) -> None:
+        with suppress(asyncio.IncompleteReadError, OSError, FieldtwinError):
+            while True:
+                kind, content = await _read(self._reader)
+                if kind == b"A":
+                    self._under_way -= 1
+                elif kind == b"H":
+                    self._heard.append(content)
+        self._gone = True
+
+    async def aclose(self) -> None:
+        await self._nursery.__aexit__(None, None, None)
+        self._writer.close()
+        with suppress(OSError):
+            await self._writer.wait_closed()

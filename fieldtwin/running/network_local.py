@@ -1,0 +1,92 @@
+"""A network's scenario on the target `local`: all its systems as processes on this host, judged over their control channels."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+
+from fieldtwin.report.model import ScenarioResult
+from fieldtwin.running.control_bench import ControlBench, Where
+from fieldtwin.running.network_bench import MemberTrace, NetworkBench, Part
+from fieldtwin.running.network_session import NetworkOptions, NetworkSession
+from fieldtwin.running.session import RunSession
+from fieldtwin.scenarios.form import Scenario
+from fieldtwin.scenarios.runner import Runner
+from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
+from gateway.core.clock import NS_PER_S
+from gateway.core.errors import FieldtwinError
+
+
+async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> ScenarioResult:
+    """Bring the network up, run the scenario, take all down. Raises `FieldtwinError` for what is gone."""
+    assert scenario.network is not None
+    chosen = seed if seed is not None else scenario.form.seed
+    options = NetworkOptions(f"test-{os.getpid()}", 0.0, chosen, scenario.profiles, cold=True, capture=True)
+    session = NetworkSession(scenario.network, options)
+    async with AsyncExitStack() as stack:
+        kept = stack.enter_context(_Tidy())
+        await stack.enter_async_context(session)
+        kept.folders += [session.instance.dir, *(one.instance.dir for one in session.sessions.values())]
+        bench = NetworkBench(scenario.network, trace, "local", session.faults)
+        for name, one in session.sessions.items():
+            notes = MemberTrace(trace, name, _later(bench, name))
+            used = [local for member, local in map(scenario.network.split, sorted(scenario.used)) if member == name]
+            part = ControlBench(
+                one.system,
+                Where(one.instance.dir, capture=one.options.capture),
+                notes,
+                target="local",
+                names=used,
+                gone=_gone(one),
+            )
+            await stack.enter_async_context(part)
+            bench.parts[name] = Part(part, notes)
+        if session.shore is not None:
+            session.shore.on_send = _told(bench)
+            bench.shore = session.shore
+        return await Runner(scenario, bench).run()
+
+
+class _Tidy:
+    """Folders of a run, gone with it; where something of it was gone before, its logs are what tells why."""
+
+    def __init__(self) -> None:
+        self.folders: list[Path] = []
+
+    def __enter__(self) -> _Tidy:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *rest: object) -> None:
+        if kind is None or not issubclass(kind, FieldtwinError):
+            for folder in self.folders:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _later(bench: NetworkBench, name: str) -> Callable[[], int]:
+    """By how much the bench of a system began later than the first."""
+    known: list[int] = []
+
+    def later_ns() -> int:
+        if not known:
+            part = bench.parts.get(name)
+            if part is None:
+                return 0
+            known.append(round((bench.now_s() - part.bench.now_s()) * NS_PER_S))
+        return known[0]
+
+    return later_ns
+
+
+def _gone(session: RunSession) -> Callable[[], FieldtwinError | None]:
+    return lambda: next((failed for child in session.children.values() if (failed := child.failure())), None)
+
+
+def _told(bench: NetworkBench) -> Callable[[int], None]:
+    def commanded(period_s: int) -> None:
+        data = {"text": f"commands {period_s} s", "period_s": period_s}
+        bench.trace.note(bench.now_ns(), Kind.NOTE, FAR_END, data)
+
+    return commanded

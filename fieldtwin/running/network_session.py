@@ -1,0 +1,130 @@
+"""A network on this host: each system a run of its own, as processes on ptys and sockets; the water between them is here.
+
+Start order: the water, the ship, then the systems in the file's order. A system that dies does not end the others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import AsyncExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from emulators.endpoints.acoustic_end import AcousticServer
+from emulators.endpoints.ports import OsPorts
+from fieldtwin.running.options import RunOptions
+from fieldtwin.running.session import RunSession
+from fieldtwin.running.shore import Scripted, Shore
+from gateway.core.endpoint import Endpoint
+from gateway.core.nursery import Nursery
+from gateway.wallclock import WallClock
+from twin.instance import Instance
+from twin.network import Network
+from twin.ship import Ship
+from twin.water_faults import WaterFaults
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """What was asked for. `instance` is the network's; its systems' are INSTANCE-SYSTEM. `duration_s` 0: until stopped."""
+
+    instance: str = ""
+    duration_s: float = 0.0
+    seed: int | None = None
+    profiles: tuple[Path, ...] = ()
+    cold: bool = False
+    capture: bool = False
+    """What goes over each system's wires into ``capture.jsonl`` in its run directory."""
+    commands: tuple[Scripted, ...] = ()
+    faults: tuple[dict[str, Any], ...] = ()
+    """Of the water."""
+
+
+class NetworkSession:
+    """``async with NetworkSession(network, options) as it: await it.wait()``. `sessions` by the names of the members."""
+
+    def __init__(self, network: Network, options: NetworkOptions) -> None:
+        self.network = network
+        self.options = options
+        self.seed = network.seed if options.seed is None else options.seed
+        self.clock = WallClock()
+        self.faults = WaterFaults(network, self.seed)
+        self.medium = network.medium(self.seed, self.faults.spoils)
+        self.instance = Instance(options.instance or network.name)
+        self.sessions: dict[str, RunSession] = {}
+        self.shore: Shore | None = None
+        self.ship: Endpoint | None = None
+        self.stopped = asyncio.Event()
+        self.started_ns = 0
+        self._stack = AsyncExitStack()
+        self._nursery = Nursery()
+
+    async def __aenter__(self) -> NetworkSession:
+        try:
+            await self._start()
+        except BaseException:
+            await self._stack.aclose()
+            raise
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        if self.shore is not None:
+            await self.shore.halt()
+        await self._stack.aclose()
+
+    async def _start(self) -> None:
+        self._stack.enter_context(self.instance)
+        server, socket = AcousticServer(self.medium, self.clock), self.instance.path("water.sock")
+        await server.open(socket)
+        self._stack.push_async_callback(server.aclose)
+        await self._stack.enter_async_context(self._nursery)
+        self._nursery.start(server.run(), "water")
+        if self.network.ship is not None:
+            ship = Ship(self.network, self.medium, self.clock)
+            self.ship = await ship.open(OsPorts())
+            self._stack.push_async_callback(ship.aclose)
+        for number, name in enumerate(self.network.members):
+            self.sessions[name] = await self._stack.enter_async_context(RunSession(self._of(number, name, socket)))
+        self.started_ns = self.faults.start_ns = self.clock.monotonic_ns()
+        for fault in self.options.faults:  # each knows its time
+            self.faults.inject(fault)
+        if self.ship is not None:
+            like = next(iter(self.network.members.values()))
+            self.shore = Shore(like.system, like.modem, self.ship, self.clock)
+            self._nursery.start(self.shore.run(list(self.options.commands)), "ship")
+
+    def _of(self, number: int, name: str, socket: Path) -> RunOptions:
+        member, instance = self.network.members[name], f"{self.instance.name}-{name}"
+        return RunOptions(
+            system=str(member.system.path),
+            prototype=True,
+            instance=instance,
+            profiles=self.options.profiles,
+            prototype_file=member.prototype.path,
+            capture=Instance(instance).dir / "capture.jsonl" if self.options.capture else None,
+            cold=self.options.cold,
+            seed=member.prototype.seed + 1_000_003 * self.seed + number,
+            water={member.modem: (str(socket), name)},
+        )
+
+    @property
+    def elapsed_s(self) -> float:
+        return (self.clock.monotonic_ns() - self.started_ns) / 1e9
+
+    def counters(self) -> dict[str, dict[str, int]]:
+        """Of each modem in the water."""
+        return {name: counters.as_dict() for name, counters in self.medium.counters.items()}
+
+    async def wait(self) -> None:
+        """Until the time asked for is over, `stopped` is set, or our own part of it fails."""
+        waiting = self._nursery.start(self.stopped.wait(), "until stopped")
+        done = asyncio.ensure_future(self._nursery.wait())
+        try:
+            await asyncio.wait(
+                [waiting, done], timeout=self.options.duration_s or None, return_when=asyncio.FIRST_COMPLETED
+            )
+            if done.done():
+                done.result()
+        finally:
+            done.cancel()

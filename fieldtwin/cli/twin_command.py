@@ -113,7 +113,9 @@ def command(
     else:
         print_shadow(seen)
         asked = f", {seen['asked']} asked of a prototype" if questions else ""
-        talk.print(f"  commands   {seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused")
+        there = f", {seen['refused_by_plant']} refused by the plant" if seen["refused_by_plant"] else ""
+        counts = f"{seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused{there}"
+        talk.print(f"  commands   {counts}", soft_wrap=True)
     if not seen["origins"]:
         raise Unreachable(f"the plant's thread: {seen['thread'].get('trouble') or 'nothing came'}", where=place)
     return 0 if seen["agreed"] == seen["statuses"] else 1

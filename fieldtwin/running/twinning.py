@@ -11,6 +11,7 @@ from typing import Any
 
 from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing, limits_of
 from fieldtwin.whatif.asking import Asking
+from gateway.core.clock import NS_PER_MS
 from gateway.core.events import Consumer
 from gateway.core.nursery import Nursery
 from gateway.core.values import COMMAND
@@ -19,7 +20,7 @@ from twin.instance import Instance
 from twin.knowledge import KnowledgeWriter
 from twin.mape.execute import Bounds
 from twin.mape.messages import Verdict
-from twin.mape.plan import Planner
+from twin.mape.plan import OLD_MS, Planner
 from twin.mape.what_if import Question
 from twin.system import System
 from twin.thread import DTtoPTConnection, Operator, schema_of
@@ -29,7 +30,8 @@ from twin.twin import DigitalTwin
 
 
 class Twinning(Shadowing):
-    """As `Shadowing`, with a planner. `on_command` is told each command that is sent, `on_refusal` why one is not.
+    """As `Shadowing`, with a planner. `on_command` is told each command that is sent, `on_refusal` why one is not, here or
+    at the plant.
 
     With `asking` a prototype is asked `question` before each command, or what the planner says of it.
     """
@@ -57,6 +59,7 @@ class Twinning(Shadowing):
         super().__init__(system, place, instance, store=store, on_verdict=on_verdict)
         self._on_command = on_command
         self._on_refusal = on_refusal
+        self.refused_by_plant = 0
         self._operator = Operator("twin", self.clock)
         self._sent: Consumer[COMMAND] = Consumer(self.shadow.execute.transmitter.event)
         self.shadow.execute.transmitter.subscribe(self._sent)
@@ -86,6 +89,11 @@ class Twinning(Shadowing):
     async def _arrived(self, origin: str, events: Sequence[Event]) -> None:
         if self._asking is not None:
             self._asking.known.take(events)
+        for event in events:
+            if event.kind == Kind.REFUSAL:
+                self.refused_by_plant += 1
+                if self.clock.utc_ns() // NS_PER_MS - event.t_ms <= OLD_MS:
+                    self._on_refusal(f"by the plant: {event.value!s}")
         await super()._arrived(origin, events)
 
     async def _beside(self, nursery: Nursery, store: KnowledgeStore) -> None:
@@ -109,4 +117,5 @@ class Twinning(Shadowing):
             await self._commands.flush()
 
     def describe(self) -> dict[str, Any]:
-        return {**super().describe(), "unconfirmed_commands": self._end.waiting if self._end is not None else 0}
+        waiting = self._end.waiting if self._end is not None else 0
+        return {**super().describe(), "unconfirmed_commands": waiting, "refused_by_plant": self.refused_by_plant}

@@ -7,15 +7,18 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support import run
 
 from fieldtwin.running.twin_rules import load_planner
+from fieldtwin.running.twinning import Twinning
 from gateway.core.errors import FileInvalid
 from gateway.core.statemachine import decode_period, encode_period
 from gateway.store.event import Event, Kind
 from twin.command_gate import CommandGate
+from twin.instance import Instance
 from twin.mape.execute import Bounds
 from twin.mape.messages import verdict
-from twin.mape.plan import Plan
+from twin.mape.plan import Plan, RulePlanner
 from twin.model import DigitalModel
 from twin.system import load_system
 
@@ -179,3 +182,22 @@ def test_what_a_planner_in_python_raises_or_gives_is_a_refusal_and_the_twin_goes
     raised, gave = [str(e.value) for e in plan.collect() if e.kind == Kind.REFUSAL]
     assert "'python: failing_planner:Planner' failed: ZeroDivisionError: division by zero" in raised
     assert "expected a COMMAND or None; got int" in gave
+
+
+def test_what_the_plant_refuses_is_said_by_its_twin_unless_it_is_history(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
+    said: list[str] = []
+    with Instance("twin") as here:
+        twinning = Twinning(
+            load_system(str(OBSERVATORY)), "tcp://127.0.0.1:1", here, planner=RulePlanner(()),
+            on_verdict=lambda verdict: None, on_command=lambda command: None, on_refusal=said.append,
+        )  # fmt: skip
+        now_ms = twinning.clock.utc_ns() // 1_000_000
+        told = [
+            Event(n, t_ms, Kind.REFUSAL, "command gate", f"no {n}") for n, t_ms in ((1, now_ms - 60_000), (2, now_ms))
+        ]
+        run(twinning._arrived("plant:1", told))
+    assert said == ["by the plant: no 2"]
+    assert twinning.describe()["refused_by_plant"] == 2

@@ -1,0 +1,88 @@
+"""What an extra brings is asked for when it is used, by its name; without `perf` all goes on as it does."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import sys
+import tomllib
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from fieldtwin.commissioning.plotting import check_plot
+from fieldtwin.recording.exporting import Column, _write_parquet
+from fieldtwin.running import loops
+from gateway.core.errors import UsageError
+from gateway.store.knowledge import open_knowledge
+from gateway.wallclock import WallClock
+from twin.system import load_system
+from twin.thread_place import twin_carrier
+
+CHECKOUT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+
+
+def use_mqtt(folder: Path) -> None:
+    system = load_system(str(CHECKOUT / "profiles/systems/observatory.yaml"))
+    twin_carrier("mqtt://broker/sea/observatory", system, WallClock())
+
+
+def use_postgres(folder: Path) -> None:
+    asyncio.run(open_knowledge("postgresql://nobody@127.0.0.1:1/none"))
+
+
+def use_plot(folder: Path) -> None:
+    check_plot(folder / "x.png")
+
+
+def use_parquet(folder: Path) -> None:
+    _write_parquet(folder / "x.parquet", [Column("t", float)], iter([(1.0,)]))
+
+
+USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
+    "mqtt": ("aiomqtt", use_mqtt, "twin.thread_mqtt"),
+    "postgres": ("asyncpg", use_postgres, "gateway.store.postgres_knowledge"),
+    "plot": ("matplotlib", use_plot, ""),
+    "parquet": ("pyarrow", use_parquet, ""),
+}
+
+
+@pytest.mark.parametrize("extra", list(USES))
+def test_who_has_it_not_is_told_what_to_install(extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package, use, ours = USES[extra]
+    assert [re.split("[ ><=]", wanted)[0] for wanted in EXTRAS[extra]] == [package]
+    if ours:
+        monkeypatch.delitem(sys.modules, ours, raising=False)
+        parent, _, name = ours.rpartition(".")
+        monkeypatch.delattr(import_module(parent), name, raising=False)
+    for loaded in [m for m in sys.modules if m == package or m.startswith(f"{package}.")]:
+        monkeypatch.delitem(sys.modules, loaded)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(UsageError, match=rf"pip install ['\"]fieldtwin\[{extra}\]['\"]"):
+        use(tmp_path)
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_perf_only_makes_it_faster(there: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if there:
+        pytest.importorskip("uvloop")
+    else:
+        monkeypatch.setitem(sys.modules, "uvloop", None)
+
+    async def which() -> str:
+        return type(asyncio.get_running_loop()).__module__.partition(".")[0]
+
+    assert (loops.run(which()) == "uvloop") == there
+    assert loops.run(which(), serial=True) != "uvloop"  # which waits in whole milliseconds
+
+
+def test_every_extra_is_on_the_page_and_the_rest_is_there_without() -> None:
+    page = (CHECKOUT / "docs" / "service.md").read_text(encoding="utf-8")
+    table = page[page.index("| extra |") :]
+    assert re.findall(r"^\| `([a-z]+)` \|", table.split("\n\n")[0], re.M) == sorted(EXTRAS, key=table.index)
+    named = {re.split("[ ><=;]", wanted)[0] for wanted in PROJECT["dependencies"]}
+    assert named.isdisjoint(package for package, _, _ in USES.values())

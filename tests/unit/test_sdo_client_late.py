@@ -84,7 +84,8 @@ class OrderlyServer:
             reply = self.reply(request)
             if reply is None:
                 continue
-            self.last_s = max(self.last_s, loop.time() + self.random.random() ** 3 * self.delay_s)
+            # One frame behind the other: asyncio's timers of one instant go in no order.
+            self.last_s = max(self.last_s + 1e-6, loop.time() + self.random.random() ** 3 * self.delay_s)
             loop.call_at(self.last_s, self.end.peer.feed, CanFrame(0x585, reply))
 
     def reply(self, request: bytes) -> bytes | None:

@@ -10,13 +10,19 @@ import ast
 import difflib
 import operator
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
+from itertools import pairwise
 from typing import Any
 
 from gateway.core.errors import UsageError
+from gateway.core.values import Quality, Reason
 
 FUNCTIONS = ("quality", "age", "value", "updates", "reason")
 """Of a tag: its quality in words, seconds since its source's time, its value, how often it was published, why it is bad."""
+QUALITIES = tuple(str(quality) for quality in Quality)
+WORDS = {"quality": QUALITIES, "reason": tuple(str(reason).replace(" ", "_") for reason in Reason)}
+"""What these functions can say."""
+NO_WORDS: Mapping[str, Collection[str]] = {}
 OWN = ("plc.late", "command pending")
 """``plc.late``: by how many seconds the last scan was late; ``command pending``: the far end commanded within 5 s."""
 LONGEST = 1000
@@ -54,9 +60,12 @@ Look = Callable[[str, str], Any]
 
 
 class Expression:
-    """`text`, read once. `names`: the tags and variables that it is about. Raises `UsageError` for what it is not."""
+    """`text`, read once. `names`: the tags and variables that it is about. Raises `UsageError` for what it is not.
 
-    def __init__(self, text: str, known: Collection[str]) -> None:
+    `words`: what a name can only be, where that is known; to compare it with another text is a mistake.
+    """
+
+    def __init__(self, text: str, known: Collection[str], words: Mapping[str, Collection[str]] = NO_WORDS) -> None:
         self.text = text
         self.names: list[str] = []
         self.times_s = [float(m[2]) * _UNIT_S[m[3]] for m in _TOKEN.finditer(text) if m[2] is not None]
@@ -64,6 +73,7 @@ class Expression:
         self.asks_lateness = False
         """Whether it is about ``plc.late``."""
         self._known = known
+        self._words = words
         if len(text) > LONGEST:
             raise UsageError("too long an expression", expected=f"at most {LONGEST} characters")
         self._lead = len(text) - len(text.lstrip())
@@ -108,6 +118,9 @@ class Expression:
             parts = [node.left, node.right]
         elif isinstance(node, ast.Compare) and all(type(op) in _COMPARE for op in node.ops):
             parts = [node.left, *node.comparators]
+            for one, other in pairwise(parts):
+                self._check_words(one, other)
+                self._check_words(other, one)
         elif isinstance(node, ast.Call):
             self._check_call(node)
             return
@@ -135,6 +148,25 @@ class Expression:
                 f"no function {name!r}", self._at(node), expected=", ".join(f"{f}(TAG)" for f in FUNCTIONS), hint=hint
             )
         self._check_name(self._name(node.args[0]), node.args[0])
+
+    def _check_words(self, asked: ast.expr, text: ast.expr) -> None:
+        """A text that the other side of a comparison can never be."""
+        if not isinstance(text, ast.Constant) or not isinstance(text.value, str):
+            return
+        words: Collection[str] = ()
+        if isinstance(asked, ast.Name | ast.Attribute):
+            words = self._words.get(self._name(asked), ())
+        elif isinstance(asked, ast.Call) and isinstance(asked.func, ast.Name) and len(asked.args) == 1:
+            value = asked.func.id == "value" and isinstance(asked.args[0], ast.Name | ast.Attribute)
+            words = self._words.get(self._name(asked.args[0]), ()) if value else WORDS.get(asked.func.id, ())
+        if words and text.value not in words:
+            near = difflib.get_close_matches(text.value, words, n=1, cutoff=0.5)
+            raise NotUnderstood(
+                f"{ast.unparse(asked)} is never {text.value!r}",
+                self._at(text),
+                expected=", ".join(words),
+                hint=f"did you mean {near[0]!r}?" if near else "",
+            )
 
     def _name(self, node: ast.expr) -> str:
         try:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.expression import Expression, NotUnderstood
+from fieldtwin.scenarios.expression import QUALITIES, Expression, NotUnderstood
 from fieldtwin.scenarios.probe_form import Probe, ProbeForm, read_probe
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.yaml_file import Key, YamlFile, load, validate
+from twin.data_files import network_file
 from twin.fault_aims import target
-from twin.network import WATER, Network, load_network, network_file
+from twin.network import WATER, Network, load_network
 from twin.system import System, load_system
 from twin.water_faults import check_water_fault
 
@@ -57,7 +58,7 @@ class WireForm(_Form):
     """What is seen on a device's wire."""
 
     wire: str
-    access: Annotated[str, Field(pattern="^(read|write)$")] | None = None
+    access: Literal["read", "write"] | None = None
     function: int | None = None
     register_: str | None = Field(default=None, alias="register")
     value: Number | None = None
@@ -71,10 +72,10 @@ class Expect(_Form):
     value: Number | bool | str | None = None
     tolerance: Number = 0
     quality: str | None = None
-    like: Annotated[str, Field(pattern="^recording$")] | None = None
+    like: Literal["recording"] | None = None
     updates_per_s: tuple[Number, Number] | list[Number] | None = None
     wire: str | None = None
-    access: Annotated[str, Field(pattern="^(read|write)$")] | None = None
+    access: Literal["read", "write"] | None = None
     function: int | None = None
     register_: str | None = Field(default=None, alias="register")
     times: int | Bounds | None = None
@@ -142,7 +143,6 @@ class ScenarioForm(_Form):
     steps: list[Step] = Field(min_length=1, max_length=10_000)
 
 
-_QUALITIES = ["good", "uncertain", "bad", "substituted", "simulated"]
 _TOGETHER = {
     "tag": ("tag", "value", "tolerance", "quality", "like", "within", "during"),
     "updates": ("tag", "quality", "updates_per_s", "during"),
@@ -169,6 +169,8 @@ class Scenario:
     """What expressions may name."""
     own: tuple[str, ...] = ()
     """Of these, what is the system's."""
+    words: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """What those of them can only be that have words for their values: the states of programs."""
     probes: tuple[Probe, ...] = ()
     profiles: tuple[Path, ...] = ()
     network: Network | None = None
@@ -184,7 +186,7 @@ class Scenario:
     def expression(self, text: str, *loc: Key) -> Expression:
         """`text` as an expression. Raises `FileInvalid` at its spot."""
         try:
-            expression = Expression(text, self.known)
+            expression = Expression(text, self.known, self.words)
         except UsageError as e:
             error = self.file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint)
             raise self._inside(error, text, e.at_column if isinstance(e, NotUnderstood) else 0) from e
@@ -206,15 +208,22 @@ class Scenario:
         )  # fmt: skip
 
 
-def names_of(system: System, network: Network | None = None) -> list[str]:
-    """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE; in a network behind the name of their system."""
+def names_of(system: System, network: Network | None = None) -> dict[str, tuple[str, ...]]:
+    """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE; in a network behind the name of their system. Of a program's state
+    the words that it can be, of all else none."""
     from twin.physical import image_layout
 
     if network is not None:
-        return [f"{m.name}.{name}" for m in network.members.values() for name in names_of(m.system)]
-    tags = [f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()]
-    variables = [spec.name for region in image_layout(system).regions for spec in region.tags]
-    return list(dict.fromkeys([*tags, *variables]))
+        of_all = [(m.name, names_of(m.system)) for m in network.members.values()]
+        return {f"{member}.{name}": words for member, names in of_all for name, words in names.items()}
+    names: dict[str, tuple[str, ...]] = {
+        f"{d.name}.{t.name}": () for d in system.devices.values() for t in d.profile.tags.values()
+    }
+    states = {f"{program}.state" for program in system.plc.programs}
+    for region in image_layout(system).regions:
+        for spec in region.tags:
+            names[spec.name] = tuple(word for _, word in spec.words) if spec.name in states else ()
+    return names
 
 
 def word_of(step: Step) -> str:
@@ -226,13 +235,7 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
     """Read and check. Raises `FileInvalid`, `UsageError`."""
     file = load(path)
     form = validate(file, ScenarioForm)
-    beside = path.parent / form.system
-    named = str(beside) if beside.exists() else form.system.removesuffix(".yaml")
-    at = network_file(named, profiles)
-    network = load_network(at, profiles) if at is not None else None
-    if network is not None:
-        _check_of_network(file, form)
-    system = network.whole if network is not None else load_system(named, list(profiles))
+    system, network = _system(file, form, profiles)
     served = [one.name for one in system.serving.serve]
     probes = tuple(read_probe(file, name, one, served) for name, one in form.probes.items())
     own = names_of(system, network)
@@ -241,7 +244,19 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
             raise file.error(("probes", probe.name), f"{probe.name!r} is a device or program of the system already")
     known = tuple(dict.fromkeys([*own, *(name for probe in probes for name in probe.names)]))
     scenario = Scenario(
-        path, form, file, system, _needs(file, form), (), (), known, tuple(own), probes, profiles, network
+        path,
+        form,
+        file,
+        system,
+        _needs(file, form),
+        (),
+        (),
+        known,
+        tuple(own),
+        {name: words for name, words in own.items() if words},
+        probes,
+        profiles,
+        network,
     )
     always = tuple(scenario.expression(text, "always", n) for n, text in enumerate(form.always))
     never: list[Expression | WireForm] = []
@@ -264,8 +279,30 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
         if step.fault is not None:
             faults.append(str(step.fault.get("id", f"step {n + 1}")))
         if step.clear is not None:
-            _known(file, ("steps", n, "clear"), "fault of a step before", step.clear, faults)
+            _known(file, ("steps", n, "clear"), "fault of an earlier step", step.clear, faults)
     return scenario
+
+
+def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, Network | None]:
+    """The system that it names, beside it or shipped, or the whole of the network."""
+    folder = Path(file.path).parent
+    beside = folder / form.system
+    named = str(beside) if beside.exists() else form.system.removesuffix(".yaml")
+    try:
+        at = network_file(named, profiles)
+        network = load_network(at, profiles) if at is not None else None
+        if network is not None:
+            _check_of_network(file, form)
+            return network.whole, network
+        system = load_system(named, list(profiles))
+    except UsageError as e:
+        raise file.error(("system",), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+    if form.prototype is not None and not (folder / form.prototype).is_file():
+        there = [one.name for one in sorted(folder.glob("*.yaml"))]
+        near = difflib.get_close_matches(form.prototype, there, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else ""
+        raise file.error(("prototype",), f"no file {form.prototype!r} beside it", hint=hint)
+    return system, None
 
 
 def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
@@ -309,11 +346,22 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
         if step.pause is not None:
             seconds(step.pause)
         if step.set is not None:
-            _known(file, (*loc, "set", "tag"), "tag", step.set.tag, scenario.own)
+            _check_set(scenario, step.set, (*loc, "set"))
         if step.expect is not None:
             _check_expect(scenario, step.expect, (*loc, "expect"))
     except UsageError as e:
         raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+
+
+def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
+    _known(scenario.file, (*loc, "tag"), "tag", said.tag, scenario.own)
+    device, _, name = said.tag.rpartition(".")
+    found = scenario.system.devices.get(device)
+    if found is None or name not in found.profile.tags or said.value is None:
+        return
+    if found.profile.tags[name].is_text != isinstance(said.value, str):
+        wanted = "a text" if found.profile.tags[name].is_text else "a number"
+        raise scenario.file.error((*loc, "value"), f"{said.tag} is {wanted}", got=repr(said.value))
 
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
@@ -347,11 +395,14 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
     if kind in ("rate", "updates") and expect.during is None:
         raise scenario.file.error(loc, "a rate is one of some time", expected="during: 10s")
     if expect.quality is not None:
-        _known(scenario.file, (*loc, "quality"), "quality", expect.quality, _QUALITIES)
+        _known(scenario.file, (*loc, "quality"), "quality", expect.quality, QUALITIES)
     if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
         raise scenario.file.error((*loc, "like"), "only what a device holds can be like it", expected="tag: DEVICE.TAG")
     if expect.tag is not None:
         _known(scenario.file, (*loc, "tag"), "tag", expect.tag, scenario.known)
+        words = scenario.words.get(expect.tag, ())
+        if words and isinstance(expect.value, str):
+            _known(scenario.file, (*loc, "value"), f"value of {expect.tag}", expect.value, words)
         scenario.used.add(expect.tag)
     if expect.wire is not None:
         devices = scenario.system.devices

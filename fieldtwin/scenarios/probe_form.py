@@ -69,6 +69,9 @@ def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) ->
         )
     try:
         endpoint = Endpoint.parse(form.endpoint) if form.endpoint is not None else None
+    except UsageError as e:
+        raise file.error((*loc, "endpoint"), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+    try:
         every_s, timeout_s = seconds(form.every), seconds(form.timeout)
     except UsageError as e:
         raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e

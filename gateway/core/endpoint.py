@@ -21,6 +21,7 @@ Pure text handling: this module opens nothing and knows no operating system.
 
 from __future__ import annotations
 
+import difflib
 import re
 from dataclasses import dataclass, replace
 from urllib.parse import parse_qsl, urlencode
@@ -91,7 +92,12 @@ class Endpoint:
         scheme, colon, rest = url.partition(":")
         scheme = scheme.lower()
         if not colon or scheme not in SCHEMES:
-            raise UsageError(f"cannot read endpoint {url!r}", expected="one of " + ", ".join(f"{s}:" for s in SCHEMES))
+            near = difflib.get_close_matches(scheme, SCHEMES, n=1) if colon else []
+            raise UsageError(
+                f"cannot read endpoint {url!r}",
+                expected="one of " + ", ".join(f"{s}:" for s in SCHEMES),
+                hint=f"did you mean {near[0]}:?" if near else "",
+            )
         rest, _, query = rest.partition("?")
         params = tuple(parse_qsl(query, keep_blank_values=True))
         if scheme in SOCKET_SCHEMES:

@@ -157,7 +157,14 @@ def _translate(file: YamlFile, model: type[BaseModel], e: ValidationError) -> Fi
     if first["type"] == "missing":
         missing = str(first["loc"][-1])
         return file.error(loc, f"the key {missing!r} is missing{_inside((*loc, missing))}{more}")
+    if first["type"] == "too_short" and not first["input"]:
+        return file.error(loc, f"{name} is empty{more}")
     got = "" if first["type"] == "value_error" else repr(first["input"])[:80]
+    if first["type"] == "literal_error":
+        known = re.findall(r"'([^']*)'", str(first["ctx"]["expected"]))
+        near = difflib.get_close_matches(str(first["input"]), known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}?" if near else ""
+        return file.error(loc, f"{name}{more}", expected=" or ".join(known), got=got, hint=hint)
     return file.error(loc, f"{name}: {first['msg'].removeprefix('Value error, ')}{more}", got=got)
 
 

@@ -124,7 +124,7 @@ def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -
         ("  - fault: {name: silence, device: ctb}\n", "did you mean 'ctd'", 4),
         ("  - fault: {name: bus-off, device: ctd}\n", "for CAN buses", 4),
         ("  - fault: {id: dead, name: silence, device: ctd}\n  - clear: daed\n", "did you mean 'dead'", 5),
-        ("  - clear: dead\n", "no fault of a step before 'dead'", 4),
+        ("  - clear: dead\n", "no fault of an earlier step 'dead'", 4),
         ("  - expect: {tag: ctd.presure, quality: good}\n", "did you mean 'ctd.pressure'", 4),
         ("  - expect: {wire: ctd, register: pressur, times: 1}\n", "did you mean 'pressure'", 4),
         ("  - pause: 1s\n  - wait: {until: 'relay.stat == 1'}\n", "did you mean 'relay.state'", 5),
@@ -135,6 +135,11 @@ def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -
         ("  - expect: {wire: ctd, requests_per_s: {max: 1}}\n", "during: 10s", 4),
         ("  - expect: {tag: ctd.pressure, quality: goood}\n", "did you mean 'good'", 4),
         ("  - expect: {tag: relay.state, like: recording}\n", "DEVICE.TAG", 4),
+        ("  - expect: {tag: ctd.pressure, like: recordng}\n", "did you mean 'recording'", 4),
+        ("  - expect: {wire: ctd, access: wirte}\n", "expected read or write; got 'wirte' (did you mean 'write'", 4),
+        ("  - expect: {tag: relay.state, value: ACTVE}\n", "did you mean 'ACTIVE'", 4),
+        ("  - set: {tag: ctd.pressure, value: high}\n", "ctd.pressure is a number; got 'high'", 4),
+        ("  []\n", "steps is empty", 3),
     ],
 )
 def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: str, line: int) -> None:
@@ -142,6 +147,23 @@ def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: st
         load_scenario(written(tmp_path, steps))
     assert told in str(e.value)
     assert e.value.line == line
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("system: observatry\n", "no system 'observatry'; expected a file, or one of "),
+        ("system: observatory\nprototype: x.prototyp.yaml\n", "did you mean 'x.prototype.yaml'"),
+    ],
+)
+def test_a_file_that_is_not_there_is_named_where_it_is_asked_for(tmp_path: Path, line: str, told: str) -> None:
+    (tmp_path / "x.prototype.yaml").touch()
+    path = tmp_path / "x.scenario.yaml"
+    path.write_text(f"scenario: a test\n{line}steps:\n  - pause: 1s\n")
+    with pytest.raises(FileInvalid) as e:
+        load_scenario(path)
+    assert told in str(e.value)
+    assert e.value.line == line.count("\n") + 1
 
 
 def test_reports_are_written(tmp_path: Path) -> None:

@@ -89,6 +89,7 @@ def test_probes_see_what_is_served_under_their_names(tmp_path: Path) -> None:
         (HMI.replace("desk:", "ctd:"), "device or program", 4),
         (HMI.replace("    serve: hmi\n", ""), "one place", 4),
         (HMI.replace("serve: hmi", 'endpoint: "can:socketcan/can0"'), "over Modbus", 5),
+        (HMI.replace("serve: hmi", 'endpoint: "tpc://127.0.0.1"'), "did you mean tcp:", 5),
         ("rate: [{tag: ctd.pressure, requests_per_s: {max: 1}}]\n", "of a tag or of a wire", 3),
         ("cycle: [{changes_of: ctd.pressure}]\n", "bounds", 3),
         ("within: [{after: 'relay.stat == 1', then: 'true', within: 1s}]\n", "did you mean 'relay.state'", 3),
@@ -108,6 +109,9 @@ def test_a_mistake_is_named_where_it_stands(tmp_path: Path, head: str, told: str
         ("ctd.pressure > 100 ms or qualty(ctd.pressure) == 'good'", "qualty"),
         ("'5 s' == '5 s' and 10 min > relay.stat", "relay.stat"),
         ("command pending and ctd.pressure ** 2 > 1", "ctd.pressure ** 2"),
+        ("relay.state == 'ACTIVE' or 'ACTVE' == value(relay.state)", "'ACTVE'"),
+        ("100 ms > age(ctd.pressure) or quality(ctd.pressure) != 'bade'", "'bade'"),
+        ("reason(ctd.pressure) == 'time-out'", "'time-out'"),
     ],
 )
 def test_an_error_in_an_expression_has_its_own_column(tmp_path: Path, text: str, word: str) -> None:

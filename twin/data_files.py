@@ -71,6 +71,21 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
     )
 
 
+def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
+    """The file that `name` means, if that is a network's; None for anything else, also for what is not there."""
+    try:
+        path = find("systems", name, extra=profiles)
+    except UsageError:
+        return None
+    if path.suffix not in (".yaml", ".yml"):
+        return None
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return None
+    return path if any(line.startswith("network:") for line in lines) else None
+
+
 def find_recording(name: str, beside: Path | None = None) -> Path:
     """A recording by path, beside the file that names it, in ./recordings or shipped."""
     folders = [beside.parent] if beside else []

@@ -115,25 +115,11 @@ def _renamed(program: ProgramForm, member: Member) -> ProgramForm:
         source=str(beside.resolve()) if beside.is_file() else program.source,
         task=None,
         inputs={
-            n: InputForm.model_construct(tag=f"{member.name}.{i.tag}", if_bad=i.if_bad) for n, i in program.inputs.items()
+            n: InputForm.model_construct(tag=f"{member.name}.{i.tag}", if_bad=i.if_bad)
+            for n, i in program.inputs.items()
         },
         outputs={n: f"{member.name}.{tag}" for n, tag in program.outputs.items()},
     )
-
-
-def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
-    """The file that `name` means, if that is a network's; None for anything else, also for what is not there."""
-    try:
-        path = find("systems", name, extra=profiles)
-    except UsageError:
-        return None
-    if path.suffix not in (".yaml", ".yml"):
-        return None
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return None
-    return path if any(line.startswith("network:") for line in lines) else None
 
 
 def load_network(path: Path, profiles: Iterable[Path] = ()) -> Network:

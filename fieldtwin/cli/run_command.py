@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
 from fieldtwin.cli.template_question import ask_about
 from fieldtwin.running.options import RunOptions
@@ -26,6 +27,7 @@ from fieldtwin.service.attached import Service, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
 from gateway.core.errors import UsageError
+from twin.data_files import network_file
 
 if TYPE_CHECKING:
     from fieldtwin.running.virtual_run import VirtualOptions
@@ -168,13 +170,29 @@ def command(
 ) -> int:
     """Run SYSTEM: gateway and PLC, each in its own process.
 
-    SYSTEM is a file, the name of a shipped one such as `observatory`, or a template (fieldtwin template): a zip or a folder.
+    SYSTEM is a file, the name of a shipped one such as `observatory`, or a template (fieldtwin template): a zip or a folder. With
+    --prototype also a network, such as `ocean_network`: several systems, and the water between their modems.
 
     With --prototype the field side is emulated in a process of its own, on real wires: a pty for each serial line, TCP sockets, a
     software CAN bus (or a kernel one, with --can). The same system file runs the plant with --plant.
     """
     if prototype == plant:
         raise UsageError(NEITHER if not plant else "--plant and --prototype exclude each other")
+    network = network_file(system, [Path(p) for p in profiles])
+    if network is not None:
+        others = {
+            "--field": field_host, "--recording": recordings, "--speed": speed, "--listen": listen, "--can": can,
+            "--capture": capture, "--seeds": seeds, "--ledger": ledger, "--compare": compare, "--faults": faults,
+            "--thread": thread, "--metrics": metrics, "--log": log, "--prototype-file": prototype_file,
+        }  # fmt: skip
+        return _run_network(
+            NetworkRequest(
+                network, virtual, duration_s, seed, instance, profiles,
+                parse_periods(commands) if commands is not None else None, trace, cold, as_json,
+            ),
+            plant,
+            [option for option, said in others.items() if said],
+        )  # fmt: skip
     if plant and faults:
         raise UsageError("a plant has no faults but its own", hint="--faults goes with --prototype")
     if plant and (field_host or recordings or listen or can or speed or prototype_file or commands):
@@ -249,6 +267,23 @@ def command(
         faults=_faults(faults, system, profiles) if faults else (),
     )
     return asyncio.run(_run(options, ServiceOptions(metrics=metrics, log=log), as_json))
+
+
+def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int:
+    from fieldtwin.cli.network_view import run_network
+
+    if plant:
+        raise UsageError(
+            "a network file is of prototypes: each of its systems is a plant of its own",
+            hint="run each where it is, with its own system file",
+        )
+    if others:
+        raise UsageError(
+            f"{', '.join(others)}: nothing of a network",
+            expected="--for, --virtual, --seed, --trace, --commands, --instance, --cold, --json",
+            hint="its systems can be run one by one",
+        )
+    return run_network(request)
 
 
 def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str, Any], ...]:

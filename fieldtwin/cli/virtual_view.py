@@ -43,7 +43,7 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
         f"{run.system.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
     )
     began_ns = WallClock().monotonic_ns()
-    with _bar(options.duration_s) as at:
+    with progress_bar(options.duration_s) as at:
         run.run(at)
     took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
     summary = run.summary()
@@ -80,7 +80,7 @@ def run_many(
     what = what_runs(options)
     left = [seed for seed in seeds if ledger is None or seed not in ledger.done(what)]
     count = 0
-    with _bar(float(len(left)), "seeds") as at:
+    with progress_bar(float(len(left)), "seeds") as at:
 
         def ended(result: SeedResult) -> None:
             nonlocal count
@@ -146,8 +146,8 @@ def shown_time(seconds: float) -> str:
     return f"{seconds / 60:g} min" if seconds >= 120 else f"{seconds:g} s"
 
 
-class _bar:
-    """A progress bar on stderr where that is a terminal. ``with _bar(60.0) as at: at(12.0)``."""
+class progress_bar:
+    """A progress bar on stderr where that is a terminal. ``with progress_bar(60.0) as at: at(12.0)``."""
 
     def __init__(self, total: float, unit: str = "s") -> None:
         columns = (

@@ -163,33 +163,45 @@ class VirtualRun:
             commands=commands,
             far_end=bool(commands),
         ) as bench:
-            self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
-            self._emulated = frozenset(bench.run.field.devices)
-            bench.run.gateway.tags.on_put = self._watched(bench)
-            self.trace.listeners.append(self._on_event)
-            self.states.knows(bench.run.twin.ecs.layout)
-            for program, state in bench.states().items():
-                self.states.note(program, state, loop.now_ns)
+            self.attach(bench)
             for fault in self.faults:  # each knows its time
                 await bench.inject(fault)
             await self._through(bench, loop)
             await self._settle(bench)
             if self.shore is not None:
                 await self.shore.halt()
-            self.outputs_confirmed_safe = await bench.run.stop_gateway()
-            outputs = describe(bench.run.gateway, loop.now_ns)[
-                "outputs"
-            ]  # a node that was stopped holds nothing for sure
-            await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
-            self._judge(bench.run.field)
-            self._take_status(bench, outputs)
+            await self.finish(bench)
+
+    def attach(self, bench: VirtualBench) -> None:
+        """From now on what happens on `bench` is judged."""
+        self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
+        self._emulated = frozenset(bench.run.field.devices)
+        bench.run.gateway.tags.on_put = self._watched(bench)
+        bench.trace.listeners.append(self._on_event)
+        self.states.knows(bench.run.twin.ecs.layout)
+        for program, state in bench.states().items():
+            self.states.note(program, state, bench.loop.now_ns)
+
+    def judge(self, bench: VirtualBench) -> None:
+        """What was published since the last time; often enough that no journal forgets."""
+        self.elapsed_s = bench.now_s()
+        self._judge(bench.run.field)
+
+    async def finish(self, bench: VirtualBench) -> None:
+        """Stop the gateway in order and take the last figures; then `summary`."""
+        self.outputs_confirmed_safe = await bench.run.stop_gateway()
+        outputs = describe(bench.run.gateway, bench.loop.now_ns)[
+            "outputs"
+        ]  # a node that was stopped holds nothing for sure
+        await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
+        self._judge(bench.run.field)
+        self._take_status(bench, outputs)
 
     async def _through(self, bench: VirtualBench, loop: VirtualLoop) -> None:
         """To the end of the run's time, piece by piece."""
         while (left_s := self.options.duration_s - bench.now_s()) > 0:
             await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
-            self.elapsed_s = bench.now_s()
-            self._judge(bench.run.field)
+            self.judge(bench)
             loop.stop()  # the world is looked at
             await asyncio.sleep(0)
 

@@ -1,0 +1,21 @@
+"""What the command line says of a run of a network."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+
+class NetworkRequest(NamedTuple):
+    """A run of the network in the file `path`. `commands` None: what the ship orders by default."""
+
+    path: Path
+    virtual: bool
+    duration_s: float
+    seed: int | None
+    instance: str
+    profiles: tuple[str, ...]
+    commands: tuple[int, ...] | None
+    trace: str | None
+    cold: bool
+    as_json: bool

@@ -1,0 +1,28 @@
+"""The verdict on a run of a network: that on each of its systems, and what happened in the water."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fieldtwin.__about__ import __version__
+from twin.network import Network
+
+
+def summarise_network(
+    network: Network,
+    systems: dict[str, dict[str, Any]],
+    water: dict[str, dict[str, int]],
+    ship: dict[str, Any] | None,
+    errors: list[str],
+) -> dict[str, Any]:
+    """Plain data for `--json` and for people. `systems`: each one's own summary. `ok` when all are, and nothing else failed."""
+    return {
+        "fieldtwin": __version__,
+        "network": network.name,
+        "prototype": True,
+        "systems": systems,
+        "water": water,
+        "ship": ship,
+        "errors": errors,
+        "ok": not errors and all(one["ok"] for one in systems.values()),
+    }

@@ -182,7 +182,7 @@ class Scan:
             if alive and qualities[item.index] != Quality.BAD:
                 value = values[item.index]
                 if item.hold:
-                    item.held = value, snapshot.times_ns[item.index]
+                    item.held = value, snapshot.time_ns(item.index)
                 item.armed = True
             else:
                 value = self._bad(item)

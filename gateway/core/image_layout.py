@@ -172,6 +172,11 @@ class RegionShape:
         values = "".join("d" if tag.kind is TagKind.REAL else "q" for tag in layout.tags)
         # counter, time, flags, spare; times; values; qualities; reasons
         self.body = struct.Struct(f"<QqII{count}q{values}{count}s{count}s")
+        self.head = struct.Struct("<QqI")
+        self.times = struct.Struct(f"<{count}q")
+        self.times_at = struct.calcsize("<QqII")
+        self.columns = struct.Struct(f"<{values}{count}s{count}s")
+        self.columns_at = self.times_at + self.times.size
         self.slot_size = _aligned(CHECK.size + self.body.size, LINE)
         offset = LINE + SLOTS * self.slot_size
         rings = []

@@ -60,7 +60,8 @@ class Snapshot:
 
     `values`, `qualities`, `reasons` and `times_ns` are columns in the order of the region's tags; `value` joins them
     for one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, what is new since
-    the reader's last snapshot, in order; a tag without news has no entry.
+    the reader's last snapshot, in order; a tag without news has no entry. Times stay packed in `stamps` until somebody
+    asks for one: hardly anybody does. As long as no value, quality or reason changes, snapshots share those columns.
     """
 
     shape: RegionShape
@@ -70,13 +71,22 @@ class Snapshot:
     values: tuple[Scalar | None, ...]
     qualities: bytes
     reasons: bytes
-    times_ns: tuple[int, ...]
+    stamps: bytes
     messages: Mapping[str, tuple[Message, ...]] = field(default_factory=dict)
 
     def value(self, tag: str | int) -> TagValue:
         """The value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
         i = self.shape.index[tag] if isinstance(tag, str) else tag
-        return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.times_ns[i])
+        return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.time_ns(i))
+
+    def time_ns(self, index: int) -> int:
+        """The source's time of the tag at `index` (monotonic)."""
+        return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
+
+    @property
+    def times_ns(self) -> tuple[int, ...]:
+        """The sources' times of all tags."""
+        return self.shape.times.unpack(self.stamps)
 
     def all(self) -> dict[str, TagValue]:
         """Every tag by name."""
@@ -300,8 +310,9 @@ class RegionReader(_Region):
             (None,) * count,
             bytes([Quality.BAD]) * count,
             bytes([Reason.NEVER_READ]) * count,
-            (0,) * count,
+            bytes(shape.times.size),
         )
+        self._columns = b""
 
     def resume(self, tag: str, seq: int) -> None:
         """Message `seq` of `tag` is already dealt with (a reader that was restarted): the next one is `seq` + 1."""
@@ -334,14 +345,33 @@ class RegionReader(_Region):
         """The last snapshot; its messages were handed out before."""
         s = self._latest
         if s.messages:
-            s = Snapshot(s.shape, s.counter, s.t_ns, s.flags, s.values, s.qualities, s.reasons, s.times_ns)
+            s = Snapshot(s.shape, s.counter, s.t_ns, s.flags, s.values, s.qualities, s.reasons, s.stamps)
             self._latest = s
         return s
 
     def _decode(self, copy: bytes) -> Snapshot:
-        count = self.shape.count
-        fields = self.shape.body.unpack_from(copy, CHECK.size)
-        values: tuple[Scalar | None, ...] = fields[4 + count : 4 + 2 * count]
+        shape, latest = self.shape, self._latest
+        counter, t_ns, flags = shape.head.unpack_from(copy, CHECK.size)
+        columns_at = CHECK.size + shape.columns_at
+        columns = copy[columns_at : columns_at + shape.columns.size]
+        if columns != self._columns:
+            values, marks, reasons = self._decode_columns(columns)
+            self._columns = columns
+        else:  # as a rule: a scan comes by more often than values change
+            values, marks, reasons = latest.values, latest.qualities, latest.reasons
+        messages: dict[str, tuple[Message, ...]] = {}
+        for ring in shape.rings:
+            last = values[ring.index]
+            if isinstance(last, int) and last > self._seen[ring.spec.name]:
+                messages[ring.spec.name] = self._drain(ring, last)
+        stamps = copy[CHECK.size + shape.times_at : columns_at]
+        named = RegionFlag(flags) if flags else RegionFlag.NONE
+        return Snapshot(shape, counter, t_ns, named, values, marks, reasons, stamps, messages)
+
+    def _decode_columns(self, columns: bytes) -> tuple[tuple[Scalar | None, ...], bytes, bytes]:
+        """Values, qualities and reasons."""
+        fields = self.shape.columns.unpack(columns)
+        values: tuple[Scalar | None, ...] = fields[:-2]
         marks: bytes = fields[-2]
         if self.shape.bool_indexes:
             listed = list(values)
@@ -351,22 +381,7 @@ class RegionReader(_Region):
         if marks and max(marks) >= _NO_VALUE:
             values = tuple(None if mark & _NO_VALUE else v for v, mark in zip(values, marks, strict=True))
             marks = bytes(mark & ~_NO_VALUE for mark in marks)
-        messages: dict[str, tuple[Message, ...]] = {}
-        for ring in self.shape.rings:
-            last = int(fields[4 + count + ring.index])
-            if last > self._seen[ring.spec.name]:
-                messages[ring.spec.name] = self._drain(ring, last)
-        return Snapshot(
-            self.shape,
-            fields[0],
-            fields[1],
-            RegionFlag(fields[2]) if fields[2] else RegionFlag.NONE,
-            values,
-            marks,
-            fields[-1],
-            fields[4 : 4 + count],
-            messages,
-        )
+        return values, marks, fields[-1]
 
     def _drain(self, ring: RingShape, last: int) -> tuple[Message, ...]:
         """Messages from the first unseen one to `last`; the ones that are overwritten are counted."""

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.running import health_os as here
-from fieldtwin.running.health_judging import Check, Verdict, judged_clock, judged_processor, judged_watches
+from fieldtwin.running.health_judging import Check, Verdict, judged_can, judged_clock, judged_processor, judged_watches
 from gateway.core.errors import FieldtwinError
 from twin.data_files import data_root
 from twin.instance import runtime_root
@@ -112,10 +112,7 @@ def _can() -> Check:
         return Check(
             "kernel CAN", Verdict.NOTE, reason, "prototypes use the software CAN bus; a plant needs `modprobe can-raw`"
         )
-    names = [p.parent.name for p in Path("/sys/class/net").glob("*/type") if p.read_text().strip() == "280"]
-    return Check(
-        "kernel CAN", Verdict.OK, ", ".join(names) or "available, no interface (`ip link add vcan0 type vcan`)"
-    )
+    return judged_can(here.can_interfaces())
 
 
 def _realtime() -> Check:
@@ -152,7 +149,8 @@ def _clock() -> Check:
 
 def _disk() -> Check:
     root = runtime_root()
-    existing = next(p for p in (root, *root.parents) if p.exists())
+    # Not Path.exists: that raises where a folder above may not be looked into.
+    existing = next((p for p in (root, *root.parents) if os.path.exists(p)), Path("/"))
     free = shutil.disk_usage(existing).free
     found = f"{free // (1024 * 1024)} MiB free at {existing}"
     if free < MIN_FREE_BYTES:

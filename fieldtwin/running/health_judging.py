@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -47,6 +48,16 @@ def judged_clock(state: ClockState | None) -> Check:
         advice = "start chrony or systemd-timesyncd: time stamps of logs, and certificates, go by it"
         return Check("clock", Verdict.NOTE, "the kernel's clock is not synchronised", advice)
     return Check("clock", Verdict.OK, f"synchronised, at most {state.error_s * 1000:.0f} ms off")
+
+
+def judged_can(interfaces: Mapping[str, bool]) -> Check:
+    """`interfaces`: each of the kernel's, and whether it is up. The bit rate is set before that, by whoever may."""
+    found = ", ".join(name if up else f"{name} (down)" for name, up in interfaces.items())
+    down = [name for name, up in interfaces.items() if not up]
+    if down:
+        rate = "" if down[0].startswith("v") else " type can bitrate 125000 restart-ms 100"
+        return Check("kernel CAN", Verdict.NOTE, found, f"sudo ip link set {down[0]} up{rate}")
+    return Check("kernel CAN", Verdict.OK, found or "available, no interface (`ip link add vcan0 type vcan`)")
 
 
 def judged_watches(instances: int | None) -> Check:

@@ -14,6 +14,8 @@ from fieldtwin.running.health_judging import ClockState, quota_of
 
 _STA_UNSYNC = 0x0040  # linux/timex.h
 _TIME_ERROR = 5
+_ARPHRD_CAN = 280  # linux/if_arp.h
+_IFF_UP = 0x1  # linux/if.h
 
 
 def may_realtime() -> tuple[bool, str]:
@@ -45,6 +47,16 @@ def kernel_number(name: str) -> int | None:
     with suppress(OSError, ValueError):
         return int((Path("/proc/sys") / name).read_text())
     return None
+
+
+def can_interfaces() -> dict[str, bool]:
+    """The kernel's CAN interfaces, and whether each is up."""
+    found = {}
+    for kind in sorted(Path("/sys/class/net").glob("*/type")):
+        with suppress(OSError, ValueError):  # it may be gone by now
+            if int(kind.read_text()) == _ARPHRD_CAN:
+                found[kind.parent.name] = bool(int((kind.parent / "flags").read_text(), 16) & _IFF_UP)
+    return found
 
 
 def cpu_count() -> int:

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from fieldtwin.running.health import examine
+from fieldtwin.running.health import _disk, _run_directory, examine
 from fieldtwin.running.health_judging import (
     ClockState,
     Verdict,
+    judged_can,
     judged_clock,
     judged_processor,
     judged_watches,
@@ -88,3 +89,27 @@ def test_a_run_directory_that_cannot_be_written_is_bad(tmp_path: Path, monkeypat
     found = {c.name: c for c in examine()}["run directory"]
     assert found.verdict is Verdict.BAD
     assert os.fspath(tmp_path) in found.found
+
+
+def test_a_folder_that_may_not_be_looked_into_is_no_bug(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody else's, as FIELDTWIN_RUN=/root/x is to a service: every question to the file system may be refused."""
+
+    def refused(*args: object, **more: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    with monkeypatch.context() as patched:
+        patched.setenv("FIELDTWIN_RUN", "/somebody/else")
+        for name in ("mkdir", "exists", "stat"):
+            patched.setattr(Path, name, refused)
+        checks = _run_directory(), _disk()
+    assert checks[0].verdict is Verdict.BAD
+    assert checks[1].found.endswith("at /")
+
+
+def test_a_can_interface_that_is_down_is_said() -> None:
+    assert judged_can({}).verdict is Verdict.OK
+    assert judged_can({"can0": True, "vcan0": True}).found == "can0, vcan0"
+    down = judged_can({"can0": True, "can1": False})
+    assert (down.verdict, down.found) == (Verdict.NOTE, "can0, can1 (down)")
+    assert down.advice == "sudo ip link set can1 up type can bitrate 125000 restart-ms 100"
+    assert judged_can({"vcan0": False}).advice == "sudo ip link set vcan0 up"

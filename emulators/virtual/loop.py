@@ -12,6 +12,7 @@ import sys
 from asyncio import events
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine, Generator
+from contextlib import suppress
 from contextvars import Context, copy_context
 from heapq import heapify, heappop, heappush
 from pathlib import Path
@@ -28,6 +29,8 @@ START_NS = 1_000 * NS_PER_S
 """Where monotonic time begins: not at 0, which reads as "never" in many places."""
 STUCK_AFTER = 1_000_000
 """Callbacks at one instant before the loop says that time stands still."""
+ENDING_INSTANTS = 10_000
+"""What a task may take to end once its loop is closed."""
 _WAITING_SHOWN = 20
 _COMPACT_ABOVE = 1_000
 """Timers in the heap before those that were cancelled are looked for."""
@@ -274,12 +277,35 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return self._closed
 
     def close(self) -> None:
-        """Drop what was scheduled."""
+        """End the tasks that an error or Ctrl-C left, and drop what was scheduled."""
         if self._running:
             raise Bug("a running loop cannot be closed")
+        self._end_tasks()
         self._closed = True
         self._ready.clear()
         self._timers.clear()
+
+    def _end_tasks(self) -> None:
+        """As `asyncio.run` does. What is said meanwhile, and a task that will not end, are nobody's business any more."""
+        tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
+        if not tasks or events._get_running_loop() is not None:
+            return
+        for task in tasks:
+            task.cancel()
+        self._running = True
+        events._set_running_loop(self)
+        try:
+            for _ in range(ENDING_INSTANTS):
+                if all(task.done() for task in tasks):
+                    break
+                self._stopping = False
+                with suppress(KeyboardInterrupt, SystemExit):  # what ended the run ends each task that it passes
+                    self._run_instant()
+        except Deadlock:
+            pass
+        finally:
+            self._stopping = self._running = False
+            events._set_running_loop(None)
 
     async def shutdown_asyncgens(self) -> None:
         """None are tracked."""

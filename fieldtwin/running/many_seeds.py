@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.running.shrink import smallest
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.running.workers import Workers
 
 MAX_SEEDS = 100_000
 _ERRORS_SHOWN = 5
@@ -86,7 +86,7 @@ def run_seeds(
                 on_result(results[-1])
         return results
     found: dict[int, SeedResult] = {}
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    with Workers(jobs) as pool:
         for result in _as_they_end(pool, options, seeds, 2 * jobs):
             found[result.seed] = result
             if on_result is not None:
@@ -94,9 +94,7 @@ def run_seeds(
     return [found[seed] for seed in seeds]
 
 
-def _as_they_end(
-    pool: ProcessPoolExecutor, options: VirtualOptions, seeds: Sequence[int], at_once: int
-) -> Iterator[SeedResult]:
+def _as_they_end(pool: Workers, options: VirtualOptions, seeds: Sequence[int], at_once: int) -> Iterator[SeedResult]:
     waiting: set[Future[SeedResult]] = set()
     for seed in seeds:
         waiting.add(pool.submit(run_seed, replace(options, seed=seed)))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 
+from fieldtwin.running.workers import Workers
 from fieldtwin.whatif.fork import Fork, Progress, answer
 from fieldtwin.whatif.outcome import Outcome
 from fieldtwin.whatif.plan import Plan
@@ -19,7 +19,7 @@ def answers(fork: Fork, plans: Sequence[Plan], jobs: int, progress: Progress = l
             found.append(answer(fork, plan))
             progress(found[-1])
         return found
-    with ProcessPoolExecutor(min(jobs, len(plans)), multiprocessing.get_context("spawn")) as pool:
+    with Workers(min(jobs, len(plans))) as pool:
         waiting: dict[Future[Outcome], int] = {pool.submit(answer, fork, plan): n for n, plan in enumerate(plans)}
         outcomes: dict[int, Outcome] = {}
         for done in as_completed(waiting):

@@ -245,3 +245,49 @@ def test_it_is_closed_once_and_runs_alone() -> None:
     assert not loop.is_running()
     loop.close()
     assert loop.is_closed()
+
+
+def test_an_interrupt_lets_every_task_end_before_the_loop_is_closed() -> None:
+    """Else Python ends their coroutines when it collects them, without a loop, and prints a traceback for each."""
+    loop = VirtualLoop()
+    ended: list[str] = []
+
+    async def works(name: str) -> None:
+        try:
+            await asyncio.sleep(3600)
+        finally:
+            asyncio.current_task()
+            await asyncio.sleep(1)  # to tidy up takes time, and virtual time passes
+            ended.append(name)
+
+    async def main() -> None:
+        async with asyncio.TaskGroup() as group:
+            for name in "ab":
+                group.create_task(works(name))
+            await asyncio.sleep(1)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        loop.run_until_complete(main())
+    loop.close()
+    assert sorted(ended) == ["a", "b"]
+
+
+def test_a_task_that_will_not_end_keeps_no_loop_open() -> None:
+    loop = VirtualLoop()
+
+    async def stubborn() -> None:
+        while True:
+            try:
+                await asyncio.sleep(1)
+            except asyncio.CancelledError:
+                continue
+
+    async def main() -> None:
+        task = loop.create_task(stubborn())
+        await asyncio.sleep(2)
+        assert not task.done()
+
+    loop.run_until_complete(main())
+    loop.close()
+    assert loop.is_closed()

@@ -1,0 +1,79 @@
+"""Ctrl-C, as a terminal sends it: to the whole process group. One line at most, nobody goes on, no traceback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support import eventually, run
+
+ROOT = Path(__file__).parents[2]
+PROBE = """
+import sys
+from fieldtwin.running.workers import Workers
+from slow import work
+
+if __name__ == "__main__":
+    with Workers(2) as pool:
+        waiting = [pool.submit(work, 600) for _ in range(3)]
+        print("begun", flush=True)
+        for future in waiting:
+            future.result()
+"""
+
+
+def _started(command: list[str], cwd: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        command,
+        cwd=cwd,
+        env={**os.environ, "PYTHONPATH": f"{ROOT}"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def _interrupted(process: subprocess.Popen[str]) -> str:
+    """What it says from then on; over when the last process that holds its output is."""
+    os.killpg(process.pid, signal.SIGINT)
+    said, _ = process.communicate(timeout=30)
+    return said
+
+
+def test_a_virtual_run_ends_without_a_traceback(tmp_path: Path) -> None:
+    trace = tmp_path / "run.jsonl"
+    options = ["--prototype", "--virtual", "--for", "24h", "--trace", str(trace)]
+    process = _started([sys.executable, "-m", "fieldtwin", "run", "observatory", *options], tmp_path)
+
+    async def until_it_runs() -> None:
+        await eventually(lambda: trace.exists() and trace.stat().st_size > 100_000, within_s=30)
+
+    run(until_it_runs(), timeout_s=40)
+    said = _interrupted(process)
+    assert process.returncode == 130
+    assert "Traceback" not in said
+    assert "Exception ignored" not in said
+
+
+@pytest.mark.parametrize("when", ["while they import", "while they work"])
+def test_workers_end_with_who_started_them(tmp_path: Path, when: str) -> None:
+    if when == "while they work":
+        text = "import time\ndef work(s):\n    print('here', flush=True)\n    time.sleep(s)\n"
+    else:  # we do, then the first of them
+        text = "import sys, time\nprint('here', flush=True)\ntime.sleep(0.3)\nwork = time.sleep\n"
+    (tmp_path / "slow.py").write_text(text)
+    (tmp_path / "probe.py").write_text(PROBE)
+    process = _started([sys.executable, "probe.py"], tmp_path)
+    assert process.stdout is not None
+    while not (line := process.stdout.readline()).startswith("begun"):
+        assert line
+    assert process.stdout.readline() == "here\n"
+    said = _interrupted(process)
+    assert process.returncode == -signal.SIGINT
+    assert said.count("Traceback") == 1, said  # of the probe itself, which does not catch it

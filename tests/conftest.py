@@ -47,19 +47,20 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-WHOLE_SYSTEMS = ("system", "spec", "interop")
-"""Folders whose tests start many processes: two such tests at once would only wait for each other."""
+GROUPS = {"system": "systems", "spec": "systems", "docs": "systems", "interop": "strangers"}
+"""Folders whose tests start many processes, and the line that they stand in: more at once would only wait for each other."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With several processes (pytest-xdist): whole systems in one of them, one after the other; all else file by file."""
+    """With several processes (pytest-xdist): whole systems in one of them, one after the other, programs of strangers in another;
+    all else file by file."""
     if not config.pluginmanager.hasplugin("xdist"):
         return
     here = Path(__file__).parent
     for item in items:
         folder = item.path.relative_to(here.parent).parts[1]  # of tests/, or of examples/
-        item.add_marker(pytest.mark.xdist_group("systems" if folder in WHOLE_SYSTEMS else item.path.name))
+        item.add_marker(pytest.mark.xdist_group(GROUPS.get(folder, item.path.name)))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -58,8 +58,14 @@ def test_the_driver_cannot_tell_an_emulator_from_the_device(
     [
         ({"ctd": "exception"}, "refusal: expected exception 02h, got exception 03h", set()),
         # the driver takes no such reply, so the device is lost to it and all that depends on it comes to a halt
-        ({"modem": "byte"}, "length: expected 17 bytes, got 18 bytes", {"ctd", "inclinometer"}),
-        ({"ctd": "swapped"}, "bytes: expected 01 04 14", {"modem"}),  # which relays what the ctd says
+        pytest.param(
+            {"modem": "byte"},
+            "length: expected 17 bytes, got 18 bytes",
+            {"ctd", "inclinometer"},
+            marks=pytest.mark.long,
+        ),
+        # the modem relays what the ctd says
+        pytest.param({"ctd": "swapped"}, "bytes: expected 01 04 14", {"modem"}, marks=pytest.mark.long),
         ({"inclinometer": "abort"}, "refusal: expected abort 06020000h, got abort 05040000h", set()),
     ],
     ids=["another exception code", "one byte more", "swapped words", "another abort code"],

@@ -113,6 +113,7 @@ def test_a_master_on_a_line_reaches_tcp_units_of_a_prototype(tmp_path: Path) -> 
     no_tracebacks(tmp_path / "run")
 
 
+@pytest.mark.long
 @pytest.mark.interop
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
 def test_a_master_on_a_line_reaches_tcp_units_of_a_plant(tmp_path: Path) -> None:

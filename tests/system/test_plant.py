@@ -140,6 +140,7 @@ def test_a_plant_is_only_read_until_it_may_be_written(plant: Plant) -> None:
     assert run.summary["outputs_safe"] is True
 
 
+@pytest.mark.long
 def test_another_device_than_expected_is_never_written(plant: Plant) -> None:
     plant.system.write_text(plant.system.read_text(encoding="utf-8").replace('"0042"', '"0815"'), encoding="utf-8")
     command_from_far(plant.field("get")["far"]["modem"], 1, 1)

@@ -67,7 +67,7 @@ def test_what_cannot_start_is_said_before_anything_runs(tmp_path: Path, words: l
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_a_signal_ends_the_program_first_and_then_the_field(tmp_path: Path, number: int) -> None:
     script = "trap 'echo told; exit 5' INT TERM; echo up; while :; do sleep 0.05; done"
     with fieldtwin(tmp_path, "with", "--instance", "w", "observatory", "--", "sh", "-c", script) as started:

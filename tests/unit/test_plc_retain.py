@@ -17,7 +17,7 @@ from plc.binding import BoundProgram
 from plc.program import Program, ScanInfo, var_local, var_retain
 from plc.retain import Retained, RetainFile, RetainFull
 
-KILLS = 200
+KILLS = 60
 
 
 class Counter(Program):
@@ -114,10 +114,11 @@ def test_what_grows_beyond_its_file_is_an_error_and_the_last_whole_save_stays(tm
     again.close()
 
 
-def test_nothing_is_lost_or_torn_by_a_kill_at_any_instant(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kills", [KILLS, pytest.param(20 * KILLS, marks=[pytest.mark.long, pytest.mark.timeout(600)])])
+def test_nothing_is_lost_or_torn_by_a_kill_at_any_instant(tmp_path: Path, kills: int) -> None:
     """Each round: a process scans, saves and tells how far it got; it is killed; the next one finds that or one more."""
     path, rng, reached = tmp_path / "retain", random.Random(1), 0
-    for _ in range(KILLS):
+    for _ in range(kills):
         read, write = os.pipe()
         child = os.fork()
         if child == 0:
@@ -133,7 +134,7 @@ def test_nothing_is_lost_or_torn_by_a_kill_at_any_instant(tmp_path: Path) -> Non
         while rest := os.read(read, 8):
             reached = struct.unpack("<q", rest)[0]
         os.close(read)
-    assert reached > KILLS
+    assert reached > kills
 
 
 def _told(read: int) -> int:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -27,23 +29,42 @@ from gateway.core.errors import UsageError
 def command(system: str, prototype: bool, output: Path | None, profiles: tuple[str, ...], as_json: bool) -> int:
     """Draw the wires of SYSTEM, and who hangs on each: as text, or with -o as SVG, which is light or dark as its reader is.
 
+    Of a network, such as `ocean_network`: where its systems are, and who hears whom.
+
     Reads the files only: nothing is opened, and no control logic is run.
     """
     from fieldtwin.drawing.svg import svg
     from fieldtwin.drawing.tree import tree
     from fieldtwin.drawing.wiring import wiring
     from fieldtwin.running.template_here import system_file
+    from twin.data_files import network_file
     from twin.prototype_file import load_prototype
     from twin.system import load_system
 
     if as_json and output is not None:
         raise UsageError("--json and -o at once", expected="one of them")
-    loaded = load_system(system_file(system, lambda _: True, plant=False), [Path(folder) for folder in profiles])
+    folders = [Path(folder) for folder in profiles]
+    if (network := network_file(system, folders)) is not None:
+        return _put(*_network(network, folders), output, as_json)
+    loaded = load_system(system_file(system, lambda _: True, plant=False), folders)
     wires = wiring(loaded, load_prototype(loaded) if prototype else None)
+    return _put(wires.as_data(), tree(wires, *_room()), lambda: svg(wires), output, as_json)
+
+
+def _network(path: Path, profiles: list[Path]) -> tuple[Any, str, Callable[[], str]]:
+    from fieldtwin.drawing.water import network_map, svg, text
+    from twin.network import load_network
+
+    drawn = network_map(load_network(path, profiles))
+    return drawn.as_data(), text(drawn), lambda: svg(drawn)
+
+
+def _put(facts: Any, text: str, svg: Callable[[], str], output: Path | None, as_json: bool) -> int:
+    """Where it is wanted: a file, or stdout. Raises `UsageError` for a file that cannot be written."""
     if as_json:
-        text = json.dumps(wires.as_data(), indent=2) + "\n"
-    else:
-        text = tree(wires, *_room()) if output is None else svg(wires)
+        text = json.dumps(facts, indent=2) + "\n"
+    elif output is not None:
+        text = svg()
     if output is None or str(output) == "-":
         sys.stdout.write(text)
         return 0

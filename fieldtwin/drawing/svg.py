@@ -19,7 +19,7 @@ LONGEST = 44
 WIRE, LOGIC = 90, 34
 """Characters of a text, at most, in a device's box, beside a wire, in the controller; all of it is shown to who points at it."""
 
-_STYLE = """
+STYLE = Markup("""
 svg.wires { font: 12px ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace;
   --ground: #fff; --ink: #17233a; --soft: #55627a; --box: #f3f6fb; --edge: #9fb0cb; --logic: #fff8e8; --logic-edge: #d1b06b;
   --line: #2b5597; --emulated: #a8500f }
@@ -30,7 +30,8 @@ svg.wires { font: 12px ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sa
 .box { fill: var(--box); stroke: var(--edge) } .logic { fill: var(--logic); stroke: var(--logic-edge) }
 .line { fill: none; stroke: var(--line); stroke-width: 2.5 } .port { fill: var(--line) }
 .emulated { stroke: var(--emulated); stroke-dasharray: 6 4 } .says { fill: var(--emulated) }
-"""
+.halo { stroke: var(--ground); stroke-width: 5; paint-order: stroke }
+""")
 
 
 def svg(wires: Wiring) -> str:
@@ -53,7 +54,7 @@ def svg(wires: Wiring) -> str:
         el(
             "svg",
             el("title", title),
-            el("style", Markup(_STYLE)),
+            el("style", STYLE),
             el("rect", cls="ground", width="100%", height="100%"),
             _text(EDGE, EDGE + 8.0, title, "name"),
             _text(right - CHAR * len(legend), EDGE + 8.0, legend, "says"),

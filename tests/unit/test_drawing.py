@@ -11,9 +11,12 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
+from fieldtwin.drawing import water
 from fieldtwin.drawing.svg import ROOM, svg
 from fieldtwin.drawing.tree import tree
 from fieldtwin.drawing.wiring import Wiring, wiring
+from twin.data_files import network_file
+from twin.network import load_network
 from twin.prototype_file import load_prototype
 from twin.system import load_system
 
@@ -131,12 +134,45 @@ PICTURES = sorted((ROOT / "docs" / "wires").glob("*.svg"))
 @pytest.mark.parametrize("picture", PICTURES, ids=lambda path: path.stem)
 def test_a_picture_of_the_book_is_of_today_and_on_its_page(picture: Path):
     command = f"fieldtwin draw {picture.stem} --prototype -o docs/wires/{picture.name}"
-    assert picture.read_text("utf-8") == svg(of(picture.stem)), command
-    assert f"(wires/{picture.name})" in (ROOT / "docs" / "systems.md").read_text("utf-8")
+    network = network_file(picture.stem)
+    today = water.svg(water.network_map(load_network(network))) if network else svg(of(picture.stem))
+    assert picture.read_text("utf-8") == today, command
+    assert any(f"(wires/{picture.name})" in page.read_text("utf-8") for page in (ROOT / "docs").glob("*.md"))
 
 
 def test_the_book_has_the_wires_of_each_kind_of_system():
     assert {picture.stem for picture in PICTURES} >= {"observatory", "lab_vehicle", "silage_tractor"}
+
+
+def network(folder: Path, range_m: float, *ats: str) -> water.Map:
+    systems = ("west", "middle", "east")
+    members = "".join(
+        f"  {name}: {{system: ocean_{name}.yaml, modem: modem, at_m: {at}}}\n"
+        for name, at in zip(systems, ats, strict=False)
+    )
+    path = folder / "sea.yaml"
+    path.write_text(
+        f"fieldtwin: 1\nnetwork: sea\nwater: {{range_m: {range_m}, sound_m_per_s: 1500}}\nsystems:\n{members}"
+    )
+    return water.network_map(load_network(path))
+
+
+def test_a_network_is_a_map_of_who_hears_whom(tmp_path: Path):
+    sea = network(tmp_path, 3000, "[0, 0, -300]", "[3000, 0, -300]", "[3000, 4000, -300]")
+    assert [(way.one, way.other, way.said) for way in sea.ways] == [("west", "middle", "3.0 km, 2.0 s")]
+    told = water.text(sea).splitlines()
+    assert told[-1].endswith("hears nobody")
+    assert told[-2].endswith("hears west (3.0 km, 2.0 s)")
+    root = ElementTree.fromstring(water.svg(sea))
+    dots = [(float(n.attrib["cx"]), float(n.attrib["cy"])) for n in root.iter() if n.tag.endswith("}circle")]
+    assert dots[0][1] == dots[1][1] > dots[2][1]  # north is up
+    assert dots[1][0] - dots[0][0] == pytest.approx((dots[1][1] - dots[2][1]) * 3 / 4, abs=0.3)  # one scale
+
+
+def test_places_that_are_one_are_drawn_all_the_same(tmp_path: Path):
+    sea = network(tmp_path, 100, "[5, 5]", "[5, 5]")
+    assert sea.ways[0].distance_m == 0
+    ElementTree.fromstring(water.svg(sea))
 
 
 def test_the_command_prints_text_data_or_a_picture(tmp_path: Path):
@@ -148,5 +184,6 @@ def test_the_command_prints_text_data_or_a_picture(tmp_path: Path):
     assert said("observatory").startswith("observatory (plant)\n")
     assert json.loads(said("observatory", "--prototype", "--json"))["wires"][0]["stand_in"] == "pty:line1"
     assert said("observatory", "-o", "-").startswith("<svg")
+    assert said("ocean_network").startswith("ocean (network of prototypes)\n")
     assert said("observatory", "--prototype", "-o", str(tmp_path / "o.svg")) == ""
     assert (tmp_path / "o.svg").read_text("utf-8") == svg(of("observatory"))

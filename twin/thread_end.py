@@ -17,7 +17,7 @@ from gateway.core.nursery import Nursery
 from gateway.store.event import Event, KnowledgeStore, without
 from twin.thread_core import Effect, Incoming, Keep, NoteLost, Open, Outgoing
 from twin.thread_frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
-from twin.thread_link import Carrier, Link
+from twin.thread_link import Carrier, Link, Unwelcome
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
 READ_BLOCK = 1000
@@ -31,7 +31,7 @@ class ThreadEnd:
     """``ThreadEnd(store, carrier, schema, clock, origin=...)``; `run` until cancelled.
 
     `origin` is the log that this side sends (`KnowledgeStore.own`), empty for a side that only receives. Call `appended` when the
-    log grew.
+    log grew. Without `insists`, `run` ends when the other side does not want us and there never was a link.
     """
 
     def __init__(
@@ -44,6 +44,7 @@ class ThreadEnd:
         origin: str = "",
         prototype: bool = False,
         on_events: OnEvents | None = None,
+        insists: bool = True,
     ) -> None:
         self.out: Outgoing | None = None
         self.into = Incoming(self._knows, 0)
@@ -58,6 +59,9 @@ class ThreadEnd:
         self._origin = origin
         self._prototype = prototype
         self._on_events = on_events
+        self._insists = insists
+        self.silent = "there was no link"
+        """What it means that nothing ever came; empty when something did."""
         self._link: Link | None = None
         self._news = asyncio.Event()
         self._told: dict[str, int] = {}
@@ -89,7 +93,7 @@ class ThreadEnd:
         return await self._store.forget(self._origin, first + (self.out.through - first) // 2)
 
     async def run(self) -> None:
-        """Keep the thread up. Raises `FieldtwinError` only when the store cannot be read at the start."""
+        """Keep the thread up. Raises `FieldtwinError` only when the store cannot be read at the start, and `Unwelcome`."""
         if self._origin:
             first, last = await self._store.span(self._origin)
             self.out = Outgoing(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)
@@ -101,6 +105,8 @@ class ThreadEnd:
                 await self._converse(self._link)
             except Unreachable as e:
                 self.trouble = str(e)
+                if isinstance(e, Unwelcome) and not self._insists and not self.links:
+                    raise
             finally:
                 self.connected = False
                 if self._link is not None:
@@ -114,6 +120,7 @@ class ThreadEnd:
         self.connected = True
         self.links += 1
         self.trouble = ""
+        self.silent = self.silent and link.quiet
         self.into.ack_delay_ns = link.ack_delay_ns
         if self.out is not None:
             self.out.linger_ns = link.linger_ns
@@ -158,6 +165,7 @@ class ThreadEnd:
     async def _listen(self, link: Link) -> None:
         while True:
             frame = await link.receive()
+            self.silent = ""
             try:
                 await self._take(frame)
             except Unreachable as e:  # the store: what was not kept is not acknowledged, and comes again
@@ -238,5 +246,6 @@ class ThreadEnd:
             "waiting": self.waiting,
             "resent": self.out.resent if self.out is not None else 0,
             "duplicates": self.into.duplicates,
+            "silent": self.silent,
             "trouble": self.trouble or (self._link.trouble if self._link is not None else ""),
         }

@@ -8,9 +8,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from gateway.core.errors import Desync
+from gateway.core.errors import Desync, Unreachable
 from gateway.store.event import Event
 from twin.thread_frames import Frame, FrameCodec, Schema
+
+
+class Unwelcome(Unreachable):
+    """The other side is there and does not want us: our password or certificate, or what we may do. To wait is no help."""
 
 
 class Link(ABC):
@@ -18,6 +22,8 @@ class Link(ABC):
 
     trouble = ""
     """Why nothing gets through now although the link is not lost; empty when all is well."""
+    quiet = "nothing came"
+    """What it means when nothing ever comes over it, for whoever waits."""
     ack_delay_ns = 0
     """How long an ACK may wait for others: one that takes a second on the way serves for many frames."""
 

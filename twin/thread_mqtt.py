@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import ssl
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import suppress
@@ -15,7 +16,7 @@ from gateway.core.errors import ConnectionLost, Desync, Unreachable
 from gateway.store.event import Event
 from twin.sparkplug import MAX_PAYLOAD
 from twin.thread_frames import Frame
-from twin.thread_link import Carrier, Link
+from twin.thread_link import Carrier, Link, Unwelcome
 from twin.thread_sparkplug import EdgeNode, HostApplication, Message
 
 KEEPALIVE_S = 15
@@ -24,6 +25,53 @@ QUEUED = 1000
 """Messages that may wait to be read; what is too much is dropped by the client, and comes again."""
 ACK_DELAY_NS = 100 * NS_PER_MS
 GOODBYE_S = 1.0
+
+
+FAILURE = 0x80
+"""Codes of a SUBACK from here on are refusals (MQTT 3.9.3)."""
+ACCESS = "the user needs to read and write the topics of group and node, and STATE (docs/thread.md)"
+
+
+class _Socket(ssl.SSLSocket):
+    """One that is closed when the other side is not whom we trust: paho leaves it to the collector."""
+
+    def do_handshake(self, block: bool = False) -> None:
+        try:
+            super().do_handshake(block)
+        except OSError:
+            self.close()
+            raise
+
+
+class _Heard(logging.Handler):
+    """The last thing that paho had to say: why a connection broke is nowhere else."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.last = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.last = record.getMessage().rpartition("] ")[2].partition(" (_ssl")[0]
+
+
+def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
+    """Why there is no session: who is not there may be later, who refuses will go on doing so."""
+    cause = e.__context__  # aiomqtt keeps the text of what paho raised
+    if isinstance(cause, ssl.SSLCertVerificationError):
+        hint = "ca= names who is trusted; the certificate is for the host in the URL"
+        return Unwelcome(f"the broker's certificate is refused: {cause.verify_message}", where=where, hint=hint)
+    if isinstance(cause, ssl.SSLError):
+        reason = (cause.reason or str(cause)).replace("_", " ").lower()
+        return Unwelcome(
+            f"no TLS with the broker: {reason}", where=where, hint="cert= and key= are ours, if it asks for them"
+        )
+    if isinstance(e, aiomqtt.MqttCodeError) and e.rc:
+        hint = "the user is in the URL, the password in FIELDTWIN_MQTT_PASSWORD or FIELDTWIN_MQTT_PASSWORD_FILE"
+        return Unwelcome(f"the broker refuses: {str(e).partition('] ')[2] or e}", where=where, hint=hint)
+    if heard:
+        hint = "does it want mqtts://, or a certificate of ours (cert= and key=)?"
+        return Unreachable(f"the broker ends the connection: {heard}", where=where, hint=hint)
+    return Unreachable(f"the broker is not there: {e}", where=where)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +85,7 @@ class Broker:
     tls: ssl.SSLContext | None = None
 
     def __str__(self) -> str:
-        return f"mqtt://{self.host}:{self.port}"
+        return f"{'mqtts' if self.tls else 'mqtt'}://{self.host}:{self.port}"
 
 
 Side = EdgeNode | HostApplication
@@ -54,13 +102,18 @@ class MqttLink(Link):
         self._client = client
         self._clock = clock
         self._where = where
+        self.quiet = (
+            f"nothing came through {where}: nobody there, or our user may not read or write {side.subscriptions[0]}"
+        )
         self._messages: AsyncIterator[aiomqtt.Message] = aiter(client.messages)
 
     async def begin(self) -> None:
         """Subscribe, and say that we are here."""
         try:
             for topic in self.side.subscriptions:
-                await self._client.subscribe(topic, qos=1)
+                granted = await self._client.subscribe(topic, qos=1)
+                if any(getattr(code, "value", code) >= FAILURE for code in granted):
+                    raise Unwelcome(f"the broker does not let us hear {topic}", where=self._where, hint=ACCESS)
         except aiomqtt.MqttError as e:
             raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
         for message in self.side.hello():
@@ -118,12 +171,17 @@ class MqttCarrier(Carrier):
         self._make_side = make_side
         self._clock = clock
         self._sessions = 0
+        if broker.tls is not None:
+            broker.tls.sslsocket_class = _Socket
 
     async def open(self) -> MqttLink:
         b = self._broker
         side = self._make_side(self._sessions)
         self._sessions += 1
         will = side.will()
+        heard = _Heard()
+        logger = logging.Logger("mqtt", logging.WARNING)  # of this session; nothing of it goes to the screen
+        logger.addHandler(heard)
         client = aiomqtt.Client(
             b.host,
             b.port,
@@ -133,12 +191,13 @@ class MqttCarrier(Carrier):
             timeout=TIMEOUT_S,
             keepalive=KEEPALIVE_S,
             max_queued_incoming_messages=QUEUED,
+            logger=logger,
             will=aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
         )
         try:
             await client.__aenter__()
         except aiomqtt.MqttError as e:
-            raise Unreachable(f"the broker refuses or is not there: {e}", where=str(b)) from e
+            raise _refusal(e, heard.last, str(b)) from e
         link = MqttLink(client, side, self._clock, str(b))
         try:
             await link.begin()

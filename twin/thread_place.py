@@ -1,17 +1,12 @@
 """Where a thread goes, as a URL: ``tcp://127.0.0.1:PORT`` on one computer, ``tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE`` between
-two (the plant listens, its twin comes, both show a certificate), a broker with Sparkplug B,
-``mqtt://[USER@]HOST[:PORT]/GROUP/NODE[?host=NAME]``, or the modems of the system: ``modem:`` or ``modem:DEVICE`` on the plant,
-which lends its mailboxes to the thread, and ``modem:[DEVICE@]tcp://HOST:PORT``, the far modem, at its twin. A password stands in
-FIELDTWIN_MQTT_PASSWORD, or in the file that FIELDTWIN_MQTT_PASSWORD_FILE names, never in a URL.
+two (the plant listens, its twin comes, both show a certificate), a broker with Sparkplug B (`twin.thread_broker`), or the modems
+of the system: ``modem:`` or ``modem:DEVICE`` on the plant, which lends its mailboxes to the thread, and
+``modem:[DEVICE@]tcp://HOST:PORT``, the far modem, at its twin.
 """
 
 from __future__ import annotations
 
-import os
 from ipaddress import ip_address
-from pathlib import Path
-from typing import Any
-from urllib.parse import parse_qsl, urlsplit
 
 from gateway.connections.listeners import TcpListener
 from gateway.connections.os_connector import OsConnector
@@ -23,15 +18,13 @@ from gateway.core.url_secrets import without_password
 from gateway.devices.config import BusConfig, DeviceConfig
 from twin.system import System
 from twin.thread import schema_of
+from twin.thread_broker import broker_carrier, is_broker
 from twin.thread_link import Carrier
 from twin.thread_tcp import TcpDialler, TcpListening
 
-EXPECTED = "tcp://127.0.0.1:PORT, tls://HOST:PORT?..., mqtt://HOST/GROUP/NODE, or modem:"
+EXPECTED = "tcp://127.0.0.1:PORT, tls://HOST:PORT?..., mqtt://HOST/GROUP/NODE, mqtts://..., or modem:"
 MODEM = "modem:"
 MODEM_POLL_MS = 200
-DEFAULT_HOST = "fieldtwin"
-MQTT_PORT = 1883
-PASSWORD = "FIELDTWIN_MQTT_PASSWORD"
 
 
 def lent_transmitter(place: str, system: System) -> str:
@@ -59,8 +52,8 @@ async def plant_carrier(
     if device := lent_transmitter(place, system):
         bus = system.buses[system.devices[device].bus]
         return _modem(system, device, bus.endpoint, connector or OsConnector(), clock), place
-    if place.startswith("mqtt:"):
-        return _mqtt(place, clock, system), place
+    if is_broker(place):
+        return broker_carrier(place, clock, system), place
     endpoint = _stream(place)
     if endpoint.scheme == "tcp" and not _is_loopback(endpoint.host):
         raise UsageError(
@@ -80,8 +73,8 @@ def twin_carrier(place: str, system: System, clock: Clock) -> Carrier:
                 "where is the far modem?", expected="modem:[DEVICE@]tcp://HOST:PORT", got=without_password(place)
             )
         return _modem(system, _transmitter(name, system), Endpoint.parse(far), OsConnector(), clock)
-    if place.startswith("mqtt:"):
-        return _mqtt(place, clock, None)
+    if is_broker(place):
+        return broker_carrier(place, clock, None)
     return TcpDialler(_stream(place), OsConnector(), [schema_of(system)])
 
 
@@ -113,50 +106,3 @@ def _modem(system: System, device: str, endpoint: Endpoint, connector: Connector
         clock,
         [schema_of(system)],
     )
-
-
-def _mqtt(place: str, clock: Clock, plant: System | None) -> Carrier:
-    """An edge node of `plant`, or the host application where there is none."""
-    try:
-        from twin.thread_mqtt import Broker, MqttCarrier  # an extra
-    except ModuleNotFoundError as e:
-        raise UsageError("MQTT needs an extra", hint="pip install 'fieldtwin[mqtt]'") from e
-    from twin.thread_sparkplug import EdgeNode, HostApplication, types_of
-
-    url, names = _split(place)
-    group, node = names
-    host = dict(parse_qsl(url.query)).get("host", DEFAULT_HOST)
-    broker = Broker(url.hostname or "", url.port or MQTT_PORT, url.username, _password())
-    if plant is None:
-        HostApplication(group, node, host)  # names that are none are said at once
-        return MqttCarrier(broker, lambda number: HostApplication(group, node, host), clock)
-    schema, types = schema_of(plant), types_of(plant)
-    EdgeNode(group, node, host, schema, types, 0)
-    return MqttCarrier(broker, lambda number: EdgeNode(group, node, host, schema, types, number), clock)
-
-
-def _password() -> str | None:
-    """The broker's, from the environment, or from the file that it names."""
-    path = os.environ.get(f"{PASSWORD}_FILE")
-    if not path:
-        return os.environ.get(PASSWORD)
-    try:
-        return Path(path).read_text(encoding="utf-8").splitlines()[0].strip()
-    except (OSError, UnicodeDecodeError, IndexError) as e:
-        why = getattr(e, "strerror", None) or "no text in it"
-        raise UsageError(f"the broker's password: {why}", got=f"{PASSWORD}_FILE={path}") from e
-
-
-def _split(place: str) -> tuple[Any, list[str]]:
-    try:
-        url = urlsplit(place)
-        names = url.path.strip("/").split("/")
-        port_is_fine = url.port is None or url.port > 0
-    except ValueError as e:
-        raise UsageError("no broker", expected=EXPECTED, got=without_password(place)) from e
-    if url.password is not None:
-        hint = f"{PASSWORD} in the environment, or {PASSWORD}_FILE"
-        raise UsageError("a password in a URL can be read by everybody", got=without_password(place), hint=hint)
-    if not url.hostname or len(names) != 2 or not all(names) or not port_is_fine:
-        raise UsageError("no broker, group and node", expected="mqtt://[USER@]HOST[:PORT]/GROUP/NODE", got=place)
-    return url, names

@@ -123,9 +123,12 @@ def ports(session: RunSession) -> list[str]:
     ]
 
 
+THREAD_TROUBLES = (("thread", "trouble"), ("store of the thread", "store_trouble"))
+
+
 def troubles(session: RunSession) -> list[str]:
     """What is wrong now, each with its reason: errors of the run, buses that cannot be opened, devices that do not answer, and
-    what stopped the PLC."""
+    what stopped the PLC, the digital thread's carrier and store."""
     gateway = session.gateway_status or {}
     found = list(session.errors)
     closed = {name: bus["error"] for name, bus in gateway.get("buses", {}).items() if bus["error"]}
@@ -137,6 +140,8 @@ def troubles(session: RunSession) -> list[str]:
             found.append(f"{name}: {device['error']}")
     if error := (session.plc_status or {}).get("error"):
         found.append(f"PLC: {error}")
+    thread = session.thread_status or {}
+    found += [f"{what}: {text}" for what, key in THREAD_TROUBLES if (text := thread.get(key))]
     return found
 
 

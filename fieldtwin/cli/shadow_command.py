@@ -43,6 +43,12 @@ class ShadowTalk:
         subject = f"{verdict.subject}: " if not verdict.text.startswith(verdict.subject) else ""
         talk.print(f"{when} {word} {escape(subject + verdict.text)}", soft_wrap=True)
 
+    def trouble(self, where: str, text: str) -> None:
+        """What is wrong with thread or store, once, and that it is over."""
+        if not self._quiet:
+            when = datetime.now(UTC).strftime("%H:%M:%S.%f")[:-3]
+            talk.print(f"{when} [bold yellow]{where:10}[/] {escape(text or 'all is well again')}", soft_wrap=True)
+
 
 @click.command("shadow")
 @click.argument("system")
@@ -80,8 +86,7 @@ def command(
     else:
         print_shadow(seen)
     if not seen["origins"]:
-        trouble = seen["thread"].get("trouble") or "nothing came"
-        raise Unreachable(f"the plant's thread: {trouble}", where=place)
+        raise Unreachable(f"the plant's thread: {why_nothing(seen)}", where=place)
     return 0 if seen["agreed"] == seen["statuses"] else 1
 
 
@@ -91,11 +96,19 @@ async def _run(
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    shadowing = Shadowing(system, place, instance, store=store, on_verdict=ShadowTalk(quiet=as_json))
+    talks = ShadowTalk(quiet=as_json)
+    shadowing = Shadowing(system, place, instance, store=store, on_verdict=talks)
+    shadowing.on_trouble = talks.trouble
     if not as_json:
         talk.print(f"[bold]shadow[/bold] of {system.name}, from {escape(place)}", soft_wrap=True)
     await shadowing.run(stop, duration_s)
     return shadowing.describe()
+
+
+def why_nothing(seen: dict[str, Any]) -> str:
+    """Of a shadow that was told nothing of its plant."""
+    thread = seen["thread"]
+    return str(thread.get("trouble") or thread.get("silent") or "no word of its log came")
 
 
 def print_shadow(seen: dict[str, Any]) -> None:
@@ -116,6 +129,8 @@ def print_shadow(seen: dict[str, Any]) -> None:
     ]
     if thread["trouble"]:
         lines.append(("trouble", thread["trouble"]))
+    if seen["store_trouble"]:
+        lines.append(("store", seen["store_trouble"]))
     lines += [("wrong now", f"{name}: {', '.join(what)}") for name, what in seen["wrong"].items()]
     for name, text in lines:
         talk.print(f"  {name:10} {escape(text)}", soft_wrap=True)

@@ -13,7 +13,7 @@ import click
 from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
-from fieldtwin.cli.shadow_command import ShadowTalk, print_shadow
+from fieldtwin.cli.shadow_command import ShadowTalk, print_shadow, why_nothing
 from fieldtwin.cli.talk import talk
 from fieldtwin.cli.template_question import ask_about
 from fieldtwin.running.template_here import system_file
@@ -104,6 +104,7 @@ def command(
             loaded, place, here, store=store, on_verdict=talks, on_command=talks.sent, on_refusal=talks.refused,
             planner=chosen, asking=asking, question=question,
         )  # fmt: skip
+        twinning.on_trouble = talks.trouble
         for plan in plans:
             twinning.plan(plan)
         seen = asyncio.run(_run(loaded, place, twinning, duration_s, as_json, asking, questions))
@@ -117,7 +118,7 @@ def command(
         counts = f"{seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused{there}"
         talk.print(f"  commands   {counts}", soft_wrap=True)
     if not seen["origins"]:
-        raise Unreachable(f"the plant's thread: {seen['thread'].get('trouble') or 'nothing came'}", where=place)
+        raise Unreachable(f"the plant's thread: {why_nothing(seen)}", where=place)
     return 0 if seen["agreed"] == seen["statuses"] else 1
 
 

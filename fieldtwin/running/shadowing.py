@@ -74,6 +74,9 @@ class Shadowing:
         self._socket = Path(instance.dir) / f"{self.kind}.sock"
         self._store = store or str(Path(instance.dir) / "knowledge.sqlite")
         self._on_verdict = on_verdict
+        self.on_trouble: Callable[[str, str], None] = lambda where, text: None
+        """Told what is wrong with the thread or the store, and with an empty text when that is over."""
+        self._troubles: dict[str, str] = {}
         self._end: ThreadEnd | None = None
 
     def _make(self, system: System) -> DigitalShadow:
@@ -81,7 +84,7 @@ class Shadowing:
 
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
         """This side of the thread: it receives, and has no log to send."""
-        return ThreadEnd(store, carrier, schema_of(self._system), self.clock, on_events=self._arrived)
+        return ThreadEnd(store, carrier, schema_of(self._system), self.clock, on_events=self._arrived, insists=False)
 
     async def run(self, stop: asyncio.Event, for_s: float = 0.0) -> None:
         """Shadow the plant until `stop`, or for so many seconds. Raises `FieldtwinError` for a store that cannot be used."""
@@ -143,7 +146,15 @@ class Shadowing:
         while True:
             self._step(writer)
             await self._flush()
+            self._look_for_trouble(writer)
             await self.clock.sleep_until_ns(self.clock.monotonic_ns() + STEP_MS * NS_PER_MS)
+
+    def _look_for_trouble(self, writer: KnowledgeWriter) -> None:
+        assert self._end is not None
+        for where, text in (("thread", str(self._end.describe()["trouble"])), ("store", writer.trouble)):
+            if text != self._troubles.get(where, ""):
+                self._troubles[where] = text
+                self.on_trouble(where, text)
 
     def _step(self, writer: KnowledgeWriter) -> None:
         self.shadow.step()
@@ -168,5 +179,6 @@ class Shadowing:
             "prototype": bool(self.prototypes),
             "origins": sorted(self.origins),
             "thread": thread,
+            "store_trouble": self._troubles.get("store", ""),
             **self.shadow.describe(),
         }

@@ -77,7 +77,9 @@ class Twinning(Shadowing):
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
         name = self._system.name
         origin = await store.own("twin", system=name, prototype=False, log=secrets.token_hex(4))
-        end = ThreadEnd(store, carrier, schema_of(self._system), self.clock, origin=origin, on_events=self._arrived)
+        end = ThreadEnd(
+            store, carrier, schema_of(self._system), self.clock, origin=origin, on_events=self._arrived, insists=False
+        )
         self._commands = KnowledgeWriter(store, origin, self.clock, on_written=end.appended)
         self._way_back = DTtoPTConnection(end, [self._operator], self._commands, self.clock)
         return end

@@ -42,6 +42,7 @@ def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
         *_devices(_part(before, "devices"), _part(now, "devices")),
         *_plc(before.plc if before else None, now.plc),
         *_reloaded(before.gateway if before else None, now.gateway),
+        *_thread(before.thread if before else None, now.thread),
         *_dropped(before.gateway if before else None, now.gateway),
     ]
 
@@ -108,6 +109,17 @@ def _reloaded(before: Status | None, now: Status | None) -> list[Event]:
         return []
     text = "reloaded: " + "; ".join(now["config"]["changed"])
     return [Event(Priority.NOTICE, "reloaded", text, {"hash": now["config"]["hash"]})]
+
+
+def _thread(before: Status | None, now: Status | None) -> list[Event]:
+    """The digital thread's carrier, and the store of its log: what is wrong, and that it is over."""
+    found = []
+    for key, what in (("trouble", "thread"), ("store_trouble", "store of the thread")):
+        text, was = (now or {}).get(key, ""), (before or {}).get(key, "")
+        if now is not None and text != was:
+            priority = Priority.WARNING if text else Priority.NOTICE
+            found.append(Event(priority, f"thread_{key}", f"{what}: {text or 'all is well again'}", {"error": text}))
+    return found
 
 
 def _dropped(before: Status | None, now: Status | None) -> list[Event]:

@@ -70,6 +70,11 @@ class TlsConnection(TcpConnection):
         return super()._cannot_open(error)
 
 
+def client_context(endpoint: Endpoint) -> ssl.SSLContext:
+    """What who connects needs to shake hands: ``ca``, ``cert``, ``key`` as of `TlsConnection`. Reads files, raises as `open`."""
+    return _context(endpoint)[0]
+
+
 def _context(endpoint: Endpoint) -> tuple[ssl.SSLContext, str]:
     """What is needed to shake hands, and our role. Reads files."""
     where = str(endpoint)

@@ -1,0 +1,190 @@
+"""Digital threads over a broker with TLS: whom it lets in, whom we trust, what a user may do there; against a real mosquitto."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from modbus_pki import Pki, make_pki
+from support import eventually, run
+
+import twin.thread_mqtt
+from gateway.core.errors import Unreachable, UsageError
+from gateway.wallclock import WallClock
+from twin.system import load_system
+from twin.thread import schema_of
+from twin.thread_end import ThreadEnd
+from twin.thread_link import Carrier, Unwelcome
+from twin.thread_place import plant_carrier, twin_carrier
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
+from mosquitto_here import Mosquitto, broker, program
+from thread_rig import Twin, equal, value
+
+pytestmark = [
+    pytest.mark.interop,
+    pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificates"),
+]
+CLOCK = WallClock()
+SYSTEM = load_system(str(Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.yaml"))
+ACL = """user plant
+topic readwrite spBv1.0/sea/#
+topic read spBv1.0/STATE/#
+user shore
+topic readwrite spBv1.0/sea/#
+topic readwrite spBv1.0/STATE/#
+"""
+
+
+@pytest.fixture(scope="module")
+def pki(tmp_path_factory: pytest.TempPathFactory) -> Pki:
+    return make_pki(tmp_path_factory.mktemp("pki"))
+
+
+def strict(folder: Path, pki: Pki, *more: str) -> tuple[str, ...]:
+    """Settings of a broker that asks for a certificate, a user and a password, and lets each do what is his."""
+    passwords = folder / "passwords"
+    program()  # skips where there is none
+    tool = shutil.which("mosquitto_passwd") or "mosquitto_passwd"
+    for first, user in enumerate(("plant", "shore")):
+        subprocess.run(
+            [tool, "-b", *(() if first else ("-c",)), passwords, user, f"{user}-word"], check=True, capture_output=True
+        )
+    passwords.chmod(0o600)
+    (folder / "acl").write_text(ACL)
+    (folder / "acl").chmod(0o600)
+    return (
+        f"cafile {pki.ca}", f"certfile {pki.cert('server')}", f"keyfile {pki.key('server')}", "require_certificate true",
+        "allow_anonymous false", f"password_file {passwords}", f"acl_file {folder / 'acl'}", *more,
+    )  # fmt: skip
+
+
+def url(here: Mosquitto, pki: Pki, user: str, *, certificate: bool = True, scheme: str = "mqtts") -> str:
+    ours = f"&cert={pki.cert('client')}&key={pki.key('client')}" if certificate else ""
+    return f"{scheme}://{user}@127.0.0.1:{here.port}/sea/obs" + (f"?ca={pki.ca}{ours}" if scheme == "mqtts" else "")
+
+
+async def plant(place: str) -> Carrier:
+    return (await plant_carrier(place, SYSTEM, CLOCK))[0]
+
+
+def test_certificates_users_and_passwords_are_asked_for_and_the_logs_are_equal(
+    tmp_path: Path, pki: Pki, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        with broker(tmp_path, *strict(tmp_path, pki)) as here:
+            monkeypatch.setenv("FIELDTWIN_MQTT_PASSWORD", "plant-word")
+            near = await plant(url(here, pki, "plant"))
+            monkeypatch.delenv("FIELDTWIN_MQTT_PASSWORD")
+            (tmp_path / "word").write_text("shore-word\n")
+            monkeypatch.setenv("FIELDTWIN_MQTT_PASSWORD_FILE", str(tmp_path / "word"))
+            far = twin_carrier(url(here, pki, "shore"), SYSTEM, CLOCK)
+            one = Twin("plant", tmp_path, CLOCK, lambda: near, schema_of(SYSTEM))
+            other = Twin("shore", tmp_path, CLOCK, lambda: far, schema_of(SYSTEM))
+            await one.start()
+            await other.start()
+            await one.log(*(value(n) for n in range(50)))
+            await eventually(lambda: equal(one, other))
+            assert str(near.name).startswith("thread over mqtts://")
+            await other.kill()
+            await one.kill()
+
+    run(main())
+
+
+def test_whom_the_broker_does_not_want_hears_why(tmp_path: Path, pki: Pki, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "other").mkdir()
+    stranger = make_pki(tmp_path / "other")
+
+    async def refused(place: str, word: str) -> str:
+        monkeypatch.setenv("FIELDTWIN_MQTT_PASSWORD", word)
+        with pytest.raises(Unwelcome) as caught:
+            await (await plant(place)).open()
+        assert caught.value.exit_code == 4
+        assert word not in str(caught.value)
+        return str(caught.value)
+
+    async def main() -> None:
+        with broker(tmp_path, *strict(tmp_path, pki)) as here:
+            assert "the broker refuses: Not authorized" in await refused(url(here, pki, "plant"), "wrong-word")
+            trusting_others = url(here, pki, "plant").replace(pki.ca, stranger.ca)
+            assert "the broker's certificate is refused: " in await refused(trusting_others, "plant-word")
+            monkeypatch.setattr(twin.thread_mqtt, "TIMEOUT_S", 0.5)  # TLS 1.3: we may say CONNECT before it refuses
+            with pytest.raises(Unreachable, match="the broker ends the connection: tlsv13 alert certificate required"):
+                await (await plant(url(here, pki, "plant", certificate=False))).open()
+            with pytest.raises(Unreachable, match="does it want mqtts://"):
+                await (await plant(url(here, pki, "plant", scheme="mqtt"))).open()
+
+    run(main(), timeout_s=40)
+
+
+def test_a_twin_that_is_refused_ends_and_a_plant_that_is_refused_waits(
+    tmp_path: Path, pki: Pki, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plant's thread keeps its log meanwhile: somebody may put the password right at the broker."""
+
+    async def main() -> None:
+        with broker(tmp_path, *strict(tmp_path, pki)) as here:
+            monkeypatch.setenv("FIELDTWIN_MQTT_PASSWORD", "wrong-word")
+            near, far = await plant(url(here, pki, "plant")), twin_carrier(url(here, pki, "shore"), SYSTEM, CLOCK)
+            one = Twin("plant", tmp_path, CLOCK, lambda: near, schema_of(SYSTEM))
+            await one.start()
+            await one.log(value(1))
+            await eventually(lambda: "Not authorized" in one.end.trouble)
+            assert one.end.waiting == 1
+            with pytest.raises(Unwelcome, match="Not authorized"):
+                await ThreadEnd(one.store, far, schema_of(SYSTEM), CLOCK, insists=False).run()
+            await one.kill()
+
+    run(main())
+
+
+def test_a_topic_that_we_may_not_hear_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """mosquitto grants every subscription and keeps back what comes; other brokers answer SUBACK with 0x80 (MQTT 3.9.3)."""
+
+    gone = asyncio.Event()
+
+    async def denies(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(asyncio.IncompleteReadError):
+            while True:
+                kind, length = await reader.readexactly(2)  # no packet is longer than 127 bytes here
+                packet = await reader.readexactly(length)
+                if kind == 0x10:
+                    writer.write(b"\x20\x02\x00\x00")
+                elif kind == 0x82:
+                    writer.write(b"\x90\x03" + packet[:2] + b"\x80")
+        writer.close()
+        gone.set()
+
+    async def main() -> None:
+        server = await asyncio.start_server(denies, "127.0.0.1", 0)
+        port = server.sockets[0].getsockname()[1]
+        carrier = await plant(f"mqtt://127.0.0.1:{port}/sea/obs")
+        monkeypatch.setattr(twin.thread_mqtt, "GOODBYE_S", 0.1)
+        with pytest.raises(Unwelcome, match=r"does not let us hear spBv1\.0/sea/NCMD/obs"):
+            await carrier.open()
+        server.close()
+        await server.wait_closed()
+        await gone.wait()
+
+    run(main())
+
+
+@pytest.mark.parametrize(
+    ("place", "text"),
+    [
+        ("mqtts://broker/sea/obs?ca=/nowhere.pem", "cannot read the TLS files: No such file"),
+        ("mqtts://broker/sea/obs?key=/some.key", "a key is of no use without its certificate"),
+        ("mqtt://broker/sea/obs?ca=/some.pem", "certificates go with mqtts://"),
+        ("mqtts://broker/sea/obs?verify=no", "verify= says nothing of a broker"),
+        ("mqtts://u:secret@broker/sea/obs", "a password in a URL"),
+    ],
+)
+def test_what_is_wrong_in_the_url_is_said_at_once(place: str, text: str) -> None:
+    with pytest.raises((UsageError, Unreachable), match=text):
+        twin_carrier(place, SYSTEM, CLOCK)

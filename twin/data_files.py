@@ -63,7 +63,10 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
                     if candidate.is_file():
                         return candidate
     known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if "." not in p.stem})
-    near = difflib.get_close_matches(direct.name, known, n=1)
+    if direct.name != name or direct.suffix in (".yaml", ".yml"):
+        raise UsageError(f"there is no file {name!r}", expected=f"a {kind[:-1]}'s file, or one of " + ", ".join(known))
+    files = [f.name for f in (Path(f"{name}.yaml"), Path(f"{name}.yml")) if f.is_file()]
+    near = files or difflib.get_close_matches(direct.name, known, n=1)
     raise UsageError(
         f"no {kind[:-1]} {name!r}",
         expected="a file, or one of " + ", ".join(known),

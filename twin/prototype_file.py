@@ -85,6 +85,13 @@ def prototype_path(system: System) -> Path:
 
 def load_prototype(system: System, path: Path | None = None) -> Prototype:
     """Read the prototype file of `system`. Raises `FileInvalid` or `UsageError`."""
+    if path is None and not prototype_path(system).exists():
+        raise FileInvalid(
+            f"there is no prototype file of {system.path.name}",
+            path=str(prototype_path(system)),
+            expected="what is emulated, with what and where",
+            hint="copy one of profiles/systems/, or name one with --prototype-file",
+        )
     path = path or prototype_path(system)
     file = load(path)
     form = validate(file, PrototypeForm)

@@ -103,7 +103,8 @@ def command(
         json.dump(result, sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
-        talk.print(f"{result['requests']} requests: " + ", ".join(f"{k} {v}" for k, v in result["target"].items() if v))
+        counted = ", ".join(f"{k} {v}" for k, v in result["target"].items() if v)
+        talk.print(f"{result['requests']} requests" + (f": {counted}" if counted else ""))
     return 0
 
 

@@ -65,10 +65,13 @@ class LineSink:
         self._endpoint = str(endpoint)
         started = datetime.fromtimestamp(clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="microseconds")
         now_ns = clock.monotonic_ns()
-        self._line(now_ns, {"started": started, "t_ns": now_ns, "command": words})
+        self._head: dict[str, object] | None = {"started": started, "t_ns": now_ns, "command": words}
 
     def saw(self, direction: Direction, t_ns: int, data: bytes) -> None:
         """`data` passed in that direction: SENT is towards the device."""
+        if self._head is not None:  # with the first bytes: a tap that was never connected leaves nothing
+            head, self._head = self._head, None
+            self._line(t_ns, head)
         self.bytes[direction] += len(data)
         self._line(t_ns, {"t_ns": t_ns, "endpoint": self._endpoint, "direction": direction.value, "hex": data.hex()})
 

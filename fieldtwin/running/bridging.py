@@ -124,13 +124,17 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
 
 
 async def _report(bridge: Bridge, bus: ModbusBus, clock: WallClock, say: Callable[[str], None]) -> None:
-    """Say where it listens, and each time that one of the ends comes or goes."""
+    """Say where it listens, and each time that one of the ends comes or goes; what is not there is tried again and again."""
     said: tuple[str, str] | None = None
     while True:
         bound = bridge.front.bound
-        here = str(bound) if bound is not None else bridge.front.error
-        there = str(bus.config.endpoint) if bus.connected else bus.error
-        if there and (bound is not None or bridge.config.listen.is_serial) and (here, there) != said:
+        here = bridge.front.error if bound is None else ""
+        there = "" if bus.connected else bus.error
+        settled = bus.connected or there
+        if settled and (bound is not None or bridge.config.listen.is_serial) and (here, there) != said:
+            if said is None or not (here or there):
+                say(f"{bound or bridge.config.listen}  →  {bus.config.endpoint}")
+            for error in filter(None, (here, there)):
+                say(f"waiting: {error}")
             said = here, there
-            say(f"{here}  →  {there}")
         await clock.sleep_until_ns(clock.monotonic_ns() + WATCH_NS)

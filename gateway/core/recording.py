@@ -36,6 +36,11 @@ MAX_LINE_BYTES = 65_536
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
 """Of the last two each system has one."""
 
+_OTHER_FILES = (
+    (b'{"fieldtwin_dump"', " but a dump: fieldtwin infer, diff and report read it"),
+    (b'{"started"', " but raw traffic: fieldtwin import makes a recording of it"),
+)
+"""What people give instead, by how it begins."""
 BLOCK_BYTES = 4 * MAX_LINE_BYTES
 """What is read at once of a recording of exchanges."""
 
@@ -220,8 +225,9 @@ class RecordingReader:
         try:
             header = _header_decoder.decode(line)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            other = next((told for begins, told in _OTHER_FILES if line.startswith(begins)), "")
             raise FileInvalid(
-                f"not a recording's header: {error}",
+                f"not a recording{other}" if other else f"not a recording's header: {error}",
                 path=str(self.path),
                 line=1,
                 expected='{"fieldtwin_recording": 1, "device": ..., "kind": ..., "source": ...}',

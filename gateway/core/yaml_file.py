@@ -45,6 +45,14 @@ for _tag, _pattern, _first in (
     _Loader.add_implicit_resolver(_tag, re.compile(_pattern), list(_first))
 
 
+_OTHER_FILES = (
+    (b"PK\x03\x04", "a zip; if it is a template: fieldtwin template unpack"),
+    (b"\xff\xfe", "it looks like UTF-16: save it as UTF-8"),
+    (b"\xfe\xff", "it looks like UTF-16: save it as UTF-8"),
+)
+"""What people give instead, by its first bytes."""
+
+
 @dataclass(frozen=True)
 class YamlFile:
     """A parsed file: plain data, and where each path of keys stands (line and column from 1)."""
@@ -69,11 +77,14 @@ def load(path: Path) -> YamlFile:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise FileInvalid("the file is too large", path=str(path), expected=f"at most {MAX_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
+        raw = path.read_bytes()
+        text = raw.decode("utf-8")
     except OSError as e:
         raise FileInvalid(f"cannot read the file: {e.strerror or e}", path=str(path)) from e
     except UnicodeDecodeError as e:
-        raise FileInvalid("the file is not UTF-8 text", path=str(path), got=f"byte {e.object[e.start]:02X}h") from e
+        hint = next((told for begins, told in _OTHER_FILES if e.object.startswith(begins)), "")
+        got = f"byte {e.object[e.start]:02X}h"
+        raise FileInvalid("the file is not UTF-8 text", path=str(path), got=got, hint=hint) from e
     return parse(text, str(path))
 
 

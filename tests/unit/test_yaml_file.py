@@ -122,3 +122,16 @@ def test_deep_nesting_and_aliases_end_in_an_error_and_not_in_a_crash() -> None:
         bomb += f"{now}: &{now} [{', '.join(['*' + before] * 9)}]\n"
     with pytest.raises(FileInvalid):
         parse(bomb, "f")
+
+
+@pytest.mark.parametrize(("begins", "told"), [(b"PK\x03\x04\xff", "template unpack"), (b"\xff\xfef\x00", "UTF-16")])
+def test_another_kind_of_file_is_named(tmp_path: Path, begins: bytes, told: str) -> None:
+    (tmp_path / "given").write_bytes(begins)
+    with pytest.raises(FileInvalid, match=told):
+        load(tmp_path / "given")
+
+
+@pytest.mark.parametrize("begins", [b"\xef\xbb\xbfa: 1\n", b"a: 1\r\nb: 2\r\n"])
+def test_what_editors_on_other_systems_write_is_read(tmp_path: Path, begins: bytes) -> None:
+    (tmp_path / "given").write_bytes(begins)
+    assert load(tmp_path / "given").data["a"] == 1

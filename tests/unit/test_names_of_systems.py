@@ -1,0 +1,51 @@
+"""What is said when a system, its prototype or a recording is not what somebody thought."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.recording import RecordingReader
+from twin.data_files import data_root, find
+from twin.prototype_file import load_prototype
+from twin.system import load_system
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("plant.yaml", r"there is no file 'plant.yaml'; expected a system's file, or one of .*observatory"),
+        ("sites/plant", "there is no file 'sites/plant'"),
+        ("mysite", r"no system 'mysite'.*did you mean 'mysite.yaml'\?"),
+        ("obsrvatory", r"no system 'obsrvatory'.*did you mean 'observatory'\?"),
+    ],
+)
+def test_a_system_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, told: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mysite.yaml").write_text("fieldtwin: 1\n")
+    with pytest.raises(UsageError, match=told):
+        find("systems", name)
+
+
+def test_a_site_without_a_prototype_says_what_to_do(tmp_path: Path) -> None:
+    shutil.copy(data_root() / "profiles" / "systems" / "observatory.yaml", tmp_path / "mysite.yaml")
+    with pytest.raises(
+        FileInvalid, match=r"mysite.prototype.yaml: there is no prototype file of mysite.yaml.*--prototype-file"
+    ):
+        load_prototype(load_system(str(tmp_path / "mysite.yaml")))
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ('{"fieldtwin_dump":1}\n', "but a dump: fieldtwin infer"),
+        ('{"started":"2026"}\n', "raw traffic: fieldtwin import"),
+    ],
+)
+def test_a_file_of_another_verb_is_named(tmp_path: Path, line: str, told: str) -> None:
+    (tmp_path / "given.jsonl").write_text(line)
+    with pytest.raises(FileInvalid, match=told):
+        RecordingReader(tmp_path / "given.jsonl")

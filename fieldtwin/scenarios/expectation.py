@@ -48,7 +48,7 @@ async def judge_tag(expect: Expect, watched: Watched) -> Said:
         if not low <= rate <= high:
             return f"{expect.tag}: {low:g} to {high:g} updates/s", f"{rate:.3g} in {took_s:g} s"
     if reading is None:
-        return f"{expect.tag}", "never published"
+        return f"{expect.tag} published", "never published"
     said = await _judge_value(expect, watched, reading)
     return said if said is None or not is_secret(watched.system, expect.tag) else (f"{expect.tag}", SECRET)
 

@@ -93,6 +93,18 @@ def _target(link: str, source: str, number: int, book: dict[str, str], beside: d
     return beside[wanted]
 
 
+def contents(index: str) -> str:
+    """The book's tables of contents, hidden: one for each heading of index.md, of the pages linked below it, in order."""
+    parts, seen = [], set()
+    for section in index.split("\n## ")[1:]:
+        title, _, text = section.partition("\n")
+        names = [link.removesuffix(".md") for _, link, _, _ in _LINK.findall(text) if link.endswith(".md")]
+        own = [name for name in names if name not in seen]
+        seen.update(own)
+        parts.append("\n".join(["", "```{toctree}", ":hidden:", f":caption: {title}", "", *own, "```", ""]))
+    return "".join(parts)
+
+
 def generated() -> dict[str, str]:
     """Reference pages that are made from the program itself."""
     return {"reference/cli.md": cli_page(), **form_pages(), "reference/paper.md": paper_page()}
@@ -106,7 +118,7 @@ def stage(target: Path) -> None:
     book = pages()
     for source, page in book.items():
         text, beside = with_links((ROOT / source).read_text("utf-8"), source, page, book)
-        _write(target / page, text + LISTS.get(page, ""))
+        _write(target / page, text + (contents(text) if page == "index.md" else LISTS.get(page, "")))
         for name, place in beside.items():
             (target / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, target / place)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import json
 import re
 import shlex
+from importlib import import_module
 
 import click
 import pytest
@@ -94,8 +97,24 @@ def test_a_command_that_there_is_not_is_noticed():
     ]  # fmt: skip
 
 
-def test_yaml_of_the_pages_is_yaml():
-    for page in PAGES:
-        for language, body in _FENCE.findall(page.read_text("utf-8")):
-            if language == "yaml":
-                yaml.safe_load(body)
+def fences(*languages: str) -> list[tuple[str, str]]:
+    """(page, text) of all fences in these languages."""
+    texts = [(page.relative_to(ROOT).as_posix(), page.read_text("utf-8")) for page in PAGES]
+    return [(name, body) for name, text in texts for language, body in _FENCE.findall(text) if language in languages]
+
+
+def test_yaml_and_json_of_the_pages_can_be_read():
+    assert all(yaml.safe_load(body) is not None for _, body in fences("yaml"))
+    for _, body in fences("json"):
+        lines = body.splitlines()
+        for value in lines if all(line.endswith(("}", "]")) for line in lines) else [body]:
+            json.loads(value)
+
+
+def test_python_of_the_pages_is_python_and_imports_what_there_is():
+    ours = {"fieldtwin", "gateway", "plc", "twin", "emulators"}
+    for page, body in fences("python"):
+        for node in ast.walk(ast.parse(body, page)):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] in ours:
+                module = import_module(node.module)
+                assert all(hasattr(module, name.name) for name in node.names), f"{page}: {ast.unparse(node)}"

@@ -67,8 +67,11 @@ def _reach(system: System, prototype_file: Path | None) -> tuple[str, ...]:
 
 
 def _unpacked(package: Package) -> Path:
+    """The folder with the contents of a zip. What is unpacked already does not excuse a zip that was damaged since."""
     folder = runtime_root() / "templates" / package.manifest.id[:32]
-    if not folder.exists():
+    if folder.exists():
+        package.verify()
+    else:
         runtime_root().mkdir(parents=True, exist_ok=True, mode=0o700)
         folder.parent.mkdir(exist_ok=True, mode=0o700)
         unpack(package, folder)

@@ -370,6 +370,19 @@ def test_a_wrong_hash_names_file_expected_and_got(good: Path, tmp_path: Path) ->
     assert sorted(p.name for p in tmp_path.iterdir()) == ["bad.zip", "good.zip", "site"], "nothing is left of it"
 
 
+def test_a_wrong_hash_is_found_in_a_zip_of_which_a_good_copy_ran_before(
+    good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path / "run"))
+    assert system_file(str(good), yes) == system_file(str(good), yes)
+
+    def change(files: dict[str, bytes]) -> None:
+        files["devices/tilt.yaml"] = files["devices/tilt.yaml"].replace(b"16", b"61", 1)
+
+    with pytest.raises(FileInvalid, match=r"devices/tilt\.yaml: not what was packed"):
+        system_file(str(reworked(good, tmp_path / "bad.zip", change)), yes)
+
+
 def add(name: str, data: bytes = b"x") -> Callable[[dict[str, bytes]], None]:
     return lambda files: files.update({name: data})
 

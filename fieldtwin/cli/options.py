@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -15,7 +15,14 @@ _DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|m|min|h)?$")
 _UNIT_S = {"ms": 0.001, "s": 1.0, "": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
-class Duration(click.ParamType[float]):
+if TYPE_CHECKING:
+    _OfFloat = click.ParamType[float]
+    _OfText = click.ParamType[str]
+else:  # it takes a parameter since 8.4
+    _OfFloat = _OfText = click.ParamType
+
+
+class Duration(_OfFloat):
     """``20s``, ``500ms``, ``2m``, ``1h``, or seconds."""
 
     name = "duration"
@@ -29,7 +36,7 @@ class Duration(click.ParamType[float]):
         return float(match[1]) * _UNIT_S[match[2] or ""]
 
 
-class Secret(click.ParamType[str]):
+class Secret(_OfText):
     """A secret: ``@FILE`` for the first line of a file, or the environment. A command line everybody on the computer can read:
     one that stands there is refused, and not repeated in the message."""
 

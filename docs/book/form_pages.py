@@ -13,6 +13,7 @@ from gateway.core.profile import load_profile
 KINDS = {
     "system": "The plant: buses, devices, programs. `NAME.yaml`",
     "prototype": "What is emulated of it, with what. `NAME.prototype.yaml`",
+    "network": "Systems whose modems are in one water, as prototypes.",
     "profile": "A device: its registers or objects.",
     "scenario": "What is done and what must be seen. `NAME.scenario.yaml`",
     "faults": "What goes wrong, for `run --faults` and `link --faults`.",

@@ -22,6 +22,12 @@ def _prototype() -> dict[str, Any]:
     return PrototypeForm.model_json_schema()
 
 
+def _network() -> dict[str, Any]:
+    from twin.network_schema import NetworkForm
+
+    return NetworkForm.model_json_schema()
+
+
 def _profile() -> dict[str, Any]:
     from gateway.core.profile_schema import ProfileForm
 
@@ -60,6 +66,7 @@ def _rules() -> dict[str, Any]:
 SCHEMAS: dict[str, Callable[[], dict[str, Any]]] = {
     "system": _system,
     "prototype": _prototype,
+    "network": _network,
     "profile": _profile,
     "faults": _faults,
     "scenario": _scenario,
@@ -77,6 +84,7 @@ def command(kind: str) -> int:
     \b
     system      the plant: buses, devices, programs
     prototype   what is emulated of it, with what
+    network     systems whose modems are in one water, as prototypes
     profile     a device: its registers or objects
     faults      what goes wrong, for run --faults and link --faults
     scenario    what is done and what must be seen, for test

@@ -53,6 +53,12 @@ _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "
     type=click.Path(exists=True, dir_okay=False),
     help="With --instance: the file that its wires are captured to.",
 )
+@click.option(
+    "--can",
+    default="",
+    metavar="INTERFACE/CHANNEL",
+    help="With local: emulated CAN buses on this interface, e.g. socketcan/vcan0.",
+)
 @click.option("--waivers", type=click.Path(exists=True, dir_okay=False), help="Failures that somebody answers for.")
 @click.option("--seed", type=int, default=None, help="Another seed than the scenario's.")
 @click.option("--junit", type=click.Path(dir_okay=False), help="JUnit XML to this file.")
@@ -71,6 +77,7 @@ def command(
     token: str,
     far: str,
     capture: str | None,
+    can: str,
     waivers: str | None,
     seed: int | None,
     junit: str | None,
@@ -97,11 +104,13 @@ def command(
     paths = _found(files)
     if trace and len(paths) != 1:
         raise UsageError("--trace belongs to one scenario", got=f"{len(paths)} of them")
-    _check(target, allow, instance, far, capture)
+    _check(target, allow, instance, far, capture, can)
     scenarios = [load_scenario(path, tuple(map(Path, profiles))) for path in paths]
     known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
     waived = load_waivers(Path(waivers), known) if waivers else Waivers()
-    where = Target(target, seed, instance, field_host, token, far, Path(capture) if capture else None, Danger(allow))
+    where = Target(
+        target, seed, instance, field_host, token, far, Path(capture) if capture else None, Danger(allow), can
+    )
     results: list[ScenarioResult] = []
     for scenario in scenarios:
         result = run_scenario(scenario, where, Path(trace) if trace else None)
@@ -135,7 +144,9 @@ def command(
     return 0 if all_well(results) else 1
 
 
-def _check(target: str, allow: str, instance: str, far: str, capture: str | None) -> None:
+def _check(target: str, allow: str, instance: str, far: str, capture: str | None, can: str) -> None:
+    if can and target != "local":
+        raise UsageError("--can goes with --target local", got=f"--target {target}")
     if target != "real" and (far or allow != Danger.READ.value):
         raise UsageError("--far and --allow go with --target real", got=f"--target {target}")
     if target in ("virtual", "local") and instance:

@@ -38,7 +38,8 @@ TARGETS = ("virtual", "local", "compose", "real")
 class Target:
     """Where scenarios run. `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the
     system's name, `real` starts the plant. `field_host`, `token`: the field side of `compose`. `far`: the far end of a plant.
-    `capture`: the file that a running instance's wires are captured to. `allow`: what may be done to a plant."""
+    `capture`: the file that a running instance's wires are captured to. `allow`: what may be done to a plant. `can`: on `local`
+    the interface that emulated CAN buses are on (`socketcan/vcan0`); empty: as the prototype file says."""
 
     name: str = "virtual"
     seed: int | None = None
@@ -48,6 +49,7 @@ class Target:
     far: str = ""
     capture: Path | None = None
     allow: Danger = Danger.READ
+    can: str = ""
 
 
 def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = None) -> ScenarioResult:
@@ -59,6 +61,8 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
     refused = _of_a_plant(scenario, target) if target.name == "real" else ""
     if scenario.network is not None and target.name != "local":
         refused = f"a network is a prototype, and the target {target.name} is none: each of its systems is a plant"
+    elif scenario.network is not None and target.can:
+        refused = "--can is of one system, and this is a network"
     sink = trace_file.open("wb") if trace_file is not None else None
     trace = Trace(sink=sink)
     trace.listeners.append(collector.feed)
@@ -103,6 +107,7 @@ def _words(target: Target) -> list[str]:
         "--field": target.field_host if target.field_host != Target.field_host else "",
         "--far": target.far,
         "--capture": str(target.capture or ""),
+        "--can": target.can,
         "--allow": target.allow.value if target.name == "real" and target.allow is not Target.allow else "",
     }
     return words + [word for option, value in said.items() if value for word in (option, value)]
@@ -167,6 +172,7 @@ def _session(scenario: Scenario, target: Target) -> RunSession:
         capture=Instance(name).dir / "capture.jsonl",
         cold=True,
         seed=None if plant else seed,
+        can="" if plant else target.can,
     )
     return RunSession(options)
 

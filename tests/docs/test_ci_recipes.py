@@ -51,7 +51,9 @@ def test_a_recipe_is_of_its_form_and_its_commands_are_there(service, text):
 def test_scenarios_leave_junit_and_html_on_both_services():
     told = {service for service, text in RECIPES if "--junit out/" in text and "--html out/" in text}
     assert told == {"github", "gitlab"}
-    assert {service for service, text in RECIPES if "socketcan/vcan0" in text} == {"github", "gitlab"}
+    on_vcan = [(service, text) for service, text in RECIPES if "--can socketcan/vcan0" in text]
+    assert {service for service, _ in on_vcan} == {"github", "gitlab"}
+    assert all("--junit out/" in text and "--html out/" in text and "always" in text for _, text in on_vcan)
 
 
 def test_an_option_that_there_is_not_is_noticed():

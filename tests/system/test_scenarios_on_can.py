@@ -1,0 +1,62 @@
+"""Scenarios on a CAN interface that is said: `fieldtwin test --target local --can`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import can
+import pytest
+from procs import free_port
+
+from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.running.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.form import load_scenario
+
+SCENARIO = """
+scenario: a node is read
+system: observatory
+steps:
+  - wait: {until: "quality(inclinometer.slope_long) == 'good'", within: 120s}
+  - set: {tag: inclinometer.slope_long, value: 4.5}
+  - wait: {until: "inclinometer.slope_long == 4.5", within: 60s}
+"""
+TPDO1 = 0x185
+
+
+def judged(folder: Path, where: str) -> ScenarioResult:
+    path = folder / "x.scenario.yaml"
+    path.write_text(SCENARIO)
+    return run_scenario(load_scenario(path), Target("local", can=where))
+
+
+@pytest.mark.long
+def test_the_bus_is_where_it_is_said_to_be(tmp_path: Path) -> None:
+    where = f"fieldtwin/127.0.0.1:{free_port()}"
+    result = judged(tmp_path, where)
+    assert result.verdict is Verdict.PASSED, result
+    assert f"--can {where}" in result.reproduce
+
+
+def test_a_kernel_without_the_interface_is_an_error_and_nothing_takes_its_place(tmp_path: Path) -> None:
+    result = judged(tmp_path, "socketcan/nocan7")
+    assert result.verdict is Verdict.ERROR
+    assert "nocan7" in result.reason
+
+
+def test_a_network_has_no_bus_of_that_name(tmp_path: Path) -> None:
+    path = tmp_path / "n.scenario.yaml"
+    path.write_text("scenario: still water\nsystem: ocean_network\nsteps:\n  - pause: 1s\n")
+    result = run_scenario(load_scenario(path), Target("local", can="socketcan/vcan0"))
+    assert result.verdict is Verdict.SKIPPED
+    assert "--can" in result.reason
+
+
+@pytest.mark.socketcan
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_on_a_kernels_can_the_nodes_frames_are_seen_by_anybody(tmp_path: Path) -> None:
+    with can.Bus(interface="socketcan", channel="vcan0") as bus:
+        result = judged(tmp_path, "socketcan/vcan0")
+        assert result.verdict is Verdict.PASSED, result
+        seen = {message.arbitration_id for message in iter(lambda: bus.recv(0), None)}
+    assert TPDO1 in seen

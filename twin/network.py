@@ -15,7 +15,7 @@ from emulators.wires.acoustic import AcousticMedium, Spoils, Water
 from gateway.core.errors import UsageError
 from gateway.core.profile import DeviceProfile
 from gateway.core.yaml_file import Key, YamlFile, load, validate
-from twin.data_files import find
+from twin.data_files import find, search_path
 from twin.network_schema import NetworkForm, ShipForm
 from twin.prototype_file import Prototype, load_prototype
 from twin.system import System, load_system
@@ -143,7 +143,8 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
     try:
         system = load_system(str(find("systems", said.system, beside=path, extra=profiles)), profiles)
     except UsageError as e:
-        raise file.error((*loc, "system"), e.message, expected=e.expected, hint=e.hint) from e
+        near = _near(said.system, [p.name for folder in (path.parent, *search_path(profiles)) for p in _files(folder)])
+        raise file.error((*loc, "system"), e.message, expected=e.expected, hint=near or e.hint) from e
     other = path.parent / said.prototype if said.prototype is not None else None
     if other is not None and not other.is_file():
         raise file.error((*loc, "prototype"), f"no file {said.prototype!r}", expected="one beside this file")
@@ -157,6 +158,11 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
             hint=_near(said.modem, modems),
         )
     return Member(name, system, prototype, said.modem, tuple(said.at_m))
+
+
+def _files(folder: Path) -> list[Path]:
+    """System files there, and where a folder of profiles has them."""
+    return [p for place in (folder, folder / "systems") for p in sorted(place.glob("*.yaml")) if "." not in p.stem]
 
 
 def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> None:

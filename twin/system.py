@@ -51,6 +51,11 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
     """Read a system by path or bare name. Raises `FileInvalid` or `UsageError`."""
     path = find("systems", name, extra=profiles)
     file = load(path)
+    if "network" in file.data and "system" not in file.data:
+        systems = file.data.get("systems")
+        named = ", ".join(map(str, systems)) if isinstance(systems, dict) else ""
+        hint = "run --prototype and test take networks" + (f"; its systems are {named}" if named else "")
+        raise file.error(("network",), "a network, not a system", expected="a system file", hint=hint)
     form = validate(file, SystemForm)
     buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
     known: dict[Path, DeviceProfile] = {}  # a profile that a hundred devices have is read once

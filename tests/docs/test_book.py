@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 
 import pytest
 from page_runner import ROOT
@@ -16,6 +17,7 @@ import form_pages
 import paper_page
 import stage as book
 
+import fieldtwin
 from fieldtwin.cli.schema_command import SCHEMAS
 
 
@@ -62,6 +64,15 @@ def test_every_kind_of_file_and_every_fault_is_in_the_reference():
     assert set(form_pages.KINDS) == set(SCHEMAS)
     faults = form_pages.form_pages()["reference/faults.md"]
     assert all(f"`{name}`" in faults for name in form_pages.FAULTS)
+
+
+def test_the_public_api_is_in_the_reference_and_what_is_there_exists():
+    page = (ROOT / "docs/reference/api.md").read_text("utf-8")
+    told = re.findall(r"^\.\. auto\w+:: ([\w.]+)$", page, re.MULTILINE)
+    assert {name.removeprefix("fieldtwin.") for name in told} >= set(fieldtwin.__all__) - {"__version__"}
+    for name in told:
+        module, _, own = name.rpartition(".")
+        assert getattr(import_module(module), own).__doc__, name
 
 
 @pytest.mark.long

@@ -16,8 +16,9 @@ from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.shadow_command import ShadowTalk, print_shadow, why_nothing
 from fieldtwin.cli.talk import talk
 from fieldtwin.cli.template_question import ask_about
+from fieldtwin.running.shadowing import limits_of
 from fieldtwin.running.template_here import system_file
-from fieldtwin.running.twin_rules import PythonPlanner, load_planner, questions_of
+from fieldtwin.running.twin_rules import Plans, PythonPlanner, load_planner, questions_of
 from fieldtwin.running.twinning import Twinning
 from fieldtwin.whatif.asking import Asking, Subject
 from gateway.core.errors import Unreachable, UsageError
@@ -88,24 +89,24 @@ def command(
     runs_code = bool(horizon_s or planner)  # what a prototype or a planner in Python needs of a template
     system = system_file(system, lambda template: trust or not runs_code or ask_about(template), virtual=True)
     loaded = load_system(system, folders)
-    chosen, of_rules = load_planner(planner, loaded) if planner else (RulePlanner(()), None)
-    question = _question(horizon_s, require, finally_) or of_rules
-    questions = [*([question] if question else []), *questions_of(chosen)]
+    plans = load_planner(planner, loaded) if planner else Plans(RulePlanner(()), limits=limits_of(loaded))
+    question = _question(horizon_s, require, finally_) or plans.question
+    questions = [*([question] if question else []), *questions_of(plans.planner)]
     with Instance(instance or f"{loaded.name}-twin") as here:
-        plans = [encode_period(period) for period in periods]
+        by_hand = [encode_period(period) for period in periods]
         talks = TwinTalk(quiet=as_json)
         subject = Subject(loaded, folders, prototype_file)
         asking = (
             Asking(subject, WallClock(), timeout_s, talks.asks)
-            if questions or isinstance(chosen, PythonPlanner)
+            if questions or isinstance(plans.planner, PythonPlanner)
             else None
         )
         twinning = Twinning(
             loaded, place, here, store=store, on_verdict=talks, on_command=talks.sent, on_refusal=talks.refused,
-            planner=chosen, asking=asking, question=question,
+            planner=plans.planner, limits=plans.limits, asking=asking, question=question,
         )  # fmt: skip
         twinning.on_trouble = talks.trouble
-        for plan in plans:
+        for plan in by_hand:
             twinning.plan(plan)
         seen = asyncio.run(_run(loaded, place, twinning, duration_s, as_json, asking, questions))
     if as_json:

@@ -1,6 +1,7 @@
 """The rules of a digital twin's planner, from a YAML file, or a planner in Python.
 
 ```yaml
+limits: {ctd.pressure: [0, 500]}                        # what `outside` means, where the profile has no range or another one
 what_if: {horizon: 30min, require: ["quality(ctd.pressure) == 'good'"]}    # asked of a prototype before each command
 rules:
   - {when: outside, of: ctd.pressure, period_s: 1}      # an event: sample every second
@@ -13,22 +14,27 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import ConfigDict, Field
 
 from emulators.faults.schema import seconds
+from fieldtwin.running.shadowing import limits_of
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.values import COMMAND, DATA
 from gateway.core.yaml_file import Key, YamlFile, load, validate
+from twin.mape.analyze import Limits
 from twin.mape.plan import Planner, Rule, RulePlanner
 from twin.mape.what_if import Question
 from twin.model import DigitalModel
 from twin.system import System
-from twin.system_schema import Strict
+from twin.system_schema import Strict, TagName
 
 Finding = Literal["agree", "mismatch", "outside", "inside", "bad", "good", "stale", "fresh", "unreadable"]
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 Expression = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
@@ -57,30 +63,50 @@ class RuleForm(Strict):
 class RulesForm(Strict):
     """A planner as rules; the first that fits decides."""
 
+    limits: dict[TagName, Range] = Field(
+        default={}, description="tag -> least and most, instead of the range in its profile"
+    )
     what_if: QuestionForm | None = Field(default=None, description="asked before each command that does not say more")
     rules: list[RuleForm] = Field(min_length=1, max_length=1000)
 
 
-def load_planner(source: str, system: System) -> tuple[Planner, Question | None]:
-    """``FILE.yaml``, or ``python: module:Class`` with the folder of the system file first; and what the file asks before each
-    command for which no rule says more. Raises `FileInvalid`."""
+class Plans(NamedTuple):
+    """A planner; what is asked of a prototype before each command for which no rule says more; the limits that it is told of."""
+
+    planner: Planner
+    question: Question | None = None
+    limits: Mapping[str, Limits] = MappingProxyType({})
+
+
+def load_planner(source: str, system: System) -> Plans:
+    """``FILE.yaml``, or ``python: module:Class``, beside the system file or here. Raises `FileInvalid`."""
     language, _, rest = source.partition(":")
     if language.strip() == "python":
-        return PythonPlanner(source, rest.strip(), system), None
+        return Plans(PythonPlanner(source, rest.strip(), system), limits=limits_of(system))
     file = load(Path(source))
     form = validate(file, RulesForm)
-    known = {f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()} | set(
-        system.plc.programs
-    )
+    tags = {f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()}
+    for name, (low, high) in form.limits.items():
+        if name not in tags:
+            raise file.error(("limits", name), f"{system.name} has no {name!r}", expected="a tag")
+        if not low <= high:
+            raise file.error(("limits", name), "limits", expected="the smallest, then the largest")
+    limits = limits_of(system) | {name: (low, high) for name, (low, high) in form.limits.items()}
     rules = []
     for i, rule in enumerate(form.rules):
-        if rule.of and rule.of not in known:
+        if rule.of and rule.of not in tags | set(system.plc.programs):
             raise file.error(("rules", i, "of"), f"{system.name} has no {rule.of!r}", expected="a tag or a program")
+        if rule.when in ("outside", "inside") and rule.of and rule.of not in limits:
+            raise file.error(
+                ("rules", i, "of"), f"{rule.of} has no limits that it could be {rule.when} of",
+                expected=f"`limits: {{{rule.of}: [LEAST, MOST]}}` in this file, or `range` in its profile",
+            )  # fmt: skip
         ask: Question | bool = rule.what_if is None
         if isinstance(rule.what_if, QuestionForm):
             ask = _question(file, ("rules", i, "what_if"), rule.what_if)
         rules.append(Rule(rule.when, rule.of, rule.period_s, ask))
-    return RulePlanner(rules), _question(file, ("what_if",), form.what_if) if form.what_if is not None else None
+    question = _question(file, ("what_if",), form.what_if) if form.what_if is not None else None
+    return Plans(RulePlanner(rules), question, limits)
 
 
 def questions_of(planner: Planner) -> list[Question]:
@@ -107,9 +133,9 @@ class PythonPlanner:
     def __init__(self, source: str, name: str, system: System) -> None:
         self._source = source
         module, _, kind = name.partition(":")
-        folder = str(system.path.parent)
-        if folder not in sys.path:
-            sys.path.insert(0, folder)
+        for folder in (str(Path.cwd()), str(system.path.parent)):
+            if folder not in sys.path:
+                sys.path.insert(0, folder)
         try:
             self._made: Any = getattr(importlib.import_module(module), kind)()
         except Exception as e:  # a user's module can raise anything; translated here, once

@@ -6,7 +6,7 @@ Where it was told to, it asks a prototype first, in a process beside it (`fieldt
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing, limits_of
@@ -18,6 +18,7 @@ from gateway.core.values import COMMAND
 from gateway.store.event import Event, Kind, KnowledgeStore
 from twin.instance import Instance
 from twin.knowledge import KnowledgeWriter
+from twin.mape.analyze import Limits
 from twin.mape.execute import Bounds
 from twin.mape.messages import Verdict
 from twin.mape.plan import OLD_MS, Planner
@@ -33,7 +34,8 @@ class Twinning(Shadowing):
     """As `Shadowing`, with a planner. `on_command` is told each command that is sent, `on_refusal` why one is not, here or
     at the plant.
 
-    With `asking` a prototype is asked `question` before each command, or what the planner says of it.
+    `limits` are held against values instead of those of the profiles. With `asking` a prototype is asked `question` before each
+    command, or what the planner says of it.
     """
 
     kind = "twin"
@@ -50,10 +52,12 @@ class Twinning(Shadowing):
         on_command: Callable[[COMMAND], None],
         on_refusal: Callable[[str], None] = lambda why: None,
         planner: Planner,
+        limits: Mapping[str, Limits] | None = None,
         asking: Asking | None = None,
         question: Question | None = None,
     ) -> None:
         self._planner = planner
+        self._limits = limits
         self._asking = asking
         self._question = question
         super().__init__(system, place, instance, store=store, on_verdict=on_verdict)
@@ -70,8 +74,8 @@ class Twinning(Shadowing):
         least_s, most_s = system.commands.period_s
         return DigitalTwin(
             self.receiving, self.clock, self._planner,
-            limits=limits_of(system), bounds=Bounds(least_s, most_s, system.commands.per_minute), stale_after_ms=STALE_AFTER_MS,
-            what_if=self._asking, question=self._question,
+            limits=limits_of(system) if self._limits is None else self._limits, stale_after_ms=STALE_AFTER_MS,
+            bounds=Bounds(least_s, most_s, system.commands.per_minute), what_if=self._asking, question=self._question,
         )  # fmt: skip
 
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
@@ -116,7 +120,10 @@ class Twinning(Shadowing):
             self._on_command(command)
         if self._way_back is not None and self._commands is not None:
             self._way_back.pump()
-            await self._commands.flush()
+            await self._commands.try_to_flush()  # what is not on record is not sent
+
+    def _store_trouble(self, writer: KnowledgeWriter) -> str:
+        return writer.trouble or (self._commands.trouble if self._commands is not None else "")
 
     def describe(self) -> dict[str, Any]:
         waiting = self._end.waiting if self._end is not None else 0

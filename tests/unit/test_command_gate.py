@@ -127,8 +127,12 @@ def test_a_system_file_says_what_may_be_commanded(tmp_path: Path) -> None:
 
 def test_rules_are_read_and_the_first_that_fits_decides(tmp_path: Path) -> None:
     rules = tmp_path / "rules.yaml"
-    rules.write_text("rules:\n  - {when: outside, of: ctd.pressure, period_s: 1}\n  - {when: stale, period_s: 0}\n")
-    (planner, _), model = load_planner(str(rules), load_system(str(OBSERVATORY))), DigitalModel()
+    rules.write_text(
+        "limits: {ctd.pressure: [0, 5.5]}\n"
+        "rules:\n  - {when: outside, of: ctd.pressure, period_s: 1}\n  - {when: stale, period_s: 0}\n"
+    )
+    (planner, _, limits), model = load_planner(str(rules), load_system(str(OBSERVATORY))), DigitalModel()
+    assert limits["ctd.pressure"] == (0.0, 5.5)
     command = planner.plan(verdict("outside", "ctd.pressure", "", 0), model)
     assert command is not None
     assert decode_period(command) == 1
@@ -143,6 +147,9 @@ def test_rules_are_read_and_the_first_that_fits_decides(tmp_path: Path) -> None:
         ("rules: [{when: ouside, period_s: 1}]", "ouside"),
         ("rules: [{when: outside, of: ctd.presure, period_s: 1}]", "observatory has no 'ctd.presure'"),
         ("rules: [{when: outside, period_s: 99999}]", "32767"),
+        ("rules: [{when: outside, of: ctd.pressure, period_s: 1}]", "no limits that it could be outside of"),
+        ("{limits: {ctd.presure: [0, 1]}, rules: [{when: outside, period_s: 1}]}", "observatory has no 'ctd.presure'"),
+        ("{limits: {ctd.pressure: [1, 0]}, rules: [{when: outside, period_s: 1}]}", "the smallest, then the largest"),
         ("rules: []", "rules"),
     ],
 )
@@ -173,7 +180,7 @@ def test_what_a_planner_in_python_raises_or_gives_is_a_refusal_and_the_twin_goes
         "        return [1 / 0 if data.finding == 'bad' else None, 5][self.given > 1]\n"
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    planner, _ = load_planner("python: failing_planner:Planner", load_system(str(OBSERVATORY)))
+    planner = load_planner("python: failing_planner:Planner", load_system(str(OBSERVATORY))).planner
     plan = Plan(DigitalModel(), planner, Hands())
     for finding in ("bad", "good"):
         plan.consumer.observe(verdict(finding, "ctd.pressure", "", NOW_MS))

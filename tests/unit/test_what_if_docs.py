@@ -37,7 +37,7 @@ def test_the_rules_of_the_page_on_twins(tmp_path: Path) -> None:
     system, asked = load_system("observatory"), []
     for number, text in enumerate(fences("yaml")):
         (tmp_path / f"{number}.yaml").write_text(text, encoding="utf-8")
-        planner, question = load_planner(str(tmp_path / f"{number}.yaml"), system)
+        planner, question, _ = load_planner(str(tmp_path / f"{number}.yaml"), system)
         assert isinstance(planner, RulePlanner)
         asked.append((len(planner.rules), question is not None, len(questions_of(planner))))
     assert asked == [(3, False, 0), (3, True, 1)]
@@ -48,7 +48,7 @@ def test_the_planner_of_the_page_on_twins(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "planner.py").write_text(text, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     system = replace(load_system("observatory"), path=tmp_path / "observatory.yaml")
-    planner, _ = load_planner("python: planner:Planner", system)
+    planner = load_planner("python: planner:Planner", system).planner
     assert isinstance(planner, PythonPlanner)
     model, commanded = DigitalModel(), []
     for finding, subject in (("inside", "a"), ("outside", "a"), ("outside", "b"), ("inside", "a"), ("inside", "b")):

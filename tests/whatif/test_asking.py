@@ -144,7 +144,7 @@ def test_rules_say_what_is_asked(tmp_path: Path) -> None:
         "  - {when: bad, period_s: 0, what_if: false}\n"
         "  - {when: inside, period_s: 60, what_if: {horizon: 6h, settle: 1min, finally: [\"relay.state == 'ACTIVE'\"]}}\n"
     )
-    planner, question = load_planner(str(file), OBSERVATORY)
+    planner, question, _ = load_planner(str(file), OBSERVATORY)
     assert question == Question(1800.0, ("ctd.pressure < 900",))
     own = Question(21_600.0, (), ("relay.state == 'ACTIVE'",), 60.0)
     assert questions_of(planner) == [own]

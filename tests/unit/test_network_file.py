@@ -32,7 +32,7 @@ def line_of(path: Path, text: str) -> int:
     return next(n for n, line in enumerate(path.read_text("utf-8").splitlines(), 1) if text in line)
 
 
-def test_the_shipped_network():
+def test_the_shipped_network() -> None:
     network = load_network(SHIPPED)
     assert list(network.members) == ["west", "middle", "east"]
     sea = network.medium(1)
@@ -48,7 +48,7 @@ def test_the_shipped_network():
         network.split("wets.ctd.pressure")
 
 
-def test_no_system_of_it_mentions_another():
+def test_no_system_of_it_mentions_another() -> None:
     """A plant's files are those of one observatory."""
     for name in ("west", "middle", "east"):
         keys = [
@@ -66,7 +66,7 @@ def test_no_system_of_it_mentions_another():
         ("water: {range_m: 4000", "wather: {range_m: 4000", "wather", "did you mean 'water'?"),
         ("range_m: 4000", "rang_m: 4000", "rang_m", "did you mean 'range_m'?"),
         ("loss: 0.05", "loss: 1.5", "loss", "less than 1"),
-        ("ocean_east.yaml", "ocean_eest.yaml", "ocean_eest", "did you mean 'ocean_east.yaml'?"),
+        ("ocean_east.yaml", "ocean_aest.yaml", "ocean_aest", "did you mean 'ocean_east.yaml'?"),
         ("east.yaml,   modem: modem", "east.yaml,   modem: moden", "moden", "did you mean 'modem'?"),
         ("modem: modem, at_m: [6000, 0, -510]", "modem: current, at_m: [6000, 0, -510]", "current", "is no modem of ocean_east"),
         ("at_m: [6000, 0, -510]", "at_m: [6000, 0]", "[6000, 0]", "not as many coordinates"),
@@ -77,7 +77,7 @@ def test_no_system_of_it_mentions_another():
         ("seed: 5", "seed: 5\nseed: 6", "seed: 6", "stands twice"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_is_named_at_its_spot(tmp_path: Path, old: str, new: str, at: str, said: str):
+def test_what_is_wrong_is_named_at_its_spot(tmp_path: Path, old: str, new: str, at: str, said: str) -> None:
     path = changed(tmp_path, old, new)
     with pytest.raises(FileInvalid) as caught:
         load_network(path, [SYSTEMS.parent])
@@ -86,7 +86,7 @@ def test_what_is_wrong_is_named_at_its_spot(tmp_path: Path, old: str, new: str, 
     assert caught.value.exit_code == 3
 
 
-def test_what_is_wrong_in_a_system_is_named_there(tmp_path: Path):
+def test_what_is_wrong_in_a_system_is_named_there(tmp_path: Path) -> None:
     for file in SYSTEMS.glob("ocean_*.yaml"):
         shutil.copy(file, tmp_path)
     shutil.copy(SYSTEMS / "adapt.st", tmp_path)
@@ -96,7 +96,7 @@ def test_what_is_wrong_in_a_system_is_named_there(tmp_path: Path):
         load_network(tmp_path / "ocean_network.yaml")
 
 
-def test_a_network_is_no_system_and_a_system_no_network():
+def test_a_network_is_no_system_and_a_system_no_network() -> None:
     found = network_file("ocean_network")
     assert found is not None
     assert found.resolve() == SHIPPED
@@ -119,7 +119,7 @@ def test_a_network_is_no_system_and_a_system_no_network():
         ("fault: {name: drop, bus: water, unit: 3}", "'unit' says nothing about the water"),
     ],
 )
-def test_scenarios_of_a_network_are_checked_before_they_run(tmp_path: Path, step: str, said: str):
+def test_scenarios_of_a_network_are_checked_before_they_run(tmp_path: Path, step: str, said: str) -> None:
     path = tmp_path / "x.scenario.yaml"
     path.write_text(f"scenario: x\nsystem: ocean_network\nsteps:\n  - {step}\n")
     with pytest.raises(FileInvalid) as caught:
@@ -128,7 +128,7 @@ def test_scenarios_of_a_network_are_checked_before_they_run(tmp_path: Path, step
     assert caught.value.line == 4
 
 
-def test_a_scenario_of_a_network_has_no_probes(tmp_path: Path):
+def test_a_scenario_of_a_network_has_no_probes(tmp_path: Path) -> None:
     path = tmp_path / "x.scenario.yaml"
     probes = "probes: {hmi: {serve: hmi, registers: {x: {at: 30001}}}}"
     path.write_text(f"scenario: x\nsystem: ocean_network\n{probes}\nsteps: [{{pause: 1s}}]\n")
@@ -136,7 +136,7 @@ def test_a_scenario_of_a_network_has_no_probes(tmp_path: Path):
         load_scenario(path)
 
 
-def test_faults_of_the_water_come_and_go():
+def test_faults_of_the_water_come_and_go() -> None:
     faults = WaterFaults(load_network(SHIPPED), 1)
     assert faults.inject({"id": "deaf", "name": "drop", "bus": "water", "device": "east"}) == "deaf"
     assert [faults.spoils(5, listener, b"x") for listener in (1, 2, 3, 4)] == [False, False, True, False]
@@ -158,7 +158,7 @@ def test_faults_of_the_water_come_and_go():
         (["--prototype", "--seed", "3"], "--seed and --trace go with --virtual"),
     ],
 )
-def test_what_a_network_is_not_asked_for(words: list[str], said: str):
+def test_what_a_network_is_not_asked_for(words: list[str], said: str) -> None:
     result = CliRunner().invoke(cli, ["run", "ocean_network", *words], standalone_mode=False)
     assert isinstance(result.exception, UsageError)
     assert said in str(result.exception)

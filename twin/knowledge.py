@@ -83,13 +83,17 @@ class KnowledgeWriter:
     async def run(self) -> None:
         """Write what comes, for good. A store that refuses is tried again; nothing that it took is written twice."""
         while True:
-            wait_ms = EVERY_MS
-            try:
-                await self.flush()
-            except Unreachable as e:
-                self._say(str(e))
-                wait_ms = RETRY_MS
+            wait_ms = EVERY_MS if await self.try_to_flush() else RETRY_MS
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + wait_ms * NS_PER_MS)
+
+    async def try_to_flush(self) -> bool:
+        """As `flush`; a store that refuses is told of, and False."""
+        try:
+            await self.flush()
+        except Unreachable as e:
+            self._say(str(e))
+            return False
+        return True
 
     async def flush(self) -> int:
         """Write everything that is queued; how many events. Raises `Unreachable`, and keeps what was not written."""
@@ -142,10 +146,9 @@ class KnowledgeWriter:
             self._say("")
 
     def _say(self, text: str) -> None:
-        kind = text.partition(":")[0]
-        if kind != self.trouble.partition(":")[0]:
+        if text.partition(":")[0] != self.trouble.partition(":")[0]:  # not again because there is a MiB less
+            self.trouble = text
             self._on_trouble(text)
-        self.trouble = text
 
 
 @dataclass

@@ -52,6 +52,8 @@ class ThreadEnd:
         self.links = 0
         self.trouble = ""
         """Why nothing gets through now, or what the other side complained of; empty when all is well."""
+        self._refused_by_store = ""
+        """Why our store did not do the last that was asked of it."""
         self._store = store
         self._carrier = carrier
         self._schema = schema
@@ -147,8 +149,9 @@ class ThreadEnd:
     async def _load(self, out: Outgoing, first: int, count: int) -> None:
         try:
             out.load(first, await self._store.read(out.origin, first, count))
+            self._refused_by_store = ""
         except Unreachable as e:
-            self.trouble = str(e)
+            self._refused_by_store = str(e)
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
 
     async def _wait(self, now_ns: int) -> None:
@@ -168,8 +171,9 @@ class ThreadEnd:
             self.silent = ""
             try:
                 await self._take(frame)
+                self._refused_by_store = ""
             except Unreachable as e:  # the store: what was not kept is not acknowledged, and comes again
-                self.trouble = str(e)
+                self._refused_by_store = str(e)
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
             self._news.set()
 
@@ -247,5 +251,5 @@ class ThreadEnd:
             "resent": self.out.resent if self.out is not None else 0,
             "duplicates": self.into.duplicates,
             "silent": self.silent,
-            "trouble": self.trouble or (self._link.trouble if self._link is not None else ""),
+            "trouble": self._refused_by_store or self.trouble or (self._link.trouble if self._link is not None else ""),
         }

@@ -151,10 +151,13 @@ class Shadowing:
 
     def _look_for_trouble(self, writer: KnowledgeWriter) -> None:
         assert self._end is not None
-        for where, text in (("thread", str(self._end.describe()["trouble"])), ("store", writer.trouble)):
+        for where, text in (("thread", str(self._end.describe()["trouble"])), ("store", self._store_trouble(writer))):
             if text != self._troubles.get(where, ""):
                 self._troubles[where] = text
                 self.on_trouble(where, text)
+
+    def _store_trouble(self, writer: KnowledgeWriter) -> str:
+        return writer.trouble
 
     def _step(self, writer: KnowledgeWriter) -> None:
         self.shadow.step()

@@ -165,3 +165,22 @@ def test_knowledge_replayed_is_what_was_last_known(tmp_path: Path) -> None:
         await store.aclose()
 
     run(main())
+
+
+def test_a_store_that_refuses_is_told_of_and_what_is_queued_stays(tmp_path: Path) -> None:
+    """A twin's commands: what is not on record is not sent, and the twin goes on."""
+
+    async def main() -> None:
+        store, origin = await moody(tmp_path)
+        said: list[str] = []
+        writer = KnowledgeWriter(store, origin, WallClock(), on_trouble=said.append)
+        writer.observe(value(1))
+        store.full = True
+        assert not await writer.try_to_flush()
+        assert (said, writer.queued) == (["no room for more knowledge"], 1)
+        store.full = False
+        assert await writer.try_to_flush()
+        assert (said[-1], writer.queued) == ("", 0)
+        await store.aclose()
+
+    run(main())

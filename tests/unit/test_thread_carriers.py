@@ -254,9 +254,10 @@ def test_a_store_that_refuses_is_not_acknowledged_to_and_catches_up(tmp_path: Pa
         shore.store.keep = refuse  # type: ignore[method-assign]
         await plant.log(*(value(n) for n in range(50)))
         await asyncio.sleep(20)
-        assert (plant.end.waiting, shore.end.trouble) == (50, "the disk is full")
+        assert (plant.end.waiting, shore.end.describe()["trouble"]) == (50, "the disk is full")
         shore.store.keep = keep  # type: ignore[method-assign]
         await until_equal(plant, shore, 120, loop)
+        assert shore.end.describe()["trouble"] == "", "and that it is over"
         await plant.kill()
         await shore.kill()
 

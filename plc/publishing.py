@@ -101,6 +101,9 @@ class OutputImage:
         self._reals = [o.index for o in self.outputs if layout.tags[o.index].kind is TagKind.REAL]
         self._by_tag = {o.tag: o for o in self.outputs}
         self._plain = [o for o in self.outputs if o.outbox is None]
+        self._by_owner: dict[str, list[Output]] = {}
+        for output in self.outputs:
+            self._by_owner.setdefault(output.owner, []).append(output)
         self._resumed = self._before(image)
         self._values: list[Scalar | None] = [None] * (len(self.outputs) + len(self.consumed))
         for n, tag in enumerate(self.consumed, len(self.outputs)):
@@ -159,32 +162,36 @@ class OutputImage:
 
     def collect(self, now_ns: int, scan: int, programs: Mapping[str, Seen]) -> None:
         """Take the values of `programs` as they are; changes are remembered with what the program saw."""
-        values = self._values
-        forced = self.forces.outputs
-        for output in self.outputs:
-            seen = programs.get(output.owner)
-            if seen is None:
-                continue
-            value = output.namespace[output.name]
+        for owner, outputs in self._by_owner.items():
+            seen = programs.get(owner)
+            if seen is not None:
+                self._collect(outputs, now_ns, scan, seen)
+
+    def _collect(self, outputs: list[Output], now_ns: int, scan: int, seen: Seen) -> None:
+        """Those of one program."""
+        values, forced, namespace = self._values, self.forces.outputs, outputs[0].namespace
+        for output in outputs:
+            value = namespace[output.name]
             if output.outbox is not None:
                 if value is not output.outbox:
                     raise ProgramFailed(output.owner, "an outbox was overwritten; call its send()", variable=output.tag)
                 continue
-            force = forced.get(output.tag)
+            force = forced.get(output.tag) if forced else None
             if force is not None:
                 output.program.put(output.name, force.value)
                 value = force.value
             before = values[output.index]
-            if value != before or value is None:
-                if value != value:  # not a number must not reach a plant
-                    value = None
-                if value != before:
-                    kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
-                    change = Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None)
-                    kept.append(change)
-                    if self.on_change is not None:
-                        self.on_change(change)
-                values[output.index] = value
+            if value is before or value == before:
+                continue
+            if value != value:  # not a number must not reach a plant
+                value = None
+            if value is not before:
+                kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
+                change = Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None)
+                kept.append(change)
+                if self.on_change is not None:
+                    self.on_change(change)
+            values[output.index] = value
 
     def publish(self, now_ns: int) -> None:
         """Publish what was collected. Raises `ProgramFailed` naming the program whose value no tag can hold."""

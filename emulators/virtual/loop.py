@@ -156,8 +156,9 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
         """A future that is done at `when_ns`: what a clock's sleep awaits, in fewer steps than by `call_at_ns`."""
         future: asyncio.Future[None] = asyncio.Future(loop=self)
-        self._sequence += 1
-        heappush(self._timers, (max(when_ns, self.now_ns), self._sequence, future))
+        self._sequence = sequence = self._sequence + 1
+        now_ns = self.now_ns
+        heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, sequence, future))
         return future
 
     def _timer_handle_cancelled(self, timer: asyncio.TimerHandle) -> None:
@@ -243,7 +244,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
             self._advance()
 
     def _advance(self) -> None:
-        timers = self._timers
+        timers, ready = self._timers, self._ready
         now_ns = None
         while timers and (now_ns is None or timers[0][0] == now_ns):
             when_ns, _, due = heappop(timers)
@@ -252,7 +253,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
                 if due._cancelled:
                     self._cancelled -= 1
                     continue
-                self._ready.append(due)
+                ready.append(due)
             elif due.done():
                 continue
             else:

@@ -134,6 +134,7 @@ class RegionWriter(_Region):
         super().__init__(memory, shape)
         self._copy = bytearray(CHECK.size + shape.body.size)
         self._body = memoryview(self._copy)[CHECK.size :]
+        self._packed: tuple[list[Scalar | None], bytes, bytes] | None = None
         self._last = {ring.spec.name: 0 for ring in shape.rings}
         self.counter = int(self._words[0])
         if self.counter:
@@ -161,10 +162,14 @@ class RegionWriter(_Region):
         `messages` maps a MESSAGE tag to its new messages as (source time in ns, payload), at most `depth` of them.
         `now_ns` is the heartbeat. Raises `NotEncodable` and publishes nothing when something does not fit.
         """
-        plain = [v.value for v in values]
-        marks = bytes([v.quality if v.value is not None else v.quality | _NO_VALUE for v in values])
         return self._publish(
-            plain, marks, bytes([v.reason for v in values]), [v.t_ns for v in values], now_ns, messages, flags
+            [v.value for v in values],
+            bytes([v.quality for v in values]),
+            bytes([v.reason for v in values]),
+            self._stamps([v.t_ns for v in values]),
+            now_ns,
+            messages,
+            flags,
         )
 
     def publish_mixed(
@@ -177,10 +182,8 @@ class RegionWriter(_Region):
         messages: Mapping[str, Sequence[tuple[int, bytes]]] | None = None,
     ) -> int:
         """`publish` for a writer that keeps columns, one entry a tag in the layout's order."""
-        marks = bytes(qualities)
-        if None in values:
-            marks = bytes([q if v is not None else q | _NO_VALUE for q, v in zip(qualities, values, strict=True)])
-        return self._publish(list(values), marks, bytes(reasons), times_ns, now_ns, messages, RegionFlag.NONE)
+        stamps = self._stamps(times_ns)
+        return self._publish(list(values), bytes(qualities), bytes(reasons), stamps, now_ns, messages, RegionFlag.NONE)
 
     def publish_columns(
         self,
@@ -204,16 +207,28 @@ class RegionWriter(_Region):
                 mixed[index] = other
             marks = bytes(mixed)
         if None in values:
-            marks = bytes([Quality.BAD | _NO_VALUE if v is None else m for v, m in zip(values, marks, strict=True)])
+            marks = bytes([Quality.BAD if v is None else m for v, m in zip(values, marks, strict=True)])
             reasons = bytes([Reason.NEVER_READ if v is None else reason for v in values])
-        return self._publish(list(values), marks, reasons, [now_ns] * count, now_ns, messages, flags)
+        stamps = now_ns.to_bytes(8, "little", signed=True) * count
+        return self._publish(list(values), marks, reasons, stamps, now_ns, messages, flags)
+
+    def _stamps(self, times_ns: Sequence[int]) -> bytes:
+        try:
+            return self.shape.times.pack(*times_ns)
+        except struct.error as e:
+            where = f"region {self.shape.layout.name}"
+            if len(times_ns) != self.shape.count:
+                raise Bug(
+                    "not one value a tag", expected=str(self.shape.count), got=str(len(times_ns)), where=where
+                ) from e
+            raise Bug("a time stamp that does not fit into 64 bits", where=where) from e
 
     def _publish(
         self,
         values: list[Scalar | None],
         marks: bytes,
         reasons: bytes,
-        times_ns: list[int],
+        stamps: bytes,
         now_ns: int,
         messages: Mapping[str, Sequence[tuple[int, bytes]]] | None,
         flags: RegionFlag,
@@ -229,15 +244,15 @@ class RegionWriter(_Region):
         last = self._check_messages(messages) if messages else self._last
         for ring in shape.rings:
             values[ring.index] = last[ring.spec.name]
-            if marks[ring.index] & _NO_VALUE:  # a sequence is always a value
-                marks = marks[: ring.index] + bytes([marks[ring.index] & ~_NO_VALUE]) + marks[ring.index + 1 :]
-        plain = [0 if v is None else v for v in values] if None in values else values
-        counter = self.counter + 1
-        try:
-            shape.body.pack_into(self._body, 0, counter, now_ns, flags, 0, *times_ns, *plain, marks, reasons)
-        except (struct.error, TypeError, OverflowError) as e:
-            raise self._not_encodable(values) from e
-        CHECK.pack_into(self._copy, 0, zlib.crc32(self._body))
+        columns = (values, marks, reasons)
+        if columns != self._packed:  # as a rule nothing changed: what was packed stands
+            self._packed = None
+            self._pack(values, marks, reasons)
+            self._packed = columns
+        body, counter = self._body, self.counter + 1
+        body[shape.times_at : shape.columns_at] = stamps
+        shape.head.pack_into(body, 0, counter, now_ns, flags)
+        CHECK.pack_into(self._copy, 0, zlib.crc32(body))
         if messages:
             self._write_messages(messages)
             self._last = last
@@ -246,6 +261,16 @@ class RegionWriter(_Region):
         self._words[0] = counter
         self.counter = counter
         return counter
+
+    def _pack(self, values: list[Scalar | None], marks: bytes, reasons: bytes) -> None:
+        plain = values
+        if None in values:
+            plain = [0 if v is None else v for v in values]
+            marks = bytes([m if v is not None else m | _NO_VALUE for m, v in zip(marks, values, strict=True)])
+        try:
+            self.shape.columns.pack_into(self._body, self.shape.columns_at, *plain, marks, reasons)
+        except (struct.error, TypeError, OverflowError) as e:
+            raise self._not_encodable(values) from e
 
     def _check_messages(self, messages: Mapping[str, Sequence[tuple[int, bytes]]]) -> dict[str, int]:
         last = dict(self._last)
@@ -281,7 +306,7 @@ class RegionWriter(_Region):
                 return NotEncodable(
                     spec.name, "a value that the tag cannot hold", expected=spec.kind.value, got=repr(value)
                 )
-        return Bug("a time stamp that does not fit into 64 bits", where=f"region {self.shape.layout.name}")
+        return Bug("values that do not fit their region", where=f"region {self.shape.layout.name}")
 
     def release(self) -> None:
         self._body.release()

@@ -32,6 +32,7 @@ from gateway.store.exchange_log import ExchangeLog
 
 PLC_GRACE_NS = 10 * NS_PER_S
 """How long a PLC may take to appear after the gateway's start before the outputs are made safe."""
+_NUMBERS = (int, float)
 
 
 @dataclass(frozen=True)
@@ -230,9 +231,9 @@ class Gateway:
             if not self.plc_alive:
                 self.outputs.release()
             for tag in self.config.outputs:
-                value = x.outputs[tag].value if tag in x.outputs else None
-                if isinstance(value, int | float):
-                    self.outputs.want(tag, value)
+                seen = x.outputs.get(tag)
+                if seen is not None and isinstance(seen.value, _NUMBERS):
+                    self.outputs.want(tag, seen.value)
         elif self.plc_alive or (not self.outputs.safe_active and now_ns - self._started_ns > PLC_GRACE_NS):
             self.plc_losses += 1
             self.outputs.make_safe("the PLC stopped" if x.plc_stopped else "the PLC's heartbeat was lost")

@@ -87,6 +87,8 @@ class ImageExchange:
             if tag not in self._depth:
                 source.queue.clear()
                 continue
+            if not source.queue:
+                continue
             room = self._depth[tag] - (self._writer.last_sequence(tag) - self._consumed.get(tag, 0))
             batch = [(now_ns, source.consume().data) for _ in range(min(max(room, 0), len(source.queue)))]
             if batch:

@@ -27,6 +27,8 @@ BUDGET = 2_500_000
 MOST_SCENARIOS = 2000
 MOST_CHECKS = 3000
 """Rows of the tables of checks, over all scenarios."""
+MOST_SAID = 2000
+"""Characters of what a check expected, and of what it got."""
 PER_SCENARIO = 2
 """Checks of one scenario that are drawn."""
 _ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.SKIPPED, Verdict.PASSED)
@@ -320,7 +322,7 @@ def _check_table(checks: Iterable[CheckResult]) -> Markup:
     for check in checks:
         at = f"{check.t_ns / SECOND_NS:.3f}" if check.t_ns is not None else "–"
         found = [
-            join([el("span", f"{name} ", cls="none"), _cut(said, 600), el("br")])
+            join([el("span", f"{name} ", cls="none"), _lines(_cut(said, MOST_SAID)), el("br")])
             for name, said in (("expected", check.expected), ("got", check.got), ("", check.reason)) if said
         ]  # fmt: skip
         rows.append(
@@ -331,6 +333,11 @@ def _check_table(checks: Iterable[CheckResult]) -> Markup:
         )  # fmt: skip
     head = [el("th", t) for t in ("", "no.", "check")] + [el("th", "at s", cls="num"), el("th", ""), el("th", "where")]
     return el("div", el("table", el("thead", el("tr", head)), el("tbody", rows)), cls="wide")
+
+
+def _lines(said: str) -> Markup | str:
+    """A text of several lines keeps them."""
+    return el("pre", said) if "\n" in said else said
 
 
 def _time(seconds: float) -> str:

@@ -13,7 +13,7 @@ _VERDICTS = {verdict.value: verdict for verdict in Verdict}
 
 
 def write_report(args: dict[str, Any]) -> None:
-    """Write ``file`` from ``tests`` (name, verdict, requirements, text, took_s, reproduce, file, line, case, role,
+    """Write ``file`` from ``tests`` (name, verdict, requirements, why, text, took_s, reproduce, file, line, case, role,
     danger), ``title``, ``reproduce``, ``versions``. Raises `UsageError` for a verdict that there is not."""
     results = []
     for test in args.get("tests") or ():
@@ -21,7 +21,8 @@ def write_report(args: dict[str, Any]) -> None:
         if verdict is None:
             raise UsageError("a verdict", expected=", ".join(_VERDICTS), got=repr(test.get("verdict")))
         text = str(test.get("text") or "")
-        checks = [CheckResult("1", text.splitlines()[-1] if text else "", verdict, got=text)] if text else []
+        why = str(test.get("why") or (text.splitlines() or [""])[-1])
+        checks = [CheckResult("1", why, verdict, got=text if text.strip() != why else "")] if text else []
         results.append(
             ScenarioResult(
                 str(test.get("name")),
@@ -30,7 +31,7 @@ def write_report(args: dict[str, Any]) -> None:
                 tuple(map(str, test.get("requirements") or ())),
                 file=str(test.get("file") or ""),
                 line=int(test.get("line") or 0),
-                reason=text if verdict is Verdict.SKIPPED else "",
+                reason=text if verdict is Verdict.SKIPPED else why,
                 reproduce=str(test.get("reproduce") or ""),
                 took_s=float(test.get("took_s") or 0.0),
                 case=str(test.get("case") or ""),

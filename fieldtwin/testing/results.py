@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -11,6 +12,9 @@ from typing import Any
 import pytest
 
 from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable, Runner, command_of
+
+_WORKER = re.compile(r"\[gw\d+\] ")
+"""The line that xdist puts before what a failure says."""
 
 
 class Results:
@@ -42,6 +46,7 @@ class Results:
             "name": report.nodeid,
             "verdict": said if said in ("inconclusive", "error") else ended,
             "requirements": [str(value) for name, value in properties if name == "requirement"],
+            "why": "" if report.passed else _why(report),
             "text": "" if report.passed else _reason(report),
             "took_s": report.duration,
             "reproduce": shlex.join(["pytest", report.nodeid]),
@@ -74,7 +79,17 @@ class Results:
             terminalreporter.write_sep("-", f"report: {where}")
 
 
+def _why(report: pytest.TestReport) -> str:
+    """In one line: a scenario's verdict and its reason, a test's error."""
+    crash = getattr(report.longrepr, "reprcrash", None)
+    said = str(crash.message) if crash is not None else _reason(report)
+    lines = [line for line in said.splitlines() if line.strip()]
+    errors = [line[1:].strip() for line in lines if line.startswith("E ")]
+    return next(iter(errors or lines), "")[:300]
+
+
 def _reason(report: pytest.TestReport) -> str:
     if report.skipped and isinstance(report.longrepr, tuple):
         return report.longrepr[2].removeprefix("Skipped: ")
-    return report.longreprtext[-4000:]
+    lines = report.longreprtext.splitlines()
+    return "\n".join(lines[1:] if lines and _WORKER.match(lines[0]) else lines)[-4000:]

@@ -186,10 +186,15 @@ def test_workers_of_xdist_do_not_meet(pytester: pytest.Pytester) -> None:
             other = emulate("ctd-reference", unit=n + 1)
             assert Path(device.path).resolve() != Path(other.path).resolve() != Path(prototype.buses["line1"].path).resolve()
             assert other.unit == n + 1
+
+        def test_no():
+            assert 1 == 2, "one and\\ntwo"
         """
     )
     result = pytester.runpytest_subprocess(*LOADED, "-n", "2", "--fieldtwin-html", "out.html")
-    result.assert_outcomes(passed=2)
+    result.assert_outcomes(passed=2, failed=1)
     page = (pytester.path / "out.html").read_text()
     assert page.count("test_it[1]") >= 1
     assert "REQ-9" in page
+    assert '<td class="long check">AssertionError: one and</td>' in page
+    assert "[gw" not in page

@@ -10,6 +10,7 @@ import click
 from rich.table import Table
 from rich.text import Text
 
+from fieldtwin.cli.files import write_text
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.commissioning.dump_file import load_dump
@@ -48,7 +49,7 @@ def command(dumps: tuple[Path, ...], out: Path | None, name: str, everything: bo
     draft = draft_profile(inference, loaded, name)
     checked(draft, out or Path("draft.yaml"))
     if out is not None:
-        out.write_text(draft, encoding="utf-8")
+        write_text(out, draft)
     if as_json:
         click.echo(json.dumps(_described(inference, out)))
         return 0

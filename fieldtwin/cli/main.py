@@ -5,10 +5,13 @@ Commands are imported when they are called, so that `--version` and completion c
 
 from __future__ import annotations
 
+import contextlib
+import difflib
+import errno
 import os
 import sys
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
@@ -78,6 +81,8 @@ SECTIONS = {
 """How the commands are shown; what stands in none comes last."""
 INTERRUPTED = 130
 BUG = 70
+HOST_REFUSES = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.EACCES, errno.EPERM)
+"""A disk that is full or broken, or a place that may not be written to: nobody's bug."""
 
 
 class LazyGroup(click.Group):
@@ -89,7 +94,9 @@ class LazyGroup(click.Group):
             result = super().invoke(ctx)
             sys.stdout.flush()
         except BrokenPipeError:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in (sys.stdout, sys.stderr):
+                os.dup2(nowhere, stream.fileno())
             return 0
         return result
 
@@ -102,6 +109,15 @@ class LazyGroup(click.Group):
         command = import_module(COMMANDS[cmd_name][0]).command
         assert isinstance(command, click.Command)
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Click names the options that were nearly meant, and no commands."""
+        near = difflib.get_close_matches(args[0], COMMANDS, n=1)
+        if args[0] not in COMMANDS and near:
+            raise click.UsageError(f"No such command {args[0]!r}. Did you mean {near[0]!r}?", ctx)
+        return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         shown = {name for names in SECTIONS.values() for name in names}
@@ -128,7 +144,7 @@ def cli() -> None:
 
 def main() -> None:
     """The console script. Never shows a traceback unless FIELDTWIN_TRACEBACK is set."""
-    from gateway.core.errors import FieldtwinError
+    from gateway.core.errors import FieldtwinError, FileInvalid
 
     try:
         code = cli.main(prog_name="fieldtwin", standalone_mode=False)
@@ -148,11 +164,27 @@ def main() -> None:
         click.echo(f"fieldtwin: {e}", err=True)
         theirs = getattr(e, "child_exit_code", 0) or getattr(e, "remote_exit_code", 0)
         sys.exit(theirs or e.exit_code)
+    except OSError as e:
+        if os.environ.get("FIELDTWIN_TRACEBACK") or e.errno not in HOST_REFUSES:
+            _bug(e)
+        click.echo(f"fieldtwin: {e.filename or 'a file, or what we print to'}: {e.strerror}", err=True)
+        _drop_what_is_unsaid()
+        sys.exit(FileInvalid.exit_code)
     except Exception as e:  # the last border: our bug, reported as such
-        if os.environ.get("FIELDTWIN_TRACEBACK"):
-            raise
-        click.echo(
-            f"fieldtwin: a bug of ours: {type(e).__name__}: {e} (run again with FIELDTWIN_TRACEBACK=1 and report it)",
-            err=True,
-        )
-        sys.exit(BUG)
+        _bug(e)
+
+
+def _bug(error: Exception) -> NoReturn:
+    if os.environ.get("FIELDTWIN_TRACEBACK"):
+        raise error
+    click.echo(
+        f"fieldtwin: a bug of ours: {type(error).__name__}: {error} (run again with FIELDTWIN_TRACEBACK=1 and report it)",
+        err=True,
+    )
+    sys.exit(BUG)
+
+
+def _drop_what_is_unsaid() -> None:
+    """Else Python tries again to print it when it ends, and makes that exit code 120."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

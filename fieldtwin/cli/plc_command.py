@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from fieldtwin.cli.files import write_text
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import talk
 from gateway.core.errors import UsageError
@@ -220,7 +221,7 @@ def diagram(system: str, program: str, output: Path | None, profiles: tuple[str,
     if output is None:
         sys.stdout.write(drawn)
     else:
-        output.write_text(drawn, encoding="utf-8")
+        write_text(output, drawn)
     return 0
 
 
@@ -255,7 +256,7 @@ def prove(
     result = look(proof, max_states)
     text = scenario(loaded, name, proof, result) if result.broken else ""
     if output is not None and text:
-        output.write_text(text, encoding="utf-8")
+        write_text(output, text)
     if as_json:
         _emit(
             {

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from fieldtwin.cli.files import write_text
 from fieldtwin.cli.live_view import print_summary
 from fieldtwin.cli.talk import data, talk
 from gateway.core.errors import UsageError
@@ -131,7 +132,7 @@ def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
     path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
     title = f"what failed with seed {failed.seed}"
     text = as_scenario(title, options.system, failed.seed, options.duration_s, faults, result.errors)
-    path.write_text(text, encoding="utf-8")
+    write_text(path, text)
     data.print(f"seed {failed.seed} takes {len(faults)} of its faults: {path}", soft_wrap=True, markup=False)
 
 

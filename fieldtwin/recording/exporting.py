@@ -162,7 +162,11 @@ def _write_table(out: Path, kind: str, columns: Sequence[Column], rows: Rows) ->
 
 def _write_csv(out: Path, columns: Sequence[Column], rows: Rows) -> int:
     count = 0
-    with out.open("w", encoding="utf-8", newline="") as file:
+    try:
+        file = out.open("w", encoding="utf-8", newline="")
+    except OSError as e:
+        raise FileInvalid(f"cannot write the table: {e.strerror or e}", path=str(out)) from e
+    with file:
         writer = csv.writer(file)
         writer.writerow(c.name for c in columns)
         for row in rows:

@@ -26,7 +26,7 @@ from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner, refusal
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.scenarios.trace import Trace, open_sink
 from gateway.core.errors import FieldtwinError
 from gateway.wallclock import WallClock
 from twin.instance import Instance, runtime_root
@@ -63,7 +63,7 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
         refused = f"a network is a prototype, and the target {target.name} is none: each of its systems is a plant"
     elif scenario.network is not None and target.can:
         refused = "--can is of one system, and this is a network"
-    sink = trace_file.open("wb") if trace_file is not None else None
+    sink = open_sink(trace_file) if trace_file is not None else None
     trace = Trace(sink=sink)
     trace.listeners.append(collector.feed)
     try:

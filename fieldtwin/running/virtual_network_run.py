@@ -19,7 +19,7 @@ from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.shore import Scripted
 from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.running.virtual_run import PIECE_S, VirtualOptions, VirtualRun
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.scenarios.trace import Trace, open_sink
 from gateway.core.errors import FieldtwinError
 from twin.network import Network
 
@@ -68,7 +68,7 @@ class VirtualNetworkRun:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
             sink: BinaryIO | None = None
             if self.options.trace is not None:
-                sink = stack.enter_context(self.options.trace.open("wb"))
+                sink = stack.enter_context(open_sink(self.options.trace))
             self.trace = Trace(TRACE_KEPT, sink)
             stack.callback(loop.close)
             with sealed():

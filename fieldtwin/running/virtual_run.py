@@ -24,7 +24,7 @@ from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.virtual_bench import VirtualBench
-from fieldtwin.scenarios.trace import Event, Kind, Trace
+from fieldtwin.scenarios.trace import Event, Kind, Trace, open_sink
 from gateway.core.clock import NS_PER_MS
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError
@@ -128,7 +128,7 @@ class VirtualRun:
             run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
             sink: BinaryIO | None = None
             if self.options.trace is not None:
-                sink = stack.enter_context(self.options.trace.open("wb"))
+                sink = stack.enter_context(open_sink(self.options.trace))
             self.trace = Trace(TRACE_KEPT, sink)
             stack.callback(loop.close)
             with sealed():

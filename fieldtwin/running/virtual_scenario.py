@@ -17,7 +17,7 @@ from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner
-from fieldtwin.scenarios.trace import Trace
+from fieldtwin.scenarios.trace import Trace, open_sink
 from gateway.core.errors import FieldtwinError
 from gateway.wallclock import WallClock
 from twin.prototype_file import load_prototype
@@ -34,7 +34,7 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
     error = ""
     result: ScenarioResult | None = None
     with tempfile.TemporaryDirectory(prefix="ft-scenario-") as folder:
-        sink = trace_file.open("wb") if trace_file is not None else None
+        sink = open_sink(trace_file) if trace_file is not None else None
         trace = Trace(sink=sink)
         trace.listeners.append(collector.feed)
 

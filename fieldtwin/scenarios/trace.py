@@ -10,9 +10,12 @@ import hashlib
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
+from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
+
+from gateway.core.errors import FileInvalid
 
 CAPACITY = 200_000
 _HASHED_AT_ONCE = 256
@@ -93,3 +96,11 @@ class Trace:
 def read_trace(lines: list[bytes]) -> list[Event]:
     """The events that a sink took."""
     return [Event(t, Kind(kind), where, data) for t, kind, where, data in map(msgspec.json.decode, lines)]
+
+
+def open_sink(path: Path) -> BinaryIO:
+    """The file that a trace goes to; an older one is overwritten. Raises `FileInvalid` where it cannot be written."""
+    try:
+        return path.open("wb")
+    except OSError as e:
+        raise FileInvalid(f"cannot write the trace: {e.strerror or e}", path=str(path)) from e

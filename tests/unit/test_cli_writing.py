@@ -1,0 +1,50 @@
+"""What a full disk, a folder that is not there and a closed pipe come to: one line that names the place, never our bug."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from fieldtwin.cli.main import cli
+
+ROOT = Path(__file__).parents[2]
+
+
+def _run(*words: str, to: str | None = None) -> tuple[int, str]:
+    with open(to or os.devnull, "wb") as out:
+        ended = subprocess.run(
+            [sys.executable, "-m", "fieldtwin", *words],
+            stdin=subprocess.DEVNULL,
+            stdout=out,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+    return ended.returncode, ended.stderr
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
+def test_a_full_disk_is_not_our_bug() -> None:
+    code, said = _run("schema", "system", to="/dev/full")
+    assert code == 3
+    assert said == "fieldtwin: a file, or what we print to: No space left on device\n"
+
+
+def test_a_trace_that_cannot_be_written(tmp_path: Path) -> None:
+    place = tmp_path / "nowhere" / "run.jsonl"
+    options = ["--prototype", "--virtual", "--for", "1s", "--trace", str(place)]
+    code, said = _run("run", "observatory", *options)
+    assert code == 3
+    assert said.splitlines()[-1].startswith(f"fieldtwin: {place}: cannot write the trace: ")
+
+
+def test_a_command_that_was_nearly_meant() -> None:
+    result = CliRunner().invoke(cli, ["emualte", "observatory"])
+    assert result.exit_code == 2
+    assert "No such command 'emualte'. Did you mean 'emulate'?" in result.output

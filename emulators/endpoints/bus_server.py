@@ -30,7 +30,7 @@ from gateway.core.can_error import overrun_frame
 from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, FieldtwinError, Unreachable, UsageError
+from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, FieldtwinError, Unreachable, UsageError, os_reason
 
 HELLO_TIMEOUT_S = 5.0
 CLOSE_TIMEOUT_S = 1.0
@@ -83,7 +83,7 @@ class SoftBusServer:
         except OSError as e:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("the port of the software CAN bus is in use", where=str(endpoint)) from e
-            raise Unreachable(f"cannot listen: {e.strerror or e}", where=str(endpoint)) from e
+            raise Unreachable(f"cannot listen: {os_reason(e)}", where=str(endpoint)) from e
         for listening in server.sockets:  # whatever it accepts inherits this
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         bus._server = server

@@ -169,7 +169,7 @@ class TcpDoor:
         except OSError as e:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("another program listens here", where=where) from e
-            raise Unreachable(f"cannot listen: {e.strerror or e}", where=where) from e
+            raise Unreachable(f"cannot listen: {os_reason(e)}", where=where) from e
         door.bound = endpoint.with_address(endpoint.host, door._server.sockets[0].getsockname()[1])
         return door
 

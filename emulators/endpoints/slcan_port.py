@@ -16,7 +16,7 @@ from emulators.endpoints.slcan_protocol import SlcanSession
 from gateway.core.can_error import overrun_frame
 from gateway.core.canframe import CanFrame
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable
+from gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable, os_reason
 
 MAX_OUTBOUND_BYTES = 64 * 1024
 """What waits for a client that reads slowly; beyond that it loses frames, alone and counted."""
@@ -47,7 +47,7 @@ class SlcanPort:
         except OSError as e:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("the slcan port is in use", where=str(endpoint)) from e
-            raise Unreachable(f"cannot listen: {e.strerror or e}", where=str(endpoint)) from e
+            raise Unreachable(f"cannot listen: {os_reason(e)}", where=str(endpoint)) from e
         for listening in server.sockets:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BUFFER_BYTES)
         port._server = server

@@ -15,7 +15,7 @@ from typing import Any, cast
 from emulators.endpoints.tls_server import client_role, make_context
 from gateway.core.connection import ByteConnection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, os_reason
 
 MAX_CLIENTS = 32
 MAX_PENDING_CHUNKS = 16
@@ -208,7 +208,7 @@ class SocketListener:
         except OSError as e:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("the port is in use", where=str(endpoint), hint="another instance?") from e
-            raise Unreachable(f"cannot listen: {e.strerror or e}", where=str(endpoint)) from e
+            raise Unreachable(f"cannot listen: {os_reason(e)}", where=str(endpoint)) from e
         return listener
 
     @property

@@ -13,7 +13,7 @@ from typing import cast
 
 from gateway.core.connection import closed_here
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable
+from gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, os_reason
 
 MAX_PENDING = 256
 """Datagrams that wait to be read."""
@@ -48,7 +48,7 @@ class UdpEnd(asyncio.DatagramProtocol):
         except OSError as e:
             if e.errno == errno.EADDRINUSE:
                 raise EndpointBusy("the port is in use", where=str(endpoint), hint="another instance?") from e
-            raise Unreachable(f"cannot listen: {e.strerror or e}", where=str(endpoint)) from e
+            raise Unreachable(f"cannot listen: {os_reason(e)}", where=str(endpoint)) from e
         return end
 
     @property

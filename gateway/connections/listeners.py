@@ -17,7 +17,7 @@ from gateway.connections.tls_listen import HANDSHAKE_LIMIT_S, server_context
 from gateway.connections.tls_role import role_in
 from gateway.core.connection import Client
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
+from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError, os_reason
 
 MAX_CLIENTS = 32
 BACKLOG = 64
@@ -249,4 +249,4 @@ def _cannot_listen(endpoint: Endpoint, error: OSError) -> Unreachable:
             "ports below 1024 are for root: setcap cap_net_bind_service, or sysctl net.ipv4.ip_unprivileged_port_start"
         )
         return Unreachable("no permission to listen on this port", where=where, hint=hint)
-    return Unreachable(f"cannot listen: {error.strerror or error}", where=where)
+    return Unreachable(f"cannot listen: {os_reason(error)}", where=where)

@@ -60,7 +60,7 @@ class ControlServer:
                 path.unlink()
             server = await asyncio.start_unix_server(self._serve_unix, path=str(path), limit=MAX_LINE)
         except OSError as e:
-            raise Unreachable(f"cannot listen for control: {e.strerror or e}", where=str(path)) from e
+            raise Unreachable(f"cannot listen for control: {os_reason(e)}", where=str(path)) from e
         path.chmod(0o600)
         self._sockets.append(path)
         self._servers.append(server)
@@ -72,7 +72,7 @@ class ControlServer:
         try:
             server = await asyncio.start_server(self._serve_tcp, host, port, limit=MAX_LINE)
         except OSError as e:
-            raise Unreachable(f"cannot listen for control: {e.strerror or e}", where=f"{host}:{port}") from e
+            raise Unreachable(f"cannot listen for control: {os_reason(e)}", where=f"{host}:{port}") from e
         self._servers.append(server)
         return int(server.sockets[0].getsockname()[1])
 

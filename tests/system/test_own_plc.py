@@ -12,6 +12,11 @@ from typing import Any
 import pytest
 from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
+from fieldtwin.running.control_bench import ControlBench, Where
+from fieldtwin.scenarios.trace import Trace
+from gateway.core.errors import UsageError
+from twin.system import load_system
+
 HERE = CHECKOUT / "examples" / "own-plc"
 MODBUS_H = Path("/usr/include/modbus/modbus.h")
 
@@ -81,6 +86,12 @@ def test_what_is_asked_of_our_own_controller_wants_one(tmp_path: Path) -> None:
     ended = run_to_end(tmp_path, "test", str(scenario), "--target", "compose", "--field", "127.0.0.1:1")
     assert ended.process.returncode == 1
     assert "gateway.sock" in ended.out
+
+
+def test_nobody_says_of_another_s_scans_that_they_were_in_time(tmp_path: Path) -> None:
+    bench = ControlBench(load_system("observatory"), Where(tmp_path), Trace(), target="compose", names=[])
+    with pytest.raises(UsageError, match="somebody else's controller"):
+        bench.late_ms()
 
 
 def test_the_foreign_controller_s_text_is_our_program_s() -> None:

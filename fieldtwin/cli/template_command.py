@@ -150,7 +150,8 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
     if not may_run:
         talk.print("its control logic was not looked at")
     if not same:
-        talk.print(f"it was packed by other software: {manifest.software.version}; here is {__version__}")
+        there = f"{manifest.software.version}, modules {manifest.software.modules_sha256[:12]}"
+        talk.print(f"it was packed by other software: {there}; here is {__version__}, modules {modules_hash()[:12]}")
     return 0
 
 
@@ -195,7 +196,7 @@ def _print_files(manifest: Manifest) -> None:
     data.print(f"{manifest.system}: template {manifest.id[:16]}, fieldtwin {manifest.software.version}", soft_wrap=True)
     table = Table(box=box.SIMPLE, pad_edge=False)
     for name in ("kind", "file", "bytes", "SHA-256"):
-        table.add_column(name, justify="right" if name == "bytes" else "left", no_wrap=name != "file")
+        table.add_column(name, justify="right" if name == "bytes" else "left", no_wrap=name != "file", overflow="fold")
     for file in manifest.files:
         table.add_row(file.document or file.kind, escape(file.path), f"{file.bytes:,}", file.sha256[:12])
     data.print(table)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import can
 import pytest
 from procs import free_port
 
@@ -20,7 +19,6 @@ steps:
   - set: {tag: inclinometer.slope_long, value: 4.5}
   - wait: {until: "inclinometer.slope_long == 4.5", within: 60s}
 """
-TPDO1 = 0x185
 
 
 def judged(folder: Path, where: str) -> ScenarioResult:
@@ -33,7 +31,7 @@ def judged(folder: Path, where: str) -> ScenarioResult:
 def test_the_bus_is_where_it_is_said_to_be(tmp_path: Path) -> None:
     where = f"fieldtwin/127.0.0.1:{free_port()}"
     result = judged(tmp_path, where)
-    assert result.verdict is Verdict.PASSED, result
+    assert result.verdict is Verdict.PASSED, (result.reason, result.checks)
     assert f"--can {where}" in result.reproduce
 
 
@@ -49,14 +47,3 @@ def test_a_network_has_no_bus_of_that_name(tmp_path: Path) -> None:
     result = run_scenario(load_scenario(path), Target("local", can="socketcan/vcan0"))
     assert result.verdict is Verdict.SKIPPED
     assert "--can" in result.reason
-
-
-@pytest.mark.socketcan
-@pytest.mark.slow
-@pytest.mark.timeout(300)
-def test_on_a_kernels_can_the_nodes_frames_are_seen_by_anybody(tmp_path: Path) -> None:
-    with can.Bus(interface="socketcan", channel="vcan0") as bus:
-        result = judged(tmp_path, "socketcan/vcan0")
-        assert result.verdict is Verdict.PASSED, result
-        seen = {message.arbitration_id for message in iter(lambda: bus.recv(0), None)}
-    assert TPDO1 in seen

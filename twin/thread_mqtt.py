@@ -71,7 +71,9 @@ def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
     if heard:
         hint = "does it want mqtts://, or a certificate of ours (cert= and key=)?"
         return Unreachable(f"the broker ends the connection: {heard}", where=where, hint=hint)
-    return Unreachable(f"the broker is not there: {e}", where=where)
+    why = cause.strerror if isinstance(cause, OSError) and cause.strerror else str(e)
+    hint = "TLS is asked for: does it speak that on this port?" if isinstance(cause, ConnectionResetError) else ""
+    return Unreachable(f"the broker is not there: {why}", where=where, hint=hint)
 
 
 @dataclass(frozen=True, slots=True)

@@ -292,6 +292,28 @@ def test_a_plant_that_says_local_takes_no_command_and_says_so(tmp_path: Path, lo
     run(main())
 
 
+def test_a_mailbox_that_is_lent_to_a_thread_is_neither_read_nor_written(tmp_path: Path) -> None:
+    """What comes over it is no command; what the control logic sends is not put there; what the thread commands is taken."""
+
+    async def main() -> None:
+        modems = pair()
+        audit = AuditLog(tmp_path / "audit.jsonl", WallClock())
+        async with station(modems, "far") as far, station(modems) as near:
+            pump = MailboxPump(near.driver, near.bus, audit, allow_writes=True, remote=True, lent=True)
+            far.driver.consumer.observe(COMMAND(b"\0\5"))
+            await far.do("send")
+            await near.do("read")
+            pump.offer([b"a response"])
+            pump.tick(1, all_consumed=True)
+            assert (len(pump.inbox.queue), pump.untaken) == (0, 0)
+            assert near.driver.to_acknowledge
+            assert pump.command(b"\0\7", "twin:1")
+            assert [item.data for item in pump.inbox.queue] == [b"\0\7"]
+        audit.close()
+
+    run(main())
+
+
 # -- the link between the modems ------------------------------------------------------------------------------------------
 
 payloads = st.lists(st.binary(min_size=1, max_size=64), max_size=30)

@@ -144,6 +144,15 @@ def test_a_twin_that_is_refused_ends_and_a_plant_that_is_refused_waits(
     run(main())
 
 
+def test_a_broker_without_tls_is_asked_about(tmp_path: Path, pki: Pki) -> None:
+    async def main() -> None:
+        with broker(tmp_path) as here:
+            with pytest.raises(Unreachable, match="does it speak that on this port"):
+                await (await plant(url(here, pki, "plant"))).open()
+
+    run(main())
+
+
 def test_a_topic_that_we_may_not_hear_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     """mosquitto grants every subscription and keeps back what comes; other brokers answer SUBACK with 0x80 (MQTT 3.9.3)."""
 

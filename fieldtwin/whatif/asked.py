@@ -6,6 +6,7 @@ speaks against the command. With ``"only_check": true`` nothing is run; what is 
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from fieldtwin.whatif.outcome import Outcome
 from fieldtwin.whatif.plan import Plan
 from fieldtwin.whatif.state import KnownState
 from gateway.core.errors import FieldtwinError
+
+NICE = 5
+"""Whoever runs beside it, a plant or its twin, goes first."""
 
 
 def objection(asked: Asked) -> str:
@@ -54,6 +58,8 @@ def told(outcome: Outcome) -> str:
 
 
 def main() -> int:
+    if hasattr(os, "nice"):
+        os.nice(NICE)
     asked = msgspec.json.decode(sys.stdin.buffer.read(), type=Asked)
     found = objection(asked)
     sys.stdout.buffer.write(msgspec.json.encode({"objection": found}) + b"\n")

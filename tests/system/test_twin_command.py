@@ -43,3 +43,30 @@ def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_pat
     audit = [json.loads(line) for line in (root / "observatory" / "audit.jsonl").read_text().splitlines()]
     assert [a["payload"] for a in audit if a["action"] == "command"] == ["0001", "0003"]
     no_tracebacks(root)
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_a_twin_that_asks_first_sends_what_its_prototype_allows_and_nothing_else(tmp_path: Path) -> None:
+    root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
+    question = ("--what-if", "20s", "--finally", "relay.state == 'ACTIVE'")
+    with fieldtwin(
+        root, "run", "observatory", "--prototype", "--commands", "none", "--for", "90s", "--thread", place
+    ) as run:
+        plant = run.control("observatory", "thread")
+        commands = ("--command", "2", "--command", "0")
+        with fieldtwin(
+            root, "twin", "observatory", "--from", place, "--for", "90s", *question, *commands, name="twin"
+        ) as twin:
+            wait_for(lambda: "refused    period 0 s" in twin.err, 60, f"both were asked about; {twin.err}")
+            assert plant("get")["commands_taken"] == 1
+            twin.signal(2)
+            assert twin.wait(20) == 0, twin.err
+        run.signal(2)
+        run.wait(20)
+    assert "command    period 2 s" in twin.err
+    assert "a prototype was asked: \"relay.state == 'ACTIVE'\" does not hold 20 s from now" in twin.err
+    assert "0 planned, 2 asked of a prototype, 1 sent, 1 refused" in twin.err
+    audit = [json.loads(line) for line in (root / "observatory" / "audit.jsonl").read_text().splitlines()]
+    assert [a["payload"] for a in audit if a["action"] == "command"] == ["0002"]
+    no_tracebacks(root)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from pathlib import Path
 
 import pytest
@@ -175,18 +174,3 @@ def test_what_is_wrong_with_a_question_is_said_with_its_line(tmp_path: Path, tex
     with pytest.raises(FileInvalid, match=why) as caught:
         load_planner(str(file), OBSERVATORY)
     assert ":2" in str(caught.value)
-
-
-def test_an_answer_is_one_line_of_json(
-    capfdbinary: pytest.CaptureFixture[bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import io
-    import sys
-
-    import msgspec
-
-    from fieldtwin.whatif.asked import main
-
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(msgspec.json.encode(asked(2, only_check=True)))))
-    assert main() == 0
-    assert json.loads(capfdbinary.readouterr().out) == {"objection": ""}

@@ -144,8 +144,10 @@ def cli() -> None:
 
 def main() -> None:
     """The console script. Never shows a traceback unless FIELDTWIN_TRACEBACK is set."""
+    from fieldtwin.cli.plain_letters import write_plainly
     from gateway.core.errors import FieldtwinError, FileInvalid
 
+    write_plainly()
     try:
         code = cli.main(prog_name="fieldtwin", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)

@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 from rich.console import Console
 
-talk = Console(stderr=True, highlight=False)
-data = Console(highlight=False)
+
+class _Console(Console):
+    def on_broken_pipe(self) -> NoReturn:
+        """rich ends the program with exit code 1. Who reads with `head` has what it wanted: see `LazyGroup.invoke`."""
+        self.quiet = True
+        raise BrokenPipeError
+
+
+talk = _Console(stderr=True, highlight=False)
+data = _Console(highlight=False)

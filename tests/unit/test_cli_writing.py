@@ -48,3 +48,26 @@ def test_a_command_that_was_nearly_meant() -> None:
     result = CliRunner().invoke(cli, ["emualte", "observatory"])
     assert result.exit_code == 2
     assert "No such command 'emualte'. Did you mean 'emulate'?" in result.output
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_locale_without_arrows(encoding: str) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--virtual", "--for", "4s"],
+        capture_output=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": encoding},
+    )  # fmt: skip
+    said = ended.stdout.decode(encoding) + ended.stderr.decode(encoding)
+    assert ended.returncode == 0, said
+    assert "STANDBY -> " in said
+
+
+def test_a_reader_that_leaves_a_table_early_is_no_error() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fieldtwin", "faults"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert process.stdout is not None
+    process.stdout.close()
+    process.stdout = None
+    _, said = process.communicate(timeout=20)
+    assert (process.returncode, said) == (0, b"")

@@ -35,6 +35,12 @@ def _frame(kind: bytes, content: bytes = b"") -> bytes:
     return kind + len(content).to_bytes(2) + content
 
 
+async def _close(writer: asyncio.StreamWriter) -> None:
+    writer.close()
+    with suppress(OSError):
+        await writer.wait_closed()
+
+
 class AcousticServer:
     """``await server.open(path)``, then ``await server.run()`` beside it. One connection a modem."""
 
@@ -46,6 +52,7 @@ class AcousticServer:
         self._news = asyncio.Event()
         medium.on_say = self._news.set
         self._wanted: dict[str, deque[bytes]] = {}
+        self._serving: list[asyncio.Task[None]] = []
 
     async def open(self, path: Path) -> None:
         """Raises `EndpointBusy`."""
@@ -81,7 +88,9 @@ class AcousticServer:
                 await self._news.wait()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        name = ""
+        name, me = "", asyncio.current_task()
+        assert me is not None
+        self._serving.append(me)
         try:
             kind, content = await _read(reader)
             name = content.decode(errors="replace")
@@ -99,13 +108,16 @@ class AcousticServer:
         finally:
             if self._writers.get(name) is writer:
                 del self._writers[name]
-            writer.close()
+            await _close(writer)
+            self._serving.remove(me)
 
     async def aclose(self) -> None:
         if self._server is not None:
             self._server.close()
-        for writer in list(self._writers.values()):
-            writer.close()
+        for task in (serving := list(self._serving)):
+            task.cancel()
+        if serving:
+            await asyncio.wait(serving)
         if self._server is not None:
             await self._server.wait_closed()
 
@@ -127,9 +139,13 @@ class AcousticEnd:
         """The end of the modem `name`. Raises `Unreachable`."""
         try:
             reader, writer = await asyncio.open_unix_connection(path)
+        except OSError as e:
+            raise Unreachable("there is no water", where=str(path)) from e
+        try:
             writer.write(_frame(b"M", name.encode()))
             await _read(reader)
-        except (OSError, asyncio.IncompleteReadError) as e:
+        except (OSError, asyncio.IncompleteReadError, Desync) as e:
+            await _close(writer)
             raise Unreachable(f"{name} is not in the water", where=str(path)) from e
         return cls(reader, writer)
 
@@ -159,6 +175,4 @@ class AcousticEnd:
 
     async def aclose(self) -> None:
         await self._nursery.__aexit__(None, None, None)
-        self._writer.close()
-        with suppress(OSError):
-            await self._writer.wait_closed()
+        await _close(self._writer)

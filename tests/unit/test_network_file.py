@@ -66,7 +66,7 @@ def test_no_system_of_it_mentions_another() -> None:
         ("water: {range_m: 4000", "wather: {range_m: 4000", "wather", "did you mean 'water'?"),
         ("range_m: 4000", "rang_m: 4000", "rang_m", "did you mean 'range_m'?"),
         ("loss: 0.05", "loss: 1.5", "loss", "less than 1"),
-        ("ocean_east.yaml", "ocean_aest.yaml", "ocean_aest", "did you mean 'ocean_east.yaml'?"),
+        ("ocean_middle.yaml", "ocean_midle.yaml", "ocean_midle", "did you mean 'ocean_middle.yaml'?"),
         ("east.yaml,   modem: modem", "east.yaml,   modem: moden", "moden", "did you mean 'modem'?"),
         ("modem: modem, at_m: [6000, 0, -510]", "modem: current, at_m: [6000, 0, -510]", "current", "is no modem of ocean_east"),
         ("at_m: [6000, 0, -510]", "at_m: [6000, 0]", "[6000, 0]", "not as many coordinates"),

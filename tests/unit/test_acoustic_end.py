@@ -1,0 +1,81 @@
+"""The water between processes: served on a socket, with a modem's end of it in another process, here in this one."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from support import eventually, run
+
+from emulators.endpoints.acoustic_end import ROOM, AcousticEnd, AcousticServer
+from emulators.wires.acoustic import AcousticMedium, Water
+from gateway.core.errors import Unreachable
+from gateway.core.nursery import Nursery
+from gateway.wallclock import WallClock
+
+PLACES = {"a": (0.0, 0.0), "b": (15.0, 0.0)}
+WATER = Water(range_m=100.0, bytes_per_s=10_000.0)
+
+
+def test_what_one_says_the_other_hears(tmp_path: Path) -> None:
+    async def main() -> None:
+        clock = WallClock()
+        medium = AcousticMedium(WATER, PLACES, 1)
+        server = AcousticServer(medium, clock)
+        await server.open(tmp_path / "w")
+        async with Nursery() as nursery:
+            nursery.start(server.run(), "water")
+            a, b = await AcousticEnd.open(tmp_path / "w", "a"), await AcousticEnd.open(tmp_path / "w", "b")
+            said = [bytes([n]) * 12 for n in range(20)]
+            for payload in said:
+                await eventually(lambda payload=payload: a.submit(payload, 0))
+            heard: list[bytes] = []
+
+            def all_heard() -> bool:
+                while (payload := b.arrived(0)) is not None:
+                    heard.append(payload)
+                return len(heard) == len(said)
+
+            await eventually(all_heard)
+            assert heard == said
+            assert (a.sent, b.delivered) == (20, 20)
+            medium.say("b", b"ahoy", clock.monotonic_ns())  # somebody in this process: the server wakes up for it
+            await eventually(lambda: a.arrived(0) == b"ahoy")
+            await server.aclose()
+            await eventually(lambda: not a.submit(b"x", 0))  # nobody takes it any more; nothing breaks
+            assert a.arrived(0) is None
+            await a.aclose()
+            await b.aclose()
+
+    run(main())
+
+
+def test_a_modem_hands_over_so_much_and_no_more(tmp_path: Path) -> None:
+    async def main() -> None:
+        server = AcousticServer(AcousticMedium(WATER, PLACES, 1), WallClock())
+        await server.open(tmp_path / "w")  # and nobody runs it
+        a = await AcousticEnd.open(tmp_path / "w", "a")
+        assert [a.submit(b"x", 0) for _ in range(ROOM + 1)] == [True] * ROOM + [False]
+        await a.aclose()
+        await server.aclose()
+
+    run(main())
+
+
+@pytest.mark.parametrize("first", [b"M\x00\x01z", b"S\x00\x01x", b"M\xff\xff"])
+def test_who_is_not_in_the_water_is_let_go(tmp_path: Path, first: bytes) -> None:
+    async def main() -> None:
+        server = AcousticServer(AcousticMedium(WATER, PLACES, 1), WallClock())
+        await server.open(tmp_path / "w")
+        reader, writer = await asyncio.open_unix_connection(tmp_path / "w")
+        writer.write(first)
+        assert await reader.read() == b""
+        writer.close()
+        with pytest.raises(Unreachable, match="z is not in the water"):
+            await AcousticEnd.open(tmp_path / "w", "z")
+        await server.aclose()
+        with pytest.raises(Unreachable):
+            await AcousticEnd.open(tmp_path / "w", "a")
+
+    run(main())

@@ -129,10 +129,8 @@ class CanopenBus:
         for status in self.nodes.values():
             if not status.reading:
                 self._take_over(status)
-                if (
-                    status.polling is not None and self._nursery is not None
-                ):  # it may sleep until a poll that is no more
-                    status.polling.cancel()
+                if status.polling is not None and self._nursery is not None:
+                    status.polling.cancel()  # it may sleep until a poll that is no more
                     status.polling = self._nursery.start(self._poll(status), f"{status.driver.config.name} polls")
         self._taken_over()
 

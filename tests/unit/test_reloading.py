@@ -32,10 +32,11 @@ buses:
   can0: {url: "can:socketcan/can0", bitrate: 125000}
 devices:
   tank: {profile: tank.yaml, bus: line, unit: 1, poll: {values: {every_ms: 1000}, slow: {every_ms: 4000}},
-    stale_after_ms: 3000, writable: [target, code], safe: {target: 1, code: 5}}
+    stale_after_ms: 3000, writable: [target, code, dose], safe: {target: 1, code: 5}}
   other: {profile: tank.yaml, bus: line, unit: 2, poll: {values: {every_ms: 500}}, stale_after_ms: 3000}
   tilt: {profile: inclinometer-cia410, bus: can0, node: 5, poll: {values: {every_ms: 1000}}, stale_after_ms: 3000}
-plc: {cycle_ms: 50, programs: {fill: {source: fill.st, inputs: {level: {tag: tank.level}}, outputs: {target: tank.target}}}}
+plc: {cycle_ms: 50, programs: {fill: {source: fill.st, inputs: {level: {tag: tank.level}},
+    outputs: {target: tank.target, dose: tank.dose}}}}
 remote: remote
 """
 TANK = """\
@@ -49,6 +50,7 @@ tags:
   target: {at: "holding:1", scale: 0.1, range: [0, 50], access: rw}
   volume: {at: "holding:10", scale: 0.5, poll: slow}
   size:   {at: "holding:20", scale: 0.5, poll: once}
+  dose:   {at: "holding:35", scale: 0.1, access: wo}
   code:   {at: "holding:30", access: rw, secret: true, poll: once}
 """
 PROTOTYPE = """\
@@ -62,7 +64,7 @@ devices:
 PROGRAM = """\
 PROGRAM Fill
 VAR_INPUT level : REAL; END_VAR
-VAR_OUTPUT target : REAL := 2.0; END_VAR
+VAR_OUTPUT target : REAL := 2.0; dose : REAL := 3.0; END_VAR
 target := 2.0;
 END_PROGRAM
 """
@@ -92,7 +94,7 @@ def edit(path: Path, *changes: tuple[str, str]) -> None:
         ("stale_after_ms: 3000, w", "stale_after_ms: 9000, w", "devices.tank.stale_after_ms: 3000 -> 9000"),
         ("target: 1", "target: 2", "devices.tank.safe.target: 1 -> 2"),
         ("code: 5", "code: 6", "devices.tank.safe.code: (secret) -> (secret)"),
-        ("[target, code]", "[target, code, volume]", None),
+        ("code, dose]", "code, dose, volume]", None),
         ("timeout_ms: 300", "timeout_ms: 500, retries: 3, spacing_ms: 20", "buses.line.timeout_ms: 300 -> 500"),
         ("stale_after_ms: 3000}\n  tilt", "stale_after_ms: 3000, timeout_ms: 900}\n  tilt", "devices.other.timeout_ms"),
         ("node: 5, poll: {values: {every_ms: 1000}", "node: 5, poll: {values: {every_ms: 200}", "devices.tilt.poll"),
@@ -121,7 +123,7 @@ def test_what_can_be_taken_over(plant: Path, old: str, new: str, says: str | Non
         ("plant", "node: 5, poll: {values: {every_ms: 1000}}, ", "node: 5, ", "10:3", "devices.tilt.poll.values"),
         ("plant", "  other:", "  another:", "9:3", "devices.another"),
         ("plant", "cycle_ms: 50", "cycle_ms: 20", "11:7", "plc.cycle_ms"),
-        ("plant", "remote: remote", "remote: local", "12:1", "remote"),
+        ("plant", "remote: remote", "remote: local", "13:1", "remote"),
         ("tank", 'level:  {at: "holding:0"', 'level:  {at: "holding:3"', "7:12", "test/tank: tags.level.at"),
         ("tank", "scale: 0.1, unit", "unit", "7:3", "test/tank: tags.level.scale"),  # a whole number from now on
         ("tank", "  volume:", '  depth: {at: "holding:9"}\n  volume:', "9:3", "test/tank: tags.depth"),
@@ -185,6 +187,12 @@ class Running:
             and c.item[:4] == head
             and (c.t_ns - self.run.started_ns) / 1e9 >= since_s
         ]
+
+    def written(self, address: int) -> list[int]:
+        """What unit 1 was told to hold there, in order."""
+        head = bytes([1, 16]) + address.to_bytes(2)
+        sent = [c.item for c in self._tap.captured if c.direction is Direction.SENT and isinstance(c.item, bytes)]
+        return [int.from_bytes(item[7:9]) for item in sent if item[:4] == head]
 
     def value(self, tag: str) -> Any:
         return self.run.gateway.tags.current(tag, self.run.loop.now_ns)
@@ -279,12 +287,13 @@ def test_outputs_are_written_anew_as_the_new_scaling_has_them(plant: Path, loop:
         def held() -> int:
             return p.run.field.devices["tank"].unit.bank.read("holding", 1, 1, loop.now_ns)[0]  # type: ignore[union-attr]
 
-        assert held() == 20
+        assert (held(), p.written(35)) == (20, [30])
         edit(plant.with_name("tank.yaml"), ("scale: 0.1, range: [0, 50]", "scale: 0.01, range: [0, 50]"))
+        edit(plant.with_name("tank.yaml"), ("scale: 0.1, access: wo", "scale: 0.01, access: wo"))
         edit(plant, ("target: 1", "target: 3"))
         await p.reload()
         await asyncio.sleep(1)
-        assert held() == 200
+        assert (held(), p.written(35)) == (200, [30, 300])  # also what nobody can read back
         writer = p.run.gateway.outputs
         writes = writer.writes
         await asyncio.sleep(5)

@@ -41,6 +41,7 @@ CODE_SUFFIXES = (".py", ".pyw", ".pyc", ".so", ".pyd", ".dll", ".dylib", ".pth")
 
 _BAD_CHARACTER = re.compile(r'[\x00-\x1f\x7f\\:*?"<>|]')
 _DEVICE_NAME = re.compile(r"(?i)^(con|prn|aux|nul|com[0-9]|lpt[0-9])(\.|$)")
+_VERSION = re.compile(r"[0-9A-Za-z.+!_-]{1,64}")
 _HASH = re.compile(r"[0-9a-f]{64}")
 
 
@@ -123,6 +124,10 @@ def parse_manifest(text: bytes, where: str) -> Manifest:
 def _check(manifest: Manifest, where: str) -> None:
     if manifest.version != VERSION:
         raise FileInvalid("the form of the template", path=where, expected=str(VERSION), got=str(manifest.version))
+    if not _VERSION.fullmatch(manifest.software.version):
+        raise FileInvalid(
+            "the version of the software", path=where, expected="such as 1.2.3", got=manifest.software.version
+        )
     if len(manifest.files) > MAX_FILES:
         raise FileInvalid("too many files", path=where, expected=f"at most {MAX_FILES}", got=str(len(manifest.files)))
     seen: set[str] = {MANIFEST}

@@ -19,6 +19,7 @@ from fieldtwin.cli.talk import data, talk
 from fieldtwin.cli.template_question import ask_about, shown
 from fieldtwin.running.template_here import Stranger
 from gateway.core.errors import UsageError
+from gateway.core.visible import visible
 from gateway.wallclock import WallClock
 from twin.prototype_file import prototype_path
 from twin.software import modules_hash
@@ -173,7 +174,7 @@ def diff_command(before: Path, after: Path, names: bool, as_json: bool) -> int:
             _print_difference(difference)
             if not names and difference.path != "fieldtwin":
                 for line in unified(a, b, difference.path):
-                    data.print(line, style=_style(line), markup=False, soft_wrap=True)
+                    data.print(visible(line), style=_style(line), markup=False, soft_wrap=True)
     if not found:
         talk.print("no difference")
     return 1 if found else 0

@@ -15,6 +15,8 @@ import re
 from enum import Enum
 from typing import ClassVar
 
+from gateway.core.visible import visible
+
 
 class Blame(Enum):
     """Who has to act for the error to go away."""
@@ -28,7 +30,7 @@ class Blame(Enum):
 
 
 class FieldtwinError(Exception):
-    """The root. `str()` is one line for a person; the parts stay readable for a program.
+    """The root. `str()` is one line for a person, whatever a file or a device put into it; the parts stay as they are.
 
     `expected`, `got`, `where` and `hint` are plain text, empty where they do not apply. `where` names bus, unit,
     address, file and line: whatever leads to the spot.
@@ -51,7 +53,7 @@ class FieldtwinError(Exception):
             text += f"; expected {self.expected}"
         if self.got:
             text += f"; got {self.got}"
-        return f"{text} ({self.hint})" if self.hint else text
+        return visible(f"{text} ({self.hint})" if self.hint else text)
 
     def at(self, where: str) -> FieldtwinError:
         """The same error with `where` put in front of what it already knows; returns itself, for ``raise e.at(...)``."""

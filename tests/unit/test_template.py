@@ -490,6 +490,7 @@ def test_a_directory_of_millions_of_entries_is_not_even_read(good: Path, tmp_pat
         ({"surprise": 1}, "surprise"),
         ({"system_file": "model.json"}, "the system file 'model.json' is not among the files"),
         ({"files": "all"}, "no manifest of a template"),
+        ({"software": {"version": "1\x1b[2J", "modules_sha256": "0"}}, r"the version of the software.* got 1\\x1b\[2J"),
     ],
 )
 def test_a_manifest_that_is_none_is_refused(good: Path, tmp_path: Path, change: dict[str, object], says: str) -> None:

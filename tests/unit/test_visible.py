@@ -1,0 +1,29 @@
+"""What a file or a device says cannot play tricks on the terminal of whoever reads our errors."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.core.errors import FileInvalid
+from gateway.core.visible import visible
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("as it is → 5 °C\n\tnext", "as it is → 5 °C\n\tnext"),
+        ("\x1b[2Jgone", "\\x1b[2Jgone"),
+        ("back\r\b", "back\\r\\x08"),
+        ("\u202egnp.exe\x9b", "\\u202egnp.exe\\x9b"),
+    ],
+)
+def test_what_cannot_be_seen_is_written_out(text: str, shown: str) -> None:
+    assert visible(text) == shown
+    assert str(FileInvalid("a name", got=text)) == f"a name; got {shown}"
+
+
+@given(text=st.text())
+def test_whatever_comes_can_be_seen(text: str) -> None:
+    assert all(c.isprintable() or c in "\n\t" for c in visible(text))

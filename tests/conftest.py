@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -47,20 +48,30 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-GROUPS = {"system": "systems", "spec": "systems", "docs": "systems", "interop": "strangers"}
+LINES = {"system": "systems", "spec": "systems", "docs": "systems", "interop": "strangers"}
 """Folders whose tests start many processes, and the line that they stand in: more at once would only wait for each other."""
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+def line_of(nodeid: str) -> str:
+    """What shares a process with what: a line of `LINES`, else a file."""
+    file = nodeid.partition("::")[0]
+    return LINES.get(Path(file).parent.name, file)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """With several processes (pytest-xdist): whole systems in one of them, one after the other, programs of strangers in another;
-    all else file by file."""
-    if not config.pluginmanager.hasplugin("xdist"):
-        return
-    here = Path(__file__).parent
-    for item in items:
-        folder = item.path.relative_to(here.parent).parts[1]  # of tests/, or of examples/
-        item.add_marker(pytest.mark.xdist_group(GROUPS.get(folder, item.path.name)))
+    all else file by file, so that what a file's tests share is made once.
+
+    Not by the marker `xdist_group`: pytest 9.2 no longer lets xdist 3.8 change a test's id, and then each test goes anywhere.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Lines(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return line_of(nodeid)
+
+    return Lines(config, log)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

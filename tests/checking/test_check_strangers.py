@@ -17,7 +17,6 @@ pytestmark = [
     pytest.mark.interop,
     pytest.mark.slow,
     pytest.mark.timeout(120),
-    pytest.mark.xdist_group("strange servers"),
 ]
 KNOWN = tomllib.loads((Path(__file__).parent / "strangers.toml").read_text())
 WIRES = [(peer, wire) for peer in ("pymodbus", "libmodbus") for wire in KNOWN[peer]]

@@ -48,8 +48,9 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-LINES = {"system": "systems", "spec": "systems", "docs": "systems", "interop": "strangers"}
-"""Folders whose tests start many processes, and the line that they stand in: more at once would only wait for each other."""
+LINES = {"system": "systems", "spec": "programs", "docs": "programs", "interop": "programs"}
+"""Folders whose tests start many processes, and the line that they stand in: more at once would only wait for each other. Two lines
+as long as all else, for three processes."""
 
 
 def line_of(nodeid: str) -> str:
@@ -60,8 +61,8 @@ def line_of(nodeid: str) -> str:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """With several processes (pytest-xdist): whole systems in one of them, one after the other, programs of strangers in another;
-    all else file by file, so that what a file's tests share is made once.
+    """With several processes (pytest-xdist): whole systems in one of them, one after the other, programs of users and strangers
+    in another; all else file by file, so that what a file's tests share is made once.
 
     Not by the marker `xdist_group`: pytest 9.2 no longer lets xdist 3.8 change a test's id, and then each test goes anywhere.
     """

@@ -49,8 +49,9 @@ def pytest_collection_finish() -> None:
 
 
 LINES = {"system": "systems", "spec": "programs", "docs": "programs", "interop": "programs"}
-"""Folders whose tests start many processes, and the line that they stand in: more at once would only wait for each other. Two lines
-as long as all else, for three processes."""
+"""Folders whose tests start many processes, and the line that they stand in: more at once would only wait for each other.
+
+Each of the two takes about as long as all else: three processes."""
 
 
 def line_of(nodeid: str) -> str:

@@ -122,9 +122,8 @@ def stage(target: Path) -> None:
         for name, place in beside.items():
             (target / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, target / place)
-    shutil.copytree(
-        ROOT / "examples", target / "files" / "examples", ignore=shutil.ignore_patterns("__pycache__", ".*")
-    )
+    left_out = shutil.ignore_patterns("__pycache__", ".*")
+    shutil.copytree(ROOT / "examples", target / "files" / "examples", ignore=left_out, dirs_exist_ok=True)
     for page, text in generated().items():
         _write(target / page, text)
 

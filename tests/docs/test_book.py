@@ -18,6 +18,7 @@ import paper_page
 import stage as book
 
 import fieldtwin
+from fieldtwin.cli.main import COMMANDS
 from fieldtwin.cli.schema_command import SCHEMAS
 
 
@@ -60,9 +61,12 @@ def test_a_class_that_there_is_not_is_named():
         paper_page.rows("## Schemas and classes\n| schema | class | where |\n| DigitalTwin | `Twin` | `twin.twin` |\n")
 
 
-def test_every_kind_of_file_and_every_fault_is_in_the_reference():
+def test_the_books_source_has_every_kind_of_file_every_fault_and_every_command(tmp_path):
+    book.stage(tmp_path / "source")
     assert set(form_pages.KINDS) == set(SCHEMAS)
-    faults = form_pages.form_pages()["reference/faults.md"]
+    commands = (tmp_path / "source/reference/cli.md").read_text("utf-8")
+    assert all(f"## fieldtwin {name}\n" in commands for name in COMMANDS)
+    faults = (tmp_path / "source/reference/faults.md").read_text("utf-8")
     assert all(f"`{name}`" in faults for name in form_pages.FAULTS)
 
 

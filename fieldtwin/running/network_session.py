@@ -1,6 +1,6 @@
 """A network on this host: each system a run of its own, as processes on ptys and sockets; the water between them is here.
 
-Start order: the water, the ship, then the systems in the file's order. A system that dies does not end the others.
+Start order: the water, the ship, then the systems, all at once. A system that dies does not end the others.
 """
 
 from __future__ import annotations
@@ -84,8 +84,7 @@ class NetworkSession:
             ship = Ship(self.network, self.medium, self.clock)
             self.ship = await ship.open(OsPorts())
             self._stack.push_async_callback(ship.aclose)
-        for number, name in enumerate(self.network.members):
-            self.sessions[name] = await self._stack.enter_async_context(RunSession(self._of(number, name, socket)))
+        await self._start_systems(socket)
         self.started_ns = self.faults.start_ns = self.clock.monotonic_ns()
         for fault in self.options.faults:  # each knows its time
             self.faults.inject(fault)
@@ -93,6 +92,20 @@ class NetworkSession:
             like = next(iter(self.network.members.values()))
             self.shore = Shore(like.system, like.modem, self.ship, self.clock)
             self._nursery.start(self.shore.run(list(self.options.commands)), "ship")
+
+    async def _start_systems(self, socket: Path) -> None:
+        """All at once. What did start is ended with the rest, also where another one did not."""
+        self.sessions = {
+            name: RunSession(self._of(number, name, socket)) for number, name in enumerate(self.network.members)
+        }
+        ended = await asyncio.gather(*map(self._start_one, self.sessions.values()), return_exceptions=True)
+        for result in ended:
+            if result is not None:
+                raise result
+
+    async def _start_one(self, session: RunSession) -> None:
+        await session.__aenter__()
+        self._stack.push_async_exit(session)
 
     def _of(self, number: int, name: str, socket: Path) -> RunOptions:
         member, instance = self.network.members[name], f"{self.instance.name}-{name}"

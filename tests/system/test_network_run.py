@@ -1,0 +1,53 @@
+"""A network as processes on this host: nine of them, three ptys, and the water on a socket between them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from procs import no_tracebacks, run_to_end
+
+pytestmark = [pytest.mark.slow, pytest.mark.long, pytest.mark.timeout(300)]
+
+RELAYED = """
+scenario: what the ship says reaches the eastern observatory over the two others
+system: ocean_network
+seed: 5
+always: ["west.adapt.missed == 0 and middle.adapt.missed == 0 and east.adapt.missed == 0"]
+steps:
+  - send: {period_s: 3}
+  - wait: {until: "west.adapt.state == 'ACTIVE'", within: 40s}
+  - fault: {id: gone, name: silence, device: middle.optode}
+  - wait: {until: "east.adapt.state == 'ACTIVE'", within: 90s}
+  - expect: {that: "east.adapt.hops == 2 and middle.adapt.hops == 1"}
+  - expect: {tag: middle.optode.status, quality: bad, within: 40s}
+  - clear: gone
+  - expect: {tag: east.current.speed, quality: good, within: 15s}
+  - expect: {wire: east.current, requests_per_s: {max: 4}, during: 3s}
+"""
+
+
+def test_a_scenario_of_a_network_runs_unchanged_as_processes(tmp_path: Path) -> None:
+    path = tmp_path / "n.scenario.yaml"
+    path.write_text(RELAYED)
+    ended = run_to_end(tmp_path, "test", str(path), "--target", "local", "--json", within_s=240)
+    result = json.loads(ended.out)[0]
+    late = any("late by itself" in check["got"] for check in result["checks"])
+    assert (result["verdict"], ended.process.returncode) == (("inconclusive", 1) if late else ("passed", 0)), result
+    assert not list(tmp_path.glob("test-*")), "the run directories are gone"
+    no_tracebacks(tmp_path)
+
+
+def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
+    words = ("run", "ocean_network", "--prototype", "--for", "8s", "--commands", "none", "--json")
+    ended = run_to_end(tmp_path, *words, within_s=180)
+    summary = json.loads(ended.out)
+    assert (ended.process.returncode, summary["ok"]) == (0, True), summary["systems"]
+    assert "west (ocean_west): hears middle, ship" in ended.err
+    for one in summary["systems"].values():
+        assert one["states"] == {"adapt": ["STANDBY"]}
+        assert {d["state"] for d in one["devices"].values()} == {"good"}
+        assert one["outputs_safe"]
+    assert {name for name, sea in summary["water"].items() if sea["said"]} == {"west", "middle", "east"}
+    no_tracebacks(tmp_path)

@@ -17,6 +17,7 @@ from gateway.core.nursery import Nursery
 from gateway.core.values import DATA
 from gateway.devices.config import BusConfig, DeviceConfig
 from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.bus_turns import DeviceState
 from gateway.runtime.modbus_bus import Job, ModbusBus
 from gateway.runtime.tags import TagTable
 from twin.thread_frames import Schema
@@ -27,6 +28,7 @@ ACK_DELAY_NS = 1000 * NS_PER_MS
 """A frame takes a second or more on the way: one ACK confirms several."""
 LINGER_NS = 500 * NS_PER_MS
 HALT_S = 0.5
+NOT_ASKED = DeviceState.error
 
 
 class _Inbox(Consumer[DATA]):
@@ -78,10 +80,10 @@ class ModemLink(DatagramLink):
 
     @property
     def trouble(self) -> str:  # type: ignore[override]
-        """The modem does not answer."""
-        if self._bus.online(self._driver):
-            return ""
-        return f"the modem at {self._bus.config.endpoint}: {self._bus.error or 'it does not answer yet'}"
+        """The modem does not answer, and why, without what differs from one try to the next; at first nobody has asked it."""
+        state = self._bus.devices[0]
+        why = "" if state.online else self._bus.error or state.error.removeprefix(NOT_ASKED)
+        return f"the modem: {why.partition('; expected')[0]}" if why else ""
 
     def _look(self) -> None:
         if (failure := self._nursery.failure()) is not None:

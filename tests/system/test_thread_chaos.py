@@ -102,12 +102,12 @@ class Chaos:
             for which in ("twin", "plant", "twin"):
                 self.commanded.append(len(self.commanded) + 1)
                 with self.twin("--command", str(self.commanded[-1])) as twin:
-                    self.until_more(self._chance.randrange(5, 40))
+                    self.until_more(self._chance.randrange(5, 40), twin)
                     if which == "plant":
                         plant.process.kill()
                         plant.wait()
                         plant = stack.enter_context(self.plant())
-                        self.until_more(self._chance.randrange(5, 40))
+                        self.until_more(self._chance.randrange(5, 40), twin)
                     twin.process.kill()
             with self.twin("--command", "7") as twin:
                 self.commanded.append(7)
@@ -117,10 +117,15 @@ class Chaos:
             plant.signal(2)
             plant.wait(20)
 
-    def until_more(self, count: int) -> None:
+    def until_more(self, count: int, twin: Fieldtwin) -> None:
         """So many events more have arrived, and the twin has its command on record: who dies before never gave it."""
         began = self.counts()[1]
-        wait_for(lambda: self.counts()[1] >= began + count, 60, f"{count} more events arrive")
+
+        def arrived() -> bool:
+            assert twin.process.poll() is None, f"the twin ended by itself: {twin.err}"
+            return self.counts()[1] >= began + count
+
+        wait_for(arrived, 60, f"{count} more events arrive")
         wait_for(
             lambda: len(log_of(self.stores[1], own(self.stores[1], "twin"))) == len(self.commanded), 20, "commands"
         )

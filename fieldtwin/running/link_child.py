@@ -6,7 +6,7 @@ import asyncio
 import subprocess
 from pathlib import Path
 
-from fieldtwin.running.children import spawn
+from fieldtwin.running.children import START_TIMEOUT_S, spawn
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ReplyTimeout, Unreachable
 from twin.child import command
@@ -24,7 +24,7 @@ class LinkChild:
         link.unlink(missing_ok=True)
         self._process = spawn(command("fieldtwin", "link", str(link), str(target), linger_s=LINGER_S), log)
 
-    async def ready(self, timeout_s: float = 10.0) -> None:
+    async def ready(self, timeout_s: float = START_TIMEOUT_S) -> None:
         deadline = asyncio.get_running_loop().time() + timeout_s
         while not self._link.exists():
             if self._process.poll() is not None:

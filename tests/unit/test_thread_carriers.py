@@ -165,6 +165,33 @@ def test_over_the_modems_of_the_reference_system_both_logs_are_equal(tmp_path: P
 
 
 @pytest.mark.parametrize("over", ["tcp", "modems"])
+def test_another_twin_with_an_empty_store_is_given_what_the_first_one_had(tmp_path: Path, over: str) -> None:
+    """Over TCP there is a new link; the plant's modem does not know that somebody else listens at the other end."""
+
+    async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
+        async def served(near: Callable[[], Carrier], far: Callable[[], Carrier]) -> None:
+            plant = Twin("plant", tmp_path, clock, near)
+            await plant.start()
+            await plant.log(*(value(n) for n in range(40)))
+            for name in ("first", "second"):
+                twin = Twin(name, tmp_path, clock, far)
+                await twin.start()
+                await plant.log(value(40))
+                await until_equal(plant, twin, 300, loop)
+                await twin.kill()
+            assert len(await plant.all_of(plant.origin)) == 42
+            await plant.kill()
+
+        if over == "tcp":
+            await served(lambda: LateListening(net), lambda: TcpDialler(ADDRESS, net, [SCHEMA]))
+        else:
+            async with modems(net, clock, 3) as (near, far):
+                await served(near, far)
+
+    virtually(main)
+
+
+@pytest.mark.parametrize("over", ["tcp", "modems"])
 def test_towards_the_plant_a_shadow_puts_acknowledgements_and_questions_and_nothing_else(
     tmp_path: Path, over: str
 ) -> None:

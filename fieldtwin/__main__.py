@@ -1,5 +1,10 @@
 """``python -m fieldtwin`` is the command."""
 
+import sys
+
+if sys.hexversion < 0x030B0000:  # a checkout has no installer that says so
+    sys.exit("fieldtwin needs Python 3.11 or newer; this is " + sys.version.split()[0])
+
 from fieldtwin.cli.main import main
 
 if __name__ == "__main__":

@@ -334,7 +334,8 @@ def test_prose_10_twinning_rate_and_lag_are_measured_and_printed(capsys: pytest.
         receiving.observe("plant:1", status(5, t_ms=clock.now_ms - 40))
         shadow.step()
     thread = {"links": 1, "duplicates": 0, "trouble": ""}
-    print_shadow({**shadow.describe(), "origins": ["plant:1"], "prototype": True, "thread": thread})
+    other = {"origins": ["plant:1"], "prototype": True, "thread": thread, "store_trouble": ""}
+    print_shadow({**shadow.describe(), **other})
     told = capsys.readouterr().err
     assert "10.0 reports a second" in told
     assert "median 40 ms" in told

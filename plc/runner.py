@@ -154,6 +154,8 @@ class Runner:
     def deadline_ns(self) -> int:
         if self._stopped is not None:
             return self._restart_ns
+        if len(self.entries) == 1:
+            return self.entries[0].task.deadline_ns
         return min(entry.task.deadline_ns for entry in self.entries)
 
     def run_once(self) -> None:

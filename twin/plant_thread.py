@@ -26,7 +26,7 @@ from gateway.core.connection import Connector
 from gateway.core.control import ControlClient, ControlServer
 from gateway.core.errors import FieldtwinError
 from gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
-from gateway.core.image_region import Snapshot
+from gateway.core.image_snapshot import Snapshot
 from gateway.core.nursery import Nursery
 from gateway.core.statemachine import STATE_CODES, STATES
 from gateway.core.values import COMMAND, RESPONSE, TagValue

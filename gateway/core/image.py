@@ -21,7 +21,8 @@ from typing import Any
 
 from gateway.core.errors import FileInvalid
 from gateway.core.image_layout import LINE, RegionLayout, RegionShape, TagKind, TagSpec, message_tag
-from gateway.core.image_region import Message, NotEncodable, RegionFlag, RegionReader, RegionWriter, Snapshot
+from gateway.core.image_region import NotEncodable, RegionReader, RegionWriter
+from gateway.core.image_snapshot import Message, RegionFlag, Snapshot
 
 __all__ = [
     "INPUTS",

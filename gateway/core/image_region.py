@@ -14,36 +14,16 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import IntFlag
 
 from gateway.core.errors import Bug, FileInvalid
 from gateway.core.image_layout import CHECK, RECORD_HEAD, RegionShape, RingShape, TagKind
+from gateway.core.image_snapshot import Message, RegionFlag, Snapshot
 from gateway.core.values import Quality, Reason, Scalar, TagValue
 
 MAX_LOOKS = 16
 """How often a reader looks before it gives up for now. Trying four slots gave 0.0015 retries a read (DESIGN.md)."""
 
-_QUALITIES = {int(quality): quality for quality in Quality}
-_REASONS = {int(reason): reason for reason in Reason}
 _NO_VALUE = 0x80  # in the quality byte: the tag has a quality and no value
-
-
-class RegionFlag(IntFlag):
-    """What a writer says about all of its region."""
-
-    NONE = 0
-    STOPPED = 1
-    """The writer stopped on purpose or by its watchdog: nothing in the region may be acted upon."""
-
-
-@dataclass(frozen=True, slots=True)
-class Message:
-    """One message of a MESSAGE tag. `seq` counts from 1 without gaps; `t_ns` is the source's monotonic time."""
-
-    seq: int
-    t_ns: int
-    data: bytes
 
 
 class NotEncodable(Bug):
@@ -52,53 +32,6 @@ class NotEncodable(Bug):
     def __init__(self, tag: str, message: str, *, expected: str = "", got: str = "") -> None:
         self.tag = tag
         super().__init__(message, expected=expected, got=got, where=tag)
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """One publication of a region, whole. `counter` counts publications from 1; 0 means that there never was one.
-
-    `values`, `qualities`, `reasons` and `times_ns` are columns in the order of the region's tags; `value` joins them
-    for one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, what is new since
-    the reader's last snapshot, in order; a tag without news has no entry. Times stay packed in `stamps` until somebody
-    asks for one: hardly anybody does. As long as no value, quality or reason changes, snapshots share those columns.
-    """
-
-    shape: RegionShape
-    counter: int
-    t_ns: int
-    flags: RegionFlag
-    values: tuple[Scalar | None, ...]
-    qualities: bytes
-    reasons: bytes
-    stamps: bytes
-    messages: Mapping[str, tuple[Message, ...]] = field(default_factory=dict)
-
-    def value(self, tag: str | int) -> TagValue:
-        """The value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
-        i = self.shape.index[tag] if isinstance(tag, str) else tag
-        return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.time_ns(i))
-
-    def time_ns(self, index: int) -> int:
-        """The source's time of the tag at `index` (monotonic)."""
-        return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
-
-    @property
-    def times_ns(self) -> tuple[int, ...]:
-        """The sources' times of all tags."""
-        return self.shape.times.unpack(self.stamps)
-
-    def all(self) -> dict[str, TagValue]:
-        """Every tag by name."""
-        return {name: self.value(i) for name, i in self.shape.index.items()}
-
-    @property
-    def stopped(self) -> bool:
-        return self.flags is not RegionFlag.NONE and bool(self.flags & RegionFlag.STOPPED)
-
-    def age_ns(self, now_ns: int) -> float:
-        """How long ago the writer published this: its heartbeat. Infinite when it never did."""
-        return now_ns - self.t_ns if self.counter else float("inf")
 
 
 class _Region:

@@ -1,0 +1,81 @@
+"""What a reader of a process image gets: one publication of a region, whole. Values only.
+
+It must never know where the memory is, nor who wrote it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntFlag
+from types import MappingProxyType
+from typing import NamedTuple
+
+from gateway.core.image_layout import RegionShape
+from gateway.core.values import Quality, Reason, Scalar, TagValue
+
+_QUALITIES = {int(quality): quality for quality in Quality}
+_REASONS = {int(reason): reason for reason in Reason}
+
+
+class RegionFlag(IntFlag):
+    """What a writer says about all of its region."""
+
+    NONE = 0
+    STOPPED = 1
+    """The writer stopped on purpose or by its watchdog: nothing in the region may be acted upon."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of a MESSAGE tag. `seq` counts from 1 without gaps; `t_ns` is the source's monotonic time."""
+
+    seq: int
+    t_ns: int
+    data: bytes
+
+
+class Snapshot(NamedTuple):
+    """One publication of a region, whole. `counter` counts publications from 1; 0 means that there never was one.
+
+    `values`, `qualities`, `reasons` and `times_ns` are columns in the order of the region's tags; `value` joins them
+    for one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, what is new since
+    the reader's last snapshot, in order; a tag without news has no entry. Times stay packed in `stamps` until somebody
+    asks for one: hardly anybody does. As long as no value, quality or reason changes, snapshots share those columns.
+    """
+
+    shape: RegionShape
+    counter: int
+    t_ns: int
+    flags: RegionFlag
+    values: tuple[Scalar | None, ...]
+    qualities: bytes
+    reasons: bytes
+    stamps: bytes
+    messages: Mapping[str, tuple[Message, ...]] = MappingProxyType({})
+
+    def value(self, tag: str | int) -> TagValue:
+        """The value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
+        i = self.shape.index[tag] if isinstance(tag, str) else tag
+        return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.time_ns(i))
+
+    def time_ns(self, index: int) -> int:
+        """The source's time of the tag at `index` (monotonic)."""
+        return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
+
+    @property
+    def times_ns(self) -> tuple[int, ...]:
+        """The sources' times of all tags."""
+        return self.shape.times.unpack(self.stamps)
+
+    def all(self) -> dict[str, TagValue]:
+        """Every tag by name."""
+        return {name: self.value(i) for name, i in self.shape.index.items()}
+
+    @property
+    def stopped(self) -> bool:
+        return self.flags is not RegionFlag.NONE and bool(self.flags & RegionFlag.STOPPED)
+
+    def age_ns(self, now_ns: int) -> float:
+        """How long ago the writer published this: its heartbeat. Infinite when it never did."""
+        return now_ns - self.t_ns if self.counter else float("inf")

@@ -60,9 +60,11 @@ def told(outcome: Outcome) -> str:
 def main() -> int:
     if hasattr(os, "nice"):
         os.nice(NICE)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what control logic prints is no answer
     asked = msgspec.json.decode(sys.stdin.buffer.read(), type=Asked)
-    found = objection(asked)
-    sys.stdout.buffer.write(msgspec.json.encode({"objection": found}) + b"\n")
+    with answers:
+        answers.write(msgspec.json.encode({"objection": objection(asked)}) + b"\n")
     return 0
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +28,8 @@ TIMEOUT_S = 60.0
 TOLD_WITHIN_S = 12.0
 """So long after its beginning a twin knows of everything: a plant tells every ten seconds what does not change."""
 LOOK_MS = 100
-MAX_ANSWER = 1 << 20
+MOST_KEPT = 1 << 16
+"""Bytes of what the process says."""
 
 
 class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -144,13 +146,16 @@ class Asking:
 
     async def _process(self, asked: Asked) -> str:
         """The objection of a process of its own. Raises `Unreachable` when it took too long or died."""
-        process = await asyncio.create_subprocess_exec(
-            *child_command("fieldtwin.whatif.asked"),
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
-        )  # fmt: skip
+        try:
+            process = await asyncio.create_subprocess_exec(
+                *child_command("fieldtwin.whatif.asked"),
+                stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+            )  # fmt: skip
+        except OSError as e:
+            raise Unreachable(f"no process can be started: {e.strerror or e}") from e
         try:
             async with asyncio.timeout(self._timeout_s):
-                out, err = await process.communicate(msgspec.json.encode(asked))
+                out, err = await _talk_with(process, msgspec.json.encode(asked))
         except TimeoutError as e:
             raise Unreachable(f"no answer within {self._timeout_s:g} s") from e
         finally:
@@ -158,8 +163,28 @@ class Asking:
                 process.kill()
                 await process.wait()
         try:
-            found = msgspec.json.decode(out[:MAX_ANSWER], type=dict[str, str])
+            found = msgspec.json.decode(out, type=dict[str, str])
             return found["objection"]
         except (msgspec.MsgspecError, KeyError) as e:
             last = err.decode(errors="replace").strip().rpartition("\n")[2]
             raise Unreachable(f"it ended with code {process.returncode}: {last or 'without a word'}") from e
+
+
+async def _talk_with(process: asyncio.subprocess.Process, question: bytes) -> tuple[bytes, bytes]:
+    """Tell it the question; the ends of what it answers and complains of, however much that is."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    assert process.stderr is not None
+    with suppress(ConnectionError):  # it died: its code says more
+        process.stdin.write(question)
+        await process.stdin.drain()
+    process.stdin.close()
+    out, err, _ = await asyncio.gather(_end_of(process.stdout), _end_of(process.stderr), process.wait())
+    return out, err
+
+
+async def _end_of(stream: asyncio.StreamReader) -> bytes:
+    kept = b""
+    while data := await stream.read(MOST_KEPT):
+        kept = (kept + data)[-MOST_KEPT:]
+    return kept

@@ -12,7 +12,7 @@ from fieldtwin.running.twin_rules import load_planner, questions_of
 from fieldtwin.whatif.asked import objection
 from fieldtwin.whatif.asking import Asked, Asking, Subject
 from fieldtwin.whatif.last_known import LastKnown
-from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.errors import FileInvalid, Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.statemachine import encode_period
 from gateway.core.values import Quality, Reason
@@ -174,3 +174,31 @@ def test_what_is_wrong_with_a_question_is_said_with_its_line(tmp_path: Path, tex
     with pytest.raises(FileInvalid, match=why) as caught:
         load_planner(str(file), OBSERVATORY)
     assert ":2" in str(caught.value)
+
+
+def test_what_control_logic_prints_is_no_answer_and_what_it_dies_of_is_told(tmp_path: Path) -> None:
+    """A system of one's own, whose program prints when it is imported, or ends the process."""
+    (tmp_path / "loud.py").write_text(
+        "import os, sys\nfrom plc.program import Program\n\nprint('loud' * 100_000)\n"
+        "if os.path.exists(os.path.dirname(__file__) + '/dies'):\n    print('no more', file=sys.stderr); os._exit(9)\n\n"
+        "class Loud(Program):\n    def execute(self, scan):\n        pass\n"
+    )
+    (tmp_path / "quiet.yaml").write_text(
+        "fieldtwin: 1\nsystem: quiet\nbuses: {lan: {url: 'tcp://there:502'}}\n"
+        "devices: {modem: {profile: modem-mailbox, bus: lan, unit: 1}}\n"
+        "plc: {programs: {loud: {source: 'python: loud:Loud'}}}\n"
+    )
+    (tmp_path / "quiet.prototype.yaml").write_text(
+        "prototype_of: quiet.yaml\nbuses: {lan: {listen: 'tcp://127.0.0.1:0'}}\n"
+        "devices: {modem: {model: mailbox, far: 'tcp://127.0.0.1:0'}}\n"
+    )
+
+    async def main() -> str:
+        asking = Asking(Subject(load_system(str(tmp_path / "quiet.yaml"))), WallClock())
+        await asking.check([Question(1.0, ("modem.link_state == 1",))])
+        (tmp_path / "dies").touch()
+        with pytest.raises(Unreachable) as caught:
+            await asking.check([Question(1.0, ("modem.link_state == 1",))])
+        return str(caught.value)
+
+    assert run(main(), timeout_s=60) == "it ended with code 9: no more"

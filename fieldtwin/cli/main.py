@@ -165,7 +165,7 @@ def main() -> None:
             raise
         click.echo(f"fieldtwin: {e}", err=True)
         theirs = getattr(e, "child_exit_code", 0) or getattr(e, "remote_exit_code", 0)
-        sys.exit(theirs or e.exit_code)
+        sys.exit(theirs if theirs > 0 else e.exit_code)  # below zero: a signal ended it
     except OSError as e:
         if os.environ.get("FIELDTWIN_TRACEBACK") or e.errno not in HOST_REFUSES:
             _bug(e)

@@ -26,7 +26,7 @@ from fieldtwin.running.template_here import system_file
 from fieldtwin.service.attached import Service, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
-from gateway.core.errors import UsageError
+from gateway.core.errors import FieldtwinError, UsageError
 from twin.data_files import network_file
 
 if TYPE_CHECKING:
@@ -379,28 +379,38 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
     check(service_options)
     notifier = Notifier.from_environment()
     session = RunSession(options)
-    interrupted = False
+    interrupted = started = False
+    me = asyncio.current_task()
+    assert me is not None
 
     def interrupt() -> None:
         nonlocal interrupted
         interrupted = True
         session.stopped.set()
+        if not started:  # on a busy computer that takes a while, and nobody waits for it any more
+            me.cancel()
 
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, interrupt)
-    async with session:
-        if service_options.log is None:
-            print_mapping(session)
-        async with Service(session, service_options, notifier) as service:
+    try:
+        async with session:
+            started = True
             if service_options.log is None:
-                print_metrics(service.url)
-            if hasattr(signal, "SIGHUP"):
-                # From a terminal it says that nobody watches any more; to a service, that its configuration changed.
-                watched = not notifier.wanted and any(map(os.isatty, range(3)))
-                loop.add_signal_handler(signal.SIGHUP, interrupt if watched else service.hang_up)
-            async with LiveView(session, quiet=as_json or service_options.log is not None):
-                await session.wait()
+                print_mapping(session)
+            async with Service(session, service_options, notifier) as service:
+                if service_options.log is None:
+                    print_metrics(service.url)
+                if hasattr(signal, "SIGHUP"):
+                    # From a terminal it says that nobody watches any more; to a service, that its configuration changed.
+                    watched = not notifier.wanted and any(map(os.isatty, range(3)))
+                    loop.add_signal_handler(signal.SIGHUP, interrupt if watched else service.hang_up)
+                async with LiveView(session, quiet=as_json or service_options.log is not None):
+                    await session.wait()
+    except (asyncio.CancelledError, FieldtwinError):
+        if interrupted and not started:
+            return 130
+        raise
     notifier.close()
     summary = summarise(session)
     if as_json:

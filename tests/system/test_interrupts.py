@@ -26,11 +26,11 @@ if __name__ == "__main__":
 """
 
 
-def _started(command: list[str], cwd: Path) -> subprocess.Popen[str]:
+def _started(command: list[str], cwd: Path, runs: str = "") -> subprocess.Popen[str]:
     return subprocess.Popen(
         command,
         cwd=cwd,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}"},
+        env={**os.environ, "PYTHONPATH": f"{ROOT}", **({"FIELDTWIN_RUN": str(cwd / runs)} if runs else {})},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -39,9 +39,9 @@ def _started(command: list[str], cwd: Path) -> subprocess.Popen[str]:
     )
 
 
-def _interrupted(process: subprocess.Popen[str]) -> str:
+def _interrupted(process: subprocess.Popen[str], number: int = signal.SIGINT) -> str:
     """What it says from then on; over when the last process that holds its output is."""
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, number)
     said, _ = process.communicate(timeout=30)
     return said
 
@@ -77,3 +77,24 @@ def test_workers_end_with_who_started_them(tmp_path: Path, when: str) -> None:
     said = _interrupted(process)
     assert process.returncode == -signal.SIGINT
     assert said.count("Traceback") == 1, said  # of the probe itself, which does not catch it
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_that_still_starts_ends_at_once(tmp_path: Path, number: signal.Signals) -> None:
+    process = _started(
+        [sys.executable, "-m", "fieldtwin", "run", "observatory", "--prototype", "--instance", "early"], tmp_path, "r"
+    )
+
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+
+    def has_a_child_of_its_own() -> bool:
+        return any(os.getpgid(int(pid)) == int(pid) for pid in children.read_text().split())
+
+    async def until_it_starts_another() -> None:
+        await eventually(has_a_child_of_its_own, within_s=30)
+
+    run(until_it_starts_another(), timeout_s=40)
+    said = _interrupted(process, number)
+    assert process.returncode == 130
+    assert said == ""
+    assert not list((tmp_path / "r" / "early").glob("*.sock"))

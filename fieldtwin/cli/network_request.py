@@ -19,3 +19,4 @@ class NetworkRequest(NamedTuple):
     trace: str | None
     cold: bool
     as_json: bool
+    thread: str = ""

@@ -6,6 +6,7 @@ import asyncio
 import json
 import signal
 import sys
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,14 @@ from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import Scripted, script
 from fieldtwin.running.summary import summarise
-from gateway.core.errors import UsageError
+from gateway.core.errors import FieldtwinError, UsageError
 from gateway.wallclock import WallClock
 from twin.network import SHIP, Network, load_network
 
 FIRST_S = 1.0
 BASE_S = 10
 """What the ship orders, and when, where nothing is said."""
+THREAD = "tcp://127.0.0.1:0"
 REFRESH_S = 0.25
 LINE_S = 5.0
 MAX_TROUBLES = 5
@@ -41,6 +43,11 @@ def run_network(request: NetworkRequest) -> int:
         raise UsageError("--virtual needs an end", expected="--for 24h")
     if not request.virtual and (request.seed is not None or request.trace):
         raise UsageError("--seed and --trace go with --virtual")
+    if request.thread and (request.virtual or request.thread != THREAD):
+        raise UsageError(
+            "each system of a network has a thread and a port of its own",
+            expected=f"--thread {THREAD}, without --virtual",
+        )
     network = load_network(request.path, [Path(p) for p in request.profiles])
     _print_network(network)
     return _virtual(request, network) if request.virtual else asyncio.run(_on_this_host(request, network))
@@ -96,21 +103,35 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
         tuple(Path(p) for p in request.profiles),
         request.cold,
         commands=_commands(request),
+        thread=request.thread,
     )
     session = NetworkSession(network, options)
-    interrupted = False
+    interrupted = started = False
+    me = asyncio.current_task()
+    assert me is not None
 
     def interrupt() -> None:
         nonlocal interrupted
         interrupted = True
         session.stopped.set()
+        if not started:
+            me.cancel()
 
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, interrupt)
-    async with session:
+    async with AsyncExitStack() as stack:
+        try:
+            await stack.enter_async_context(session)
+        except (asyncio.CancelledError, FieldtwinError):
+            if interrupted:
+                return 130
+            raise
+        started = True
         for name, one in session.sessions.items():
             talk.print(f"  {name}: instance {one.instance.name} in {one.instance.dir}", soft_wrap=True, highlight=False)
+            if one.thread_place:
+                talk.print(f"  {name}: digital thread  ←  {one.thread_place}", soft_wrap=True, highlight=False)
         if session.ship is not None:
             talk.print(f"  the ship's modem  →  {session.ship}", soft_wrap=True, highlight=False)
         showing = asyncio.create_task(_show(session, quiet=request.as_json))

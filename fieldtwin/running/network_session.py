@@ -39,6 +39,8 @@ class NetworkOptions:
     commands: tuple[Scripted, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
     """Of the water."""
+    thread: str = ""
+    """Where each system's thread listens: on a free port. Empty for none."""
 
 
 class NetworkSession:
@@ -118,6 +120,7 @@ class NetworkSession:
             capture=Instance(instance).dir / "capture.jsonl" if self.options.capture else None,
             cold=self.options.cold,
             seed=member.prototype.seed + 1_000_003 * self.seed + number,
+            thread=self.options.thread,
             water={member.modem: (str(socket), name)},
         )
 

@@ -129,7 +129,7 @@ def print_shadow(seen: dict[str, Any]) -> None:
     ]
     if thread["trouble"]:
         lines.append(("trouble", thread["trouble"]))
-    if seen["store_trouble"]:
+    if seen.get("store_trouble"):
         lines.append(("store", seen["store_trouble"]))
     lines += [("wrong now", f"{name}: {', '.join(what)}") for name, what in seen["wrong"].items()]
     for name, text in lines:

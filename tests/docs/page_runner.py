@@ -18,6 +18,7 @@ import select
 import signal
 import subprocess
 import sys
+import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -151,3 +152,28 @@ class Reader:
             text=True,
             start_new_session=True,
         )
+
+
+def main() -> int:
+    """Every page, as a stranger with nothing but an installation walks them (scripts/walk). 1 where one shows what is not so."""
+    wrong = 0
+    for page in sorted((ROOT / "docs").rglob("*.md")):
+        if not (todo := blocks(page)):
+            continue
+        with tempfile.TemporaryDirectory(prefix="pg", dir="/tmp") as folder:
+            reader = Reader(Path(folder))
+            try:
+                for block in todo:
+                    reader.does(block)
+            except AssertionError as differs:
+                wrong += 1
+                print(f"wrong  {page.relative_to(ROOT)}, {differs}", flush=True)
+            else:
+                print(f"ok     {page.relative_to(ROOT)}", flush=True)
+            finally:
+                reader.ends()
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -51,7 +51,11 @@ from twin.system import System, load_system
 @click.option(
     "--what-if-timeout", "timeout_s", type=Duration(), default="60s", show_default=True, help="No answer then is a no."
 )
-@click.option("--prototype-file", type=click.Path(exists=True, dir_okay=False, path_type=Path), help="What is asked.")
+@click.option(
+    "--prototype-file",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Of the prototype that is asked; default: beside the system file.",
+)
 @click.option(
     "--store", default="", metavar="FILE|URL", help="What keeps the knowledge; default: in the run directory."
 )

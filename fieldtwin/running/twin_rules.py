@@ -82,7 +82,8 @@ def load_planner(source: str, system: System) -> Plans:
     """``FILE.yaml``, or ``python: module:Class``, beside the system file or here. Raises `FileInvalid`."""
     language, _, rest = source.partition(":")
     if language.strip() == "python":
-        return Plans(PythonPlanner(source, rest.strip(), system), limits=limits_of(system))
+        made = PythonPlanner(source, rest.strip(), system)
+        return Plans(made, limits=limits_of(system) | made.limits)
     file = load(Path(source))
     form = validate(file, RulesForm)
     tags = {f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()}
@@ -128,7 +129,7 @@ def _question(file: YamlFile, loc: tuple[Key, ...], form: QuestionForm) -> Quest
 
 
 class PythonPlanner:
-    """A planner that somebody wrote: whatever it raises is a `FileInvalid` that names it."""
+    """A planner that somebody wrote: whatever it raises is a `FileInvalid` that names it. `limits` are its own, if any."""
 
     def __init__(self, source: str, name: str, system: System) -> None:
         self._source = source
@@ -142,6 +143,12 @@ class PythonPlanner:
             raise FileInvalid(f"the planner {source!r} cannot be made: {type(e).__name__}: {e}") from e
         if not callable(getattr(self._made, "plan", None)):
             raise FileInvalid("not a planner", expected="a class with plan(data, model)", got=source)
+        try:
+            said = getattr(self._made, "limits", {})
+            self.limits = {str(name): (float(low), float(high)) for name, (low, high) in said.items()}
+        except (AttributeError, TypeError, ValueError) as e:
+            expected = "{'ctd.pressure': (0, 500)}"
+            raise FileInvalid(f"the limits of {source!r}", expected=expected, got=repr(said)[:80]) from e
 
     def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None:
         try:

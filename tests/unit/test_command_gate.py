@@ -161,12 +161,16 @@ def test_what_is_wrong_with_rules_is_said_with_its_line(tmp_path: Path, text: st
     assert caught.value.line == 1
 
 
-def test_a_planner_in_python_is_made_or_refused(tmp_path: Path) -> None:
+def test_a_planner_in_python_is_made_or_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     system = load_system(str(OBSERVATORY))
     with pytest.raises(FileInvalid, match="cannot be made: ModuleNotFoundError"):
         load_planner("python: no_such_module:Planner", system)
     with pytest.raises(FileInvalid, match="not a planner"):
         load_planner("python: collections:OrderedDict", system)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "odd_planner.py").write_text("class P:\n    limits = {'x': 5}\n    def plan(self, data, model): ...\n")
+    with pytest.raises(FileInvalid, match=r"the limits of .*; got \{'x': 5\}"):
+        load_planner("python: odd_planner:P", system)
 
 
 def test_what_a_planner_in_python_raises_or_gives_is_a_refusal_and_the_twin_goes_on(

@@ -48,7 +48,8 @@ def test_the_planner_of_the_page_on_twins(tmp_path: Path, monkeypatch: pytest.Mo
     (tmp_path / "planner.py").write_text(text, encoding="utf-8")
     monkeypatch.syspath_prepend(str(tmp_path))
     system = replace(load_system("observatory"), path=tmp_path / "observatory.yaml")
-    planner = load_planner("python: planner:Planner", system).planner
+    planner, _, limits = load_planner("python: planner:Planner", system)
+    assert limits["ctd.pressure"] == (0.0, 500.0)
     assert isinstance(planner, PythonPlanner)
     model, commanded = DigitalModel(), []
     for finding, subject in (("inside", "a"), ("outside", "a"), ("outside", "b"), ("inside", "a"), ("inside", "b")):

@@ -7,7 +7,7 @@ what is emulated is dashed. Pure: facts in, text out.
 from __future__ import annotations
 
 from fieldtwin.drawing.wiring import Station, Wire, Wiring
-from fieldtwin.report.markup import Markup, el
+from fieldtwin.report.markup import Child, Markup, el
 
 CHAR = 7.25
 """Width of a character of the 12 px monospace face, in px."""
@@ -50,20 +50,22 @@ def svg(wires: Wiring) -> str:
     right = max(right, EDGE + CHAR * (len(title) + len(legend) + 4))
     height, width = bottom + EDGE, right + EDGE
     frame = el("rect", cls="box", x=EDGE, y=EDGE + 26.0, width=left_width, height=bottom - EDGE - 26.0, rx=8)
-    return (
-        el(
-            "svg",
-            el("title", title),
-            el("style", STYLE),
-            el("rect", cls="ground", width="100%", height="100%"),
-            _text(EDGE, EDGE + 8.0, title, "name"),
-            _text(right - CHAR * len(legend), EDGE + 8.0, legend, "says"),
-            frame, controller, parts,
-            cls="wires", viewBox=f"0 0 {width:.0f} {height:.0f}", width=f"{width:.0f}", height=f"{height:.0f}",
-            role="img", xmlns="http://www.w3.org/2000/svg",
-        ).replace("/><", "/>\n<").replace("</text><", "</text>\n<")
-        + "\n"
+    heads = [_text(EDGE, EDGE + 8.0, title, "name"), _text(right - CHAR * len(legend), EDGE + 8.0, legend, "says")]
+    return document(title, width, height, heads, frame, controller, parts)
+
+
+def document(title: str, width: float, height: float, *parts: Child) -> str:
+    """A drawing as a file of its own, with ground and looks; a line for each mark."""
+    whole = el(
+        "svg",
+        el("title", title),
+        el("style", STYLE),
+        el("rect", cls="ground", width="100%", height="100%"),
+        parts,
+        cls="wires", viewBox=f"0 0 {width:.0f} {height:.0f}", width=f"{width:.0f}", height=f"{height:.0f}",
+        role="img", xmlns="http://www.w3.org/2000/svg",
     )  # fmt: skip
+    return whole.replace("/><", "/>\n<").replace("</text><", "</text>\n<") + "\n"
 
 
 def _text(x: float, y: float, words: str, cls: str = "", most: int = LONGEST) -> Markup:

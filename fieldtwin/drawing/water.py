@@ -10,7 +10,7 @@ from itertools import combinations
 from math import dist
 from typing import Any
 
-from fieldtwin.drawing.svg import CHAR, EDGE, LINE, STYLE
+from fieldtwin.drawing.svg import CHAR, EDGE, LINE, document
 from fieldtwin.report.markup import Markup, el
 from twin.network import SHIP, Network
 
@@ -94,20 +94,11 @@ def svg(drawn: Map) -> str:
     taken: list[tuple[float, float, float, float]] = []
     parts += [_place(place, spots[place.name], taken) for place in drawn.places]
     title = f"{drawn.network}: network of prototypes"
-    return (
-        el(
-            "svg",
-            el("title", title),
-            el("style", STYLE),
-            el("rect", cls="ground", width="100%", height="100%"),
-            el("text", title, cls="name", x=EDGE, y=EDGE + 8),
-            el("text", drawn.water, cls="soft", x=EDGE, y=EDGE + 8 + LINE),
-            parts,
-            cls="wires", viewBox=f"0 0 {width:.0f} {height:.0f}", width=f"{width:.0f}", height=f"{height:.0f}",
-            role="img", xmlns="http://www.w3.org/2000/svg",
-        ).replace("/><", "/>\n<").replace("</text><", "</text>\n<")
-        + "\n"
-    )  # fmt: skip
+    heads = [
+        el("text", title, cls="name", x=EDGE, y=EDGE + 8),
+        el("text", drawn.water, cls="soft", x=EDGE, y=EDGE + 8 + LINE),
+    ]
+    return document(title, width, height, heads, parts)
 
 
 def _spots(drawn: Map) -> tuple[dict[str, tuple[float, float]], float]:

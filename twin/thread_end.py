@@ -20,6 +20,8 @@ from twin.thread_frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Sche
 from twin.thread_link import Carrier, Link, Unwelcome
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
+PROVEN_NS = 5 * NS_PER_S
+"""A link that lasts so long was a good one. Two who want the same place take turns of that length."""
 READ_BLOCK = 1000
 STORE_PAUSE_NS = NS_PER_S
 
@@ -99,11 +101,11 @@ class ThreadEnd:
         if self._origin:
             first, last = await self._store.span(self._origin)
             self.out = Outgoing(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)
-        retry_ns = FIRST_RETRY_NS
+        retry_ns, opened_ns = FIRST_RETRY_NS, 0
         while True:
             try:
                 self._link = await self._carrier.open()
-                retry_ns = FIRST_RETRY_NS
+                opened_ns = self._clock.monotonic_ns()
                 await self._converse(self._link)
             except Unreachable as e:
                 self.trouble = str(e)
@@ -115,6 +117,8 @@ class ThreadEnd:
                     self.trouble = self.trouble or self._link.trouble
                     await self._link.aclose()
                     self._link = None
+                    if self._clock.monotonic_ns() - opened_ns >= PROVEN_NS:
+                        retry_ns = FIRST_RETRY_NS
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + retry_ns)
             retry_ns = min(2 * retry_ns, LAST_RETRY_NS)
 

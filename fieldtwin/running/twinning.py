@@ -64,6 +64,7 @@ class Twinning(Shadowing):
         self._on_command = on_command
         self._on_refusal = on_refusal
         self.refused_by_plant = 0
+        self._by_hand: list[COMMAND] = []
         self._operator = Operator("twin", self.clock)
         self._sent: Consumer[COMMAND] = Consumer(self.shadow.execute.transmitter.event)
         self.shadow.execute.transmitter.subscribe(self._sent)
@@ -89,8 +90,8 @@ class Twinning(Shadowing):
         return end
 
     def plan(self, command: COMMAND) -> None:
-        """Somebody's plan, by hand: it goes the way of every other."""
-        self.shadow.execute.plans.observe(command)
+        """Somebody's plan, by hand: it goes the way of every other, as soon as the plant was heard of."""
+        self._by_hand.append(command)
 
     async def _arrived(self, origin: str, events: Sequence[Event]) -> None:
         if self._asking is not None:
@@ -107,7 +108,20 @@ class Twinning(Shadowing):
             await self._asking.recall(store, list(await store.origins()))
             nursery.start(self._asking.run(), "what if")
 
+    def _step(self, writer: KnowledgeWriter) -> None:
+        if self.origins:
+            self._plan_by_hand()
+        super()._step(writer)
+
+    def _plan_by_hand(self) -> None:
+        for command in self._by_hand:
+            self.shadow.execute.plans.observe(command)
+        self._by_hand.clear()
+
     def _give_up(self) -> None:
+        if self._by_hand:
+            self._plan_by_hand()
+            self.shadow.execute.give_up("the twin ended before it had heard of the plant")
         self.shadow.execute.give_up("the twin ended before a prototype had answered")
 
     def _kept(self, event: Event) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from fieldtwin.running.twin_rules import load_planner
 from fieldtwin.running.twinning import Twinning
 from gateway.core.errors import FileInvalid
 from gateway.core.statemachine import decode_period, encode_period
+from gateway.core.values import COMMAND
 from gateway.store.event import Event, Kind
 from twin.command_gate import CommandGate
 from twin.instance import Instance
@@ -193,6 +195,30 @@ def test_what_a_planner_in_python_raises_or_gives_is_a_refusal_and_the_twin_goes
     raised, gave = [str(e.value) for e in plan.collect() if e.kind == Kind.REFUSAL]
     assert "'python: failing_planner:Planner' failed: ZeroDivisionError: division by zero" in raised
     assert "expected a COMMAND or None; got int" in gave
+
+
+def test_a_plan_by_hand_waits_until_the_plant_was_heard_of_and_is_refused_when_it_never_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
+    sent: list[COMMAND] = []
+    said: list[str] = []
+
+    async def main(heard: bool) -> None:
+        with Instance("twin") as here:
+            twinning = Twinning(
+                load_system(str(OBSERVATORY)), "tcp://127.0.0.1:1", here, planner=RulePlanner(()),
+                on_verdict=lambda verdict: None, on_command=sent.append, on_refusal=said.append,
+            )  # fmt: skip
+            twinning.plan(encode_period(5))
+            if heard:
+                await twinning._arrived("plant:1", [Event(1, NOW_MS, Kind.VALUE, "ctd.pressure", 1.0)])
+            await twinning.run(asyncio.Event(), 0.2)
+
+    run(main(heard=False))
+    assert (sent, said) == ([], ["period 5 s: the twin ended before it had heard of the plant"])
+    run(main(heard=True))
+    assert sent == [encode_period(5)]
 
 
 def test_what_the_plant_refuses_is_said_by_its_twin_unless_it_is_history(

@@ -15,13 +15,13 @@ from fieldtwin.checking.device_case import DeviceResult, Spoken
 from fieldtwin.checking.run import OTHER_WIRE
 from fieldtwin.checking.subject import Subject
 from fieldtwin.conformance.results import summary
+from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.model import Verdict
 from fieldtwin.report.style import style
 from gateway.core.clock import NS_PER_MS
 from gateway.core.connection import Direction
-from gateway.core.errors import FileInvalid
 
 MOST_LINES = 60
 """Of one case's bytes."""
@@ -30,10 +30,7 @@ ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Ve
 
 def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str, path: Path) -> None:
     """Write the report; raises `FileInvalid` where that is not possible."""
-    try:
-        path.write_text(render_html(subject, results, reproduce), encoding="utf-8")
-    except OSError as e:
-        raise FileInvalid(f"cannot write the report: {e.strerror or e}", path=str(path)) from e
+    put(path, render_html(subject, results, reproduce))
 
 
 def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> str:

@@ -13,12 +13,12 @@ from pathlib import Path
 
 from fieldtwin.report.coverage_tables import coverage_section
 from fieldtwin.report.diagram import timing_diagram
+from fieldtwin.report.file import put
 from fieldtwin.report.markup import Markup, el, join
 from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, Verdict
 from fieldtwin.report.requirements import requirement_section
 from fieldtwin.report.style import style
 from fieldtwin.report.window import MOST_FRAMES, SECOND_NS, Study, Window
-from gateway.core.errors import FileInvalid
 
 MOST_DRAWN = 16
 """Failures with a diagram and frames."""
@@ -39,10 +39,7 @@ MARKS = {
 
 def write_html(report: Report, path: Path) -> None:
     """Write the report; raises `FileInvalid` where that is not possible."""
-    try:
-        path.write_text(render_html(report), encoding="utf-8")
-    except OSError as e:
-        raise FileInvalid(f"cannot write the report: {e.strerror or e}", path=str(path)) from e
+    put(path, render_html(report))
 
 
 def render_html(report: Report) -> str:

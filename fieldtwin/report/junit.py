@@ -10,9 +10,9 @@ from __future__ import annotations
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
+from fieldtwin.report.file import put
 from fieldtwin.report.markup import clean
 from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
-from gateway.core.errors import FileInvalid
 
 MOST_TEXT = 20_000
 """Characters of the text of one test case."""
@@ -20,10 +20,7 @@ MOST_TEXT = 20_000
 
 def write_junit(report: Report, path: Path) -> None:
     """Write the file; raises `FileInvalid` where that is not possible."""
-    try:
-        path.write_bytes(render_junit(report))
-    except OSError as e:
-        raise FileInvalid(f"cannot write the report: {e.strerror or e}", path=str(path)) from e
+    put(path, render_junit(report))
 
 
 def render_junit(report: Report) -> bytes:

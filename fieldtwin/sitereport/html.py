@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fieldtwin.report.file import put
 from fieldtwin.report.markup import Markup, el, join
 from fieldtwin.sitereport.document import Deviation, Device, Document, Piece, Source, Table
 from fieldtwin.sitereport.style import STYLE
-from gateway.core.errors import FileInvalid
 
 MOST_DEVIATIONS = 1000
 HEADINGS = {"check": "Conformance check", "dump": "Dump", "comparison": "Comparison", "difference": "Difference"}
@@ -19,10 +19,7 @@ WORDS = {"deviation": "deviation", "open": "open point", "waived": "waived"}
 
 def write_html(document: Document, path: Path) -> None:
     """Write it; raises `FileInvalid` where that is not possible."""
-    try:
-        path.write_text(render_html(document), encoding="utf-8")
-    except OSError as e:
-        raise FileInvalid(f"cannot write the document: {e.strerror or e}", path=str(path)) from e
+    put(path, render_html(document))
 
 
 def render_html(document: Document) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 import pytest
 import yaml
+from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
 
@@ -54,6 +55,15 @@ def test_scenarios_leave_junit_and_html_on_both_services():
     on_vcan = [(service, text) for service, text in RECIPES if "--can socketcan/vcan0" in text]
     assert {service for service, _ in on_vcan} == {"github", "gitlab"}
     assert all("--junit out/" in text and "--html out/" in text and "always" in text for _, text in on_vcan)
+
+
+def test_the_first_recipe_leaves_its_artefacts_in_a_fresh_checkout(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.scenario.yaml").write_text("scenario: a\nsystem: observatory\nsteps:\n  - pause: 100ms\n")
+    line = next(line for line in commands_of(*RECIPES[0]) if line.startswith("fieldtwin test"))
+    done = CliRunner().invoke(cli, shlex.split(line)[1:], standalone_mode=False)
+    assert (done.exception, done.return_value) == (None, 0)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"scenarios.xml", "scenarios.html"}
 
 
 def test_an_option_that_there_is_not_is_noticed():

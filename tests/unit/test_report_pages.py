@@ -253,10 +253,10 @@ def test_many_scenarios_make_the_matrix_a_list() -> None:
 
 
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
-    write_html(report(), tmp_path / "r.html")
-    assert (tmp_path / "r.html").read_text(encoding="utf-8").startswith("<!doctype html>")
+    write_html(report(), tmp_path / "new" / "r.html")
+    assert (tmp_path / "new" / "r.html").read_text(encoding="utf-8").startswith("<!doctype html>")
     with pytest.raises(FileInvalid, match="cannot write the report"):
-        write_html(report(), tmp_path / "no" / "r.html")
+        write_html(report(), tmp_path / "new" / "r.html" / "r.html")
 
 
 def test_what_is_thinned_still_reaches_the_failure() -> None:

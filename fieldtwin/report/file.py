@@ -1,0 +1,16 @@
+"""Reports as files: in a folder that is made where it is missing, as a CI job's first report finds it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gateway.core.errors import FileInvalid
+
+
+def put(path: Path, content: str | bytes) -> None:
+    """Write the file; raises `FileInvalid` where that is not possible."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    except OSError as e:
+        raise FileInvalid(f"cannot write the report: {e.strerror or e}", path=str(path)) from e

@@ -183,12 +183,12 @@ def command(
         others = {
             "--field": field_host, "--recording": recordings, "--speed": speed, "--listen": listen, "--can": can,
             "--capture": capture, "--seeds": seeds, "--ledger": ledger, "--compare": compare, "--faults": faults,
-            "--thread": thread, "--metrics": metrics, "--log": log, "--prototype-file": prototype_file,
+            "--thread-store": thread_store, "--metrics": metrics, "--log": log, "--prototype-file": prototype_file,
         }  # fmt: skip
         return _run_network(
             NetworkRequest(
                 network, virtual, duration_s, seed, instance, profiles,
-                parse_periods(commands) if commands is not None else None, trace, cold, as_json,
+                parse_periods(commands) if commands is not None else None, trace, cold, as_json, thread,
             ),
             plant,
             [option for option, said in others.items() if said],
@@ -280,7 +280,7 @@ def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int
     if others:
         raise UsageError(
             f"{', '.join(others)}: nothing of a network",
-            expected="--for, --virtual, --seed, --trace, --commands, --instance, --cold, --json",
+            expected="--for, --virtual, --seed, --trace, --commands, --instance, --thread, --cold, --json",
             hint="its systems can be run one by one",
         )
     return run_network(request)

@@ -40,7 +40,7 @@ def test_a_scenario_of_a_network_runs_unchanged_as_processes(tmp_path: Path) -> 
 
 
 def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
-    words = ("run", "ocean_network", "--prototype", "--for", "8s", "--commands", "none", "--json")
+    words = ("run", "ocean_network", "--prototype", "--for", "8s", "--commands", "none", "--json", "--thread", "tcp://127.0.0.1:0")
     ended = run_to_end(tmp_path, *words, within_s=180)
     summary = json.loads(ended.out)
     assert (ended.process.returncode, summary["ok"]) == (0, True), summary["systems"]
@@ -49,5 +49,7 @@ def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
         assert one["states"] == {"adapt": ["STANDBY"]}
         assert {d["state"] for d in one["devices"].values()} == {"good"}
         assert one["outputs_safe"]
+        assert one["thread"]["written"] > 0
+    assert ended.err.count("digital thread  ←  tcp://127.0.0.1:") == 3
     assert {name for name, sea in summary["water"].items() if sea["said"]} == {"west", "middle", "east"}
     no_tracebacks(tmp_path)

@@ -146,9 +146,8 @@ def test_a_twin_that_is_refused_ends_and_a_plant_that_is_refused_waits(
 
 def test_a_broker_without_tls_is_asked_about(tmp_path: Path, pki: Pki) -> None:
     async def main() -> None:
-        with broker(tmp_path) as here:
-            with pytest.raises(Unreachable, match="does it speak that on this port"):
-                await (await plant(url(here, pki, "plant"))).open()
+        with broker(tmp_path) as here, pytest.raises(Unreachable, match="does it speak that on this port"):
+            await (await plant(url(here, pki, "plant"))).open()
 
     run(main())
 

@@ -28,7 +28,13 @@ def run(folder: Path, steps: str, head: str = "") -> ScenarioResult:
     return run_virtual(load_scenario(written(folder, steps, head)))
 
 
-@pytest.mark.parametrize("path", SHIPPED, ids=lambda p: p.name)
+LONG = ("ocean-loss.scenario.yaml", "ocean-silent.scenario.yaml")
+
+
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.name, marks=[pytest.mark.long] if path.name in LONG else []) for path in SHIPPED],
+)
 def test_shipped_scenarios_pass_and_give_the_same_trace_again(path: Path) -> None:
     first = run_virtual(load_scenario(path))
     assert first.verdict is Verdict.PASSED, first.checks

@@ -30,7 +30,7 @@ class Station:
         self.name, self.sea = name, sea
         self.number = NAMES.index(name) + 1
         self.temperature = 8.0
-        self.kept: dict[str, object] = {}
+        self.kept: dict[str, Any] = {}
         self.count, self.due_s, self.period_s = 0, 0.0, 0
         self.log: list[bytes] = []
         self.begin()
@@ -177,6 +177,23 @@ def test_a_front_of_a_restarted_observatory_is_news() -> None:
     ocean.stations["east"].begin()
     ocean.run(60)
     front(ocean, "east", 25)
+    assert ocean.periods() == [2, 2, 2]
+
+
+def test_an_observatory_that_forgot_its_numbers_learns_them_from_the_others() -> None:
+    ocean = Ocean(0.0, 3)
+    ocean.order(10)
+    ocean.run(60)
+    for _ in range(4):
+        front(ocean, "east", 25)
+        ocean.run(60)
+    number = ocean.stations["east"].kept["kept"]
+    ocean.stations["east"].kept = {}
+    ocean.stations["east"].begin()
+    ocean.run(60)
+    front(ocean, "east", 15)  # older than what they know, until it is told so
+    ocean.run(20)
+    assert ocean.stations["east"].kept["kept"] > number
     assert ocean.periods() == [2, 2, 2]
 
 

@@ -1,4 +1,4 @@
-"""A run of a network in virtual time: ``fieldtwin run NETWORK --prototype --virtual --for 6h``.
+"""A run of a network in virtual time: ``fieldtwin run NETWORK --prototype --virtual --for 1h``.
 
 Each system is judged as it is alone (`VirtualRun`): what was published against what its devices held, what both sides counted.
 """

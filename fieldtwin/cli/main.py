@@ -9,6 +9,7 @@ import contextlib
 import difflib
 import errno
 import os
+import signal
 import sys
 from importlib import import_module
 from typing import Any, NoReturn
@@ -148,6 +149,7 @@ def main() -> None:
     from gateway.core.errors import FieldtwinError, FileInvalid
 
     write_plainly()
+    signal.signal(signal.SIGTERM, _told_to_end)
     try:
         code = cli.main(prog_name="fieldtwin", standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
@@ -174,6 +176,11 @@ def main() -> None:
         sys.exit(FileInvalid.exit_code)
     except Exception as e:  # the last border: our bug, reported as such
         _bug(e)
+
+
+def _told_to_end(number: int, frame: object) -> NoReturn:
+    """SIGTERM where a command has no order of its own to end in: what it made in /tmp goes, as after Ctrl-C."""
+    sys.exit(128 + number)
 
 
 def _bug(error: Exception) -> NoReturn:

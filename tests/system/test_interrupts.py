@@ -12,15 +12,15 @@ import pytest
 from support import eventually, run
 
 ROOT = Path(__file__).parents[2]
-PROBE = """
-import sys
+PROBE = r"""
+import os
 from fieldtwin.running.workers import Workers
 from slow import work
 
 if __name__ == "__main__":
     with Workers(2) as pool:
         waiting = [pool.submit(work, 600) for _ in range(3)]
-        print("begun", flush=True)
+        os.write(1, b"begun\n")
         for future in waiting:
             future.result()
 """
@@ -30,7 +30,12 @@ def _started(command: list[str], cwd: Path, runs: str = "") -> subprocess.Popen[
     return subprocess.Popen(
         command,
         cwd=cwd,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}", **({"FIELDTWIN_RUN": str(cwd / runs)} if runs else {})},
+        env={
+            **os.environ,
+            "PYTHONPATH": f"{ROOT}",
+            "TMPDIR": str(cwd),
+            **({"FIELDTWIN_RUN": str(cwd / runs)} if runs else {}),
+        },
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -46,7 +51,8 @@ def _interrupted(process: subprocess.Popen[str], number: int = signal.SIGINT) ->
     return said
 
 
-def test_a_virtual_run_ends_without_a_traceback(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_virtual_run_ends_without_a_traceback(tmp_path: Path, number: int, code: int) -> None:
     trace = tmp_path / "run.jsonl"
     options = ["--prototype", "--virtual", "--for", "24h", "--trace", str(trace)]
     process = _started([sys.executable, "-m", "fieldtwin", "run", "observatory", *options], tmp_path)
@@ -55,25 +61,29 @@ def test_a_virtual_run_ends_without_a_traceback(tmp_path: Path) -> None:
         await eventually(lambda: trace.exists() and trace.stat().st_size > 100_000, within_s=30)
 
     run(until_it_runs(), timeout_s=40)
-    said = _interrupted(process)
-    assert process.returncode == 130
+    said = _interrupted(process, number)
+    assert process.returncode == code
     assert "Traceback" not in said
     assert "Exception ignored" not in said
+    assert [left.name for left in tmp_path.iterdir()] == ["run.jsonl"]
 
 
 @pytest.mark.parametrize("when", ["while they import", "while they work"])
 def test_workers_end_with_who_started_them(tmp_path: Path, when: str) -> None:
     if when == "while they work":
-        text = "import time\ndef work(s):\n    print('here', flush=True)\n    time.sleep(s)\n"
-    else:  # we do, then the first of them
-        text = "import sys, time\nprint('here', flush=True)\ntime.sleep(0.3)\nwork = time.sleep\n"
+        text = "import os, time\ndef work(s):\n    os.write(1, b'here\\n')\n    time.sleep(s)\n"
+    else:  # we do, then they
+        text = "import os, time\nos.write(1, b'here\\n')\ntime.sleep(0.3)\nwork = time.sleep\n"
     (tmp_path / "slow.py").write_text(text)
     (tmp_path / "probe.py").write_text(PROBE)
     process = _started([sys.executable, "probe.py"], tmp_path)
     assert process.stdout is not None
-    while not (line := process.stdout.readline()).startswith("begun"):
+    awaited = ["begun", "here"] if when == "while they work" else ["begun", "here", "here"]
+    while awaited:
+        line = process.stdout.readline().strip()
         assert line
-    assert process.stdout.readline() == "here\n"
+        if line in awaited:
+            awaited.remove(line)
     said = _interrupted(process)
     assert process.returncode == -signal.SIGINT
     assert said.count("Traceback") == 1, said  # of the probe itself, which does not catch it

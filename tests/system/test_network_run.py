@@ -40,7 +40,18 @@ def test_a_scenario_of_a_network_runs_unchanged_as_processes(tmp_path: Path) -> 
 
 
 def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
-    words = ("run", "ocean_network", "--prototype", "--for", "8s", "--commands", "none", "--json", "--thread", "tcp://127.0.0.1:0")
+    words = (
+        "run",
+        "ocean_network",
+        "--prototype",
+        "--for",
+        "8s",
+        "--commands",
+        "none",
+        "--json",
+        "--thread",
+        "tcp://127.0.0.1:0",
+    )
     ended = run_to_end(tmp_path, *words, within_s=180)
     summary = json.loads(ended.out)
     assert (ended.process.returncode, summary["ok"]) == (0, True), summary["systems"]

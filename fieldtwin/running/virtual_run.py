@@ -27,7 +27,7 @@ from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.trace import Event, Kind, Trace, open_sink
 from gateway.core.clock import NS_PER_MS
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from gateway.core.values import Quality, TagValue
 from gateway.runtime.learnt import describe_learnt
 from gateway.runtime.status import describe
@@ -110,6 +110,7 @@ class VirtualRun:
         self._asked: dict[str, deque[int]] = {}
         """By bus: when requests were sent, ns since the start."""
         self._emulated: frozenset[str] = frozenset()
+        self._attached = False
 
     @property
     def disturbed(self) -> bool:
@@ -143,6 +144,8 @@ class VirtualRun:
 
     def _end(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
         error = None if main.cancelled() else main.exception()
+        if isinstance(error, FileInvalid | UsageError) and not self._attached:
+            raise error  # nothing ran that could be judged
         if isinstance(error, FieldtwinError):
             self.errors.append(str(error))
         elif error is not None:
@@ -174,6 +177,7 @@ class VirtualRun:
 
     def attach(self, bench: VirtualBench) -> None:
         """From now on what happens on `bench` is judged."""
+        self._attached = True
         self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
         self._emulated = frozenset(bench.run.field.devices)
         bench.run.gateway.tags.on_put = self._watched(bench)

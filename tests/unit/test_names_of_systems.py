@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.recording import RecordingReader
 from twin.data_files import data_root, find
@@ -49,3 +50,9 @@ def test_a_file_of_another_verb_is_named(tmp_path: Path, line: str, told: str) -
     (tmp_path / "given.jsonl").write_text(line)
     with pytest.raises(FileInvalid, match=told):
         RecordingReader(tmp_path / "given.jsonl")
+
+
+def test_a_virtual_run_that_cannot_begin_is_an_error_of_the_file() -> None:
+    options = VirtualOptions(system="observatory", duration_s=1.0, recordings={"ctd": "nowhere.jsonl"})
+    with pytest.raises(FileInvalid, match=r"nowhere.jsonl"):
+        VirtualRun(options).run()

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+
+import msgspec
 
 CAPACITY = 200_000
 SHARED, LEAST = 1_000_000, 1_000
 """Entries of all devices of a process together, some 60 bytes each; and what a device has of them at least."""
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
+class Held(msgspec.Struct, frozen=True, gc=False):
     """From `t_ns` (the emulator's monotonic time) on, `tag` was `raw`."""
 
     number: int

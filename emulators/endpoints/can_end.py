@@ -10,10 +10,10 @@ import asyncio
 import errno
 import os
 import socket
-from dataclasses import replace
 from pathlib import Path
 
 import can
+from msgspec.structs import replace
 
 from emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, WANTS_ERRORS, Hello, Status, unpack_hello
 from emulators.endpoints.overrun import TellsOverrun

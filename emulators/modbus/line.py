@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
+
 from emulators.modbus.unit import ModbusUnit
 from gateway.core.errors import UsageError
 
@@ -18,8 +20,7 @@ BROADCAST = 0
 LOWEST_UNIT, HIGHEST_UNIT = 1, 247
 
 
-@dataclass(frozen=True, slots=True)
-class Exchange:
+class Exchange(msgspec.Struct, frozen=True, gc=False):
     """A whole frame that was heard, and the whole frame to send for it; empty when there is nothing to say.
 
     `latency_s`: how long the unit says that it thinks about this answer (`ModbusUnit.latency_s`).

@@ -13,11 +13,11 @@ import asyncio
 import select
 import socket
 import threading
-from dataclasses import replace
 from typing import cast
 
 import can
 from can.typechecking import CanFilters
+from msgspec.structs import replace
 
 from gateway.connections.soft_bus_hello import Welcome, ask, read_answer
 from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record

@@ -8,7 +8,8 @@ Fixed size, so that a reader can take exactly one from a socket and leave the re
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+
+import msgspec
 
 from gateway.core.errors import Desync
 
@@ -22,8 +23,7 @@ FLAG_TX_CONFIRMED = 0x08
 """The bus tells the sender that this very frame was on the wire (record only; never on a received frame)."""
 
 
-@dataclass(frozen=True, slots=True)
-class CanFrame:
+class CanFrame(msgspec.Struct, frozen=True, gc=False):
     """A classic CAN frame. `can_id` is 11 bits, 29 with `extended`; `data` is 0 to 8 bytes.
 
     A remote frame (`remote`) has no data and asks for `dlc` bytes. `t_ns` is when it was received (monotonic, 0 if
@@ -40,7 +40,7 @@ class CanFrame:
 
     def __post_init__(self) -> None:
         if self.dlc < 0:
-            object.__setattr__(self, "dlc", len(self.data))
+            msgspec.structs.force_setattr(self, "dlc", len(self.data))
         limit = 0x1FFFFFFF if self.extended or self.error else 0x7FF
         if not 0 <= self.can_id <= limit or len(self.data) > 8 or self.dlc > 8:
             raise Desync(

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from gateway.core.errors import NotAllowed
 from gateway.core.profile import REGISTERS_OF, Tag

@@ -8,7 +8,9 @@ are as old as the sample and not as the poll: a sensor that answers and does not
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+
+from msgspec.structs import replace
 
 from gateway.core.connection import PROTOCOL, ByteConnection
 from gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+import msgspec
+
 from gateway.core.profile import DeviceProfile
 from gateway.core.values import Quality, Reason, TagValue
 from gateway.runtime.coming import AnyDriver, Coming
@@ -63,4 +65,4 @@ class _Taking:
 def _kept(held: TagValue, anew: TagValue) -> TagValue:
     if held.quality is Quality.GOOD or held.reason in OF_DECODING:
         return anew
-    return replace(held, value=anew.value)
+    return msgspec.structs.replace(held, value=anew.value)

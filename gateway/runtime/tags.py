@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+
+import msgspec
+from msgspec.structs import replace
 
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
@@ -17,8 +19,7 @@ JOURNAL = 100_000
 """Published values that are kept until somebody fetches them; the oldest are dropped and counted."""
 
 
-@dataclass(frozen=True, slots=True)
-class Published:
+class Published(msgspec.Struct, frozen=True, gc=False):
     """A good value as it was published: number (from 1), tag, what the device sent, engineering value, source time."""
 
     number: int

@@ -335,7 +335,10 @@ def print_summary(summary: dict[str, Any]) -> None:
         data.print(f"  [yellow]by hand[/yellow]        the PLC: {acts_text(acts)}", soft_wrap=True)
         if left:
             data.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
+    told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
     for error in summary["errors"]:
+        if error in told:  # beside the device, above
+            continue
         data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
 

@@ -286,7 +286,7 @@ def test_prototypes_that_cannot_be(tmp_path: Path, before: str, after: str, told
 def why_not(path: str) -> str:
     try:
         run = VirtualRun(VirtualOptions(path, 1.0))
+        run.run()
     except FieldtwinError as e:
         return str(e)
-    run.run()
     return " ".join(run.errors)

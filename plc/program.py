@@ -21,6 +21,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, ClassVar
 
+import msgspec
+
 from gateway.core.errors import Blame, Bug, FieldtwinError
 from gateway.core.image import Message, TagKind
 from gateway.core.values import Scalar, TagValue
@@ -121,8 +123,7 @@ def message_output(max_bytes: int = MESSAGE_BYTES, depth: int = MESSAGE_DEPTH) -
     return Variable("", Role.OUTPUT, TagKind.MESSAGE, max_bytes=max_bytes, depth=depth)
 
 
-@dataclass(frozen=True, slots=True)
-class ScanInfo:
+class ScanInfo(msgspec.Struct, frozen=True, gc=False):
     """The scan that runs: its frozen time (monotonic), its number from 1, and whether it is the first since start."""
 
     now_ns: int

@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+
+import msgspec
 
 from emulators.canopen import codec
 from emulators.canopen.aborts import Abort, abort
@@ -53,29 +54,27 @@ class Objects:
         return sorted(sub for sub in found.entries if sub) if found else []
 
 
-@dataclass(frozen=True, slots=True)
-class Situation:
+class Situation(msgspec.Struct, frozen=True):
     """What a model is told. `written` are the objects that SDO clients or RPDOs wrote just now, changed or not; `errors` the
     EMCY codes that are present in the node, whoever raised them."""
 
     now_ns: int
     objects: Objects
-    played: Mapping[Key, Number] = field(default_factory=dict)
+    played: Mapping[Key, Number] = msgspec.field(default_factory=dict)
     written: Collection[Key] = ()
     errors: tuple[int, ...] = ()
     nmt: NmtState = NmtState.PRE_OPERATIONAL
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
+class Outcome(msgspec.Struct, frozen=True):
     """What a model answers. Objects that the node does not have are left out, numbers are rounded and held within their type.
 
     A change of one of `states` is an event for the TPDOs that map it; `readings` change all the time and are none.
     `clears` are EMCY codes whose errors are over. `wake_at_ns` is when to be asked next, None for not by itself.
     """
 
-    states: Mapping[Key, Number] = field(default_factory=dict)
-    readings: Mapping[Key, Number] = field(default_factory=dict)
+    states: Mapping[Key, Number] = msgspec.field(default_factory=dict)
+    readings: Mapping[Key, Number] = msgspec.field(default_factory=dict)
     clears: tuple[int, ...] = ()
     wake_at_ns: int | None = None
 
@@ -126,7 +125,7 @@ class Behaviour(Service):
 
     def power_on(self, now_ns: int) -> None:
         """Reset node: what was stored or left the factory is in the objects again."""
-        self._model.power_on(replace(self._situation(now_ns, (), self._played(now_ns)), errors=()))
+        self._model.power_on(msgspec.structs.replace(self._situation(now_ns, (), self._played(now_ns)), errors=()))
 
     def written(self, keys: Collection[Key], now_ns: int) -> None:
         """An RPDO wrote these objects."""

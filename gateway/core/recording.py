@@ -20,7 +20,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, Literal, TypeVar
@@ -90,8 +89,7 @@ class Exchange(msgspec.Struct, frozen=True, gc=False):
     error: ExchangeError | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class SignalRow:
+class SignalRow(msgspec.Struct, frozen=True, gc=False):
     """All signals at one time, in the header's order; NaN where there is no value."""
 
     t_s: float

@@ -91,7 +91,10 @@ class HeartbeatConsumer:
         return min(deadlines, default=None)
 
     def _node(self, node: int) -> _Node:
-        return self._nodes.setdefault(node, _Node())
+        known = self._nodes.get(node)
+        if known is None:
+            known = self._nodes[node] = _Node()
+        return known
 
     def _overdue(self, node: int, known: _Node, now_ns: int) -> tuple[NodeEvent, ...]:
         deadline_ns = known.deadline_ns

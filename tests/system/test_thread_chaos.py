@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import re
 import shutil
+import socket
 import sqlite3
 import sys
 from collections.abc import Iterator
@@ -88,6 +89,11 @@ class Chaos:
         with fieldtwin(self.root, *self._twin, *options, name=f"twin{next(self._numbers)}") as run:
             yield run
 
+    def field_is_gone(self) -> bool:
+        """Its ports are free again, which a prototype file may name."""
+        with closing(socket.socket(socket.AF_UNIX)) as probe:
+            return probe.connect_ex(str(self.root / "observatory" / "field.sock")) != 0
+
     def counts(self) -> tuple[int, int]:
         """Events of the plant's log, and how many of them its twin has without a gap."""
         origin = own(self.stores[0], "plant")
@@ -106,6 +112,7 @@ class Chaos:
                     if which == "plant":
                         plant.process.kill()
                         plant.wait()
+                        wait_for(self.field_is_gone, 10, "the field side, which lingers, ends")
                         plant = stack.enter_context(self.plant())
                         self.until_more(self._chance.randrange(5, 40), twin)
                     twin.process.kill()

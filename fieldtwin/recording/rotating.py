@@ -112,13 +112,17 @@ def part(path: Path, number: int) -> Path:
 
 
 def parts_of(path: Path) -> list[Path]:
-    """The parts of the recording at `path`, in order: those that are there, from the oldest that was kept."""
+    """The parts of the recording at `path`, in order: those that are there, from the oldest that was kept.
+
+    A last part without a header is none: its recorder was killed when it had made the file and not yet begun it.
+    """
     numbers = sorted(
         int(name)
-        for found in path.parent.glob(f"{_escaped(path.stem)}.[0-9][0-9][0-9][0-9]{path.suffix}")
-        if (name := found.name[len(path.stem) + 1 : len(path.stem) + 5]).isdigit()
+        for at in path.parent.glob(f"{_escaped(path.stem)}.[0-9][0-9][0-9][0-9]{path.suffix}")
+        if (name := at.name[len(path.stem) + 1 : len(path.stem) + 5]).isdigit()
     )
-    return [*([path] if path.is_file() or not numbers else []), *(part(path, n) for n in numbers)]
+    found = [*([path] if path.is_file() or not numbers else []), *(part(path, n) for n in numbers)]
+    return found if len(found) == 1 or found[-1].stat().st_size else found[:-1]
 
 
 def oldest_part(path: Path) -> Path:

@@ -18,6 +18,8 @@ from fieldtwin.cli.main import COMMANDS, cli
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md")]
 PAGES += [*sorted(p for p in (ROOT / "docs").rglob("*.md") if "decisions" not in p.parts)]
 _FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+MISSPELT = "fieldtwin runn observatory:"
+"""Shown in the walkthrough for what it prints."""
 _INLINE = re.compile(r"`(fieldtwin\s[^`]+)`")
 
 
@@ -82,6 +84,7 @@ def unknown(words: list[str]) -> str:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_commands_of_a_page_are_there(page):
     wrong = [f"{' '.join(words)}: {why}" for words in shown(page.read_text("utf-8")) if (why := unknown(words))]
+    wrong = [line for line in wrong if not line.startswith(MISSPELT)]
     assert not wrong, "\n".join(wrong)
 
 

@@ -41,7 +41,7 @@ from fieldtwin.recording.polling import (
     record_node,
     record_polls,
 )
-from fieldtwin.recording.rotating import RotatingFile, exchanges_of, parts_of
+from fieldtwin.recording.rotating import RotatingFile, exchanges_of, part, parts_of
 from fieldtwin.recording.sinks import CanLogSink, ExchangeSink, LineSink
 from fieldtwin.recording.tapping import LineTap
 from fieldtwin.running.device_here import DeviceHost, as_it_was_recorded
@@ -444,6 +444,8 @@ def test_parts_are_bounded_and_the_oldest_go(tmp_path: Path) -> None:
     assert all(path.stat().st_size <= 1000 and path.read_bytes().startswith(head) for path in parts_of(out))
     times = [e.t_s for e in exchanges_of(out)]
     assert times == [float(n) for n in range(200 - len(times), 200)]
+    part(out, 9999).touch()  # a recorder was killed when it had made the next part and not yet written to it
+    assert [e.t_s for e in exchanges_of(out)] == times
     assert file.removed > 3
     with RotatingFile(tmp_path / "t.jsonl", head, max_s=10.0) as file:
         for n, line in enumerate(lines[:35]):

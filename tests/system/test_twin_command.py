@@ -32,7 +32,7 @@ def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_pat
             )
             health = second.control("observatory-twin", "twin")
             wait_for(lambda: health("ready")["ready"], 20, "the twin says that it hears the plant")
-            assert health("get")["period_s"] == 3
+            wait_for(lambda: health("get")["period_s"] == 3, 20, f"it knows what the first one commanded; {second.err}")
             second.signal(2)
             assert second.wait(20) == 0, second.err
         assert plant("get")["commands_taken"] == 2, "nothing is repeated"

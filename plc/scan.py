@@ -32,6 +32,7 @@ from plc.program import (
 )
 from plc.publishing import OutputImage, find
 
+_BAD = int(Quality.BAD)
 MAX_SHOWN, MAX_SHOWN_BYTES = 4, 24
 """Of the messages that a scan took, what is remembered with a change that it made."""
 
@@ -179,7 +180,7 @@ class Scan:
         alive = self.gateway_alive = self._alive(now_ns)
         values, qualities = snapshot.values, snapshot.qualities
         for item in self._plain:
-            if alive and qualities[item.index] != Quality.BAD:
+            if alive and qualities[item.index] != _BAD:
                 value = values[item.index]
                 if item.hold:
                     item.held = value, snapshot.time_ns(item.index)

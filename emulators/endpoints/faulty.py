@@ -35,7 +35,8 @@ class FaultyEnd(ByteConnection):
         """Pieces that were lost because too many waited."""
         self._faults = faults
         self._loop = asyncio.get_running_loop()
-        self._in = {way: Assembler(way, faults.framing) for way in Way}
+        self._requests = Assembler(Way.REQUEST, faults.framing)
+        self._replies = Assembler(Way.REPLY, faults.framing)
         self._free_ns = dict.fromkeys(Way, 0)
         self._gathered: dict[Way, bytearray] = {}
         self._asked: Frame | None = None
@@ -112,7 +113,7 @@ class FaultyEnd(ByteConnection):
         self._show(Way.REQUEST, data)
         if self._dead:
             return True
-        assembler = self._in[Way.REQUEST]
+        assembler = self._requests
         if not self._faults.active and not assembler.pending and self._free_ns[Way.REQUEST] <= 0:
             return False
         for frame in assembler.feed(data):
@@ -132,18 +133,18 @@ class FaultyEnd(ByteConnection):
         if self._flush is not None:
             self._flush.cancel()
             self._flush = None
-        if self._in[Way.REQUEST].pending and not self._faults.framing.streams:
+        if self._requests.pending and not self._faults.framing.streams:
             self._flush = self._loop.call_later(FLUSH_S, self._flush_now)
 
     def _flush_now(self) -> None:
-        for frame in self._in[Way.REQUEST].flush():
+        for frame in self._requests.flush():
             self._on_request(frame)
 
     def _said(self, data: bytes, after_s: float = 0.0) -> list[bytes]:
         """What of an emulator's reply goes out at once; the rest is on its way."""
         if self._dead:
             return []
-        assembler = self._in[Way.REPLY]
+        assembler = self._replies
         if not self._faults.active and not assembler.pending and self._free_ns[Way.REPLY] <= 0:
             return [data]
         frames = assembler.feed(data)

@@ -130,7 +130,7 @@ class _ForkRun:
         async with AsyncExitStack() as stack:
             await stack.enter_async_context(run)
             run.gateway.tags.on_put = self.outcome.saw_tag
-            if self.plan.commands:
+            if self.plan.commands or run.field.far:  # nobody at the far end would mean modems that are full for ever
                 nursery = await stack.enter_async_context(Nursery())
                 nursery.start(self._shore().run(list(self.plan.commands)), "far end")
             for fault in self.plan.faults:

@@ -21,6 +21,8 @@ from gateway.runtime.modbus_bus import Job, ModbusBus
 RETRY_NS = 1000 * NS_PER_MS
 ASK_EVERY_NS = 50 * NS_PER_MS
 """How often a full outbox is looked at again."""
+MOST_PATIENCE_NS = 2000 * NS_PER_MS
+"""How long a full outbox is not looked at, at most, because the message before took that long to leave it."""
 
 
 class MailboxPump:
@@ -49,6 +51,8 @@ class MailboxPump:
         self._busy = False
         self._sending = 0
         self._next_ns = 0
+        self._sent_ns: int | None = None
+        self._patience_ns = 0
         self._recorded: tuple[str, object] | None = None
 
     def command(self, payload: bytes, by: str) -> bool:
@@ -98,12 +102,20 @@ class MailboxPump:
                 self._submit(self.driver.acknowledge)
         elif self.driver.consumer.queue:
             if self.driver.outbox_free:
+                self._learn(now_ns)
                 if self._on_record("outbox", self.driver.consumer.queue[0].data.hex(), now_ns):
-                    self._sending = 1
+                    self._sending, self._sent_ns = 1, now_ns
                     self._submit(self.driver.send)
-            else:
+            elif self._sent_ns is None or now_ns >= self._sent_ns + self._patience_ns:
                 self._next_ns = now_ns + ASK_EVERY_NS
                 self._submit(self._ask)
+
+    def _learn(self, now_ns: int) -> None:
+        """The outbox is free again. The next message will take about as long to leave it: there is no use in asking a slow
+        modem every 50 ms meanwhile. Three quarters, so that a modem that got faster is noticed."""
+        if self._sent_ns is not None:
+            self._patience_ns = min((now_ns - self._sent_ns) * 3 // 4, MOST_PATIENCE_NS)
+            self._sent_ns = None
 
     def _on_record(self, tag: str, new: object, now_ns: int) -> bool:
         """Note the write before it happens; without a record it waits and is tried again."""

@@ -72,6 +72,13 @@ def test_commands_and_faults_of_a_plan_and_the_same_again() -> None:
     assert {**again.described(), "took_s": 0} == {**off.described(), "took_s": 0}
 
 
+def test_somebody_listens_at_the_far_end() -> None:
+    """Modems whose messages nobody takes would be full in the end, and the fork would foresee losses that there are not."""
+    outcome = answer(Fork("observatory", DEEP, 40.0), Plan("go on", finally_=("relay.waiting < 3",)))
+    assert outcome.met, outcome.described()
+    assert outcome.variables["modem.link_sent"].last > 30
+
+
 def test_a_simulation_goes_on_from_its_values() -> None:
     known = KnownState({"localiser.x": 5.0, "localiser.heading": 0.0, "console.enable": 1, "console.speed": 1.0})
     outcome = answer(Fork("lab_vehicle", known, 4.0), Plan("drive", finally_=("localiser.x > 6",)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Self, TypeVar
 
 from gateway.core.clock import NS_PER_S, Clock
@@ -45,6 +46,9 @@ from gateway.protocols.modbus.requests import (
 from gateway.protocols.modbus.transaction import Transaction
 
 R = TypeVar("R", bound=Reply)
+
+_read_registers = lru_cache(maxsize=1024)(ReadRegisters)
+"""Polls ask the same again and again; a request is a value, checked when it is made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +206,7 @@ class ModbusClient:
         self, unit: int, table: RegisterTable, address: int, count: int, timeout_s: float | None = None
     ) -> RegistersReply:
         """Read 1 to 125 holding (03h) or input (04h) registers. Errors as `execute`."""
-        return await self.execute(unit, ReadRegisters(table, address, count), timeout_s)
+        return await self.execute(unit, _read_registers(table, address, count), timeout_s)
 
     async def read_bits(
         self, unit: int, table: BitTable, address: int, count: int, timeout_s: float | None = None

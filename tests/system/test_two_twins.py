@@ -29,6 +29,7 @@ def test_two_twins_of_one_system_run_side_by_side_and_each_has_its_own_plant(tmp
             start("twin", "observatory", "--from", place, "--json", "--command", str(period), name=f"{name}-twin")
             for place, period, name in zip(places, (3, 7), names, strict=True)
         ]
+        twins[0].control("one-twin", "twin")("get")  # it is there: the name is taken
         again = run_to_end(root, "twin", "observatory", "--from", places[0], "--instance", "one-twin", name="again")
         assert again.process.returncode == 4
         assert "is running already" in again.err

@@ -7,7 +7,7 @@ import random
 
 import pytest
 from canopen_master_bus import LoopClock, MemoryEnd, bus, run_virtual, running
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import eventually
 
@@ -40,8 +40,10 @@ def test_a_reply_that_may_be_the_late_one_settles_only_what_is_older() -> None:
     late.answered(N)
     assert not late.is_ambiguous(M)
     assert not late.is_ambiguous(N)
-    late.answered(PROBES[0])
+    assert late.answered(PROBES[0])
     assert late.is_ambiguous(PROBES[0])
+    assert late.answered(PROBES[0])
+    assert not late.answered(PROBES[0])
 
 
 def test_a_boot_up_settles_all() -> None:
@@ -104,6 +106,9 @@ class OrderlyServer:
         return None
 
 
+OBJECTS = ((0x2000, 0), (0x2000, 1), (0x2001, 0), (0x2001, 1))
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     seed=st.integers(0, 2**32),
@@ -111,6 +116,7 @@ class OrderlyServer:
     delay_s=st.sampled_from([0.2, 1.0, 3.0]),
     wanted=st.lists(st.tuples(st.integers(0x2000, 0x2001), st.integers(0, 1)), min_size=5, max_size=40),
 )
+@example(502922616, 0.0, 3.0, [OBJECTS[int(n)] for n in "103213133000023032"])  # two replies to one probe
 def test_co023_a_value_is_never_older_than_its_request(
     seed: int, loss: float, delay_s: float, wanted: list[tuple[int, int]]
 ) -> None:

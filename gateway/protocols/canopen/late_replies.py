@@ -39,11 +39,13 @@ class LateReplies:
         """A request was given up on (time-out, cancellation, protocol error): its reply may come later, or never."""
         self._outstanding.append(request)
 
-    def answered(self, request: Multiplexor) -> None:
-        """A reply for `request` came. If one was outstanding for it, this may be that one: only what is older is settled."""
+    def answered(self, request: Multiplexor) -> bool:
+        """A reply for `request` came. If one was outstanding for it, this may be that one: only what is older is settled, and
+        it is True: who asked for it now has to go on expecting the other reply."""
         while self._outstanding:
             if self._outstanding.popleft() == request:
-                return
+                return True
+        return False
 
     def settle(self) -> None:
         """Nothing can be on its way any more: the node has booted."""

@@ -167,9 +167,8 @@ class SdoChannel:
             self._counters.ignored += len(self._inbox)
             self._inbox.clear()
             if not self._rebooted:  # else nothing can be on its way, and there is nothing to abort
-                if transfer.answered:
-                    self._late.answered(request)
-                if not complete:
+                other_expected = transfer.answered and self._late.answered(request)
+                if not complete or other_expected:
                     self._late.unanswered(request)
                 self._owe(transfer)
 

@@ -6,24 +6,20 @@ Each system is judged as it is alone (`VirtualRun`): what was published against 
 from __future__ import annotations
 
 import asyncio
-import tempfile
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.seal import sealed
+from fieldtwin.running.driven import TRACE_KEPT, drive
 from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.shore import Scripted
 from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.running.virtual_run import PIECE_S, VirtualOptions, VirtualRun
-from fieldtwin.scenarios.trace import Trace, open_sink
+from fieldtwin.scenarios.trace import Trace
 from gateway.core.errors import FieldtwinError
 from twin.network import Network
-
-TRACE_KEPT = 20_000
 
 
 @dataclass(frozen=True)
@@ -63,28 +59,20 @@ class VirtualNetworkRun:
 
     def run(self, progress: Callable[[float], None] | None = None) -> None:
         """Run it. `progress` is told the virtual seconds that are over, from time to time. Errors are kept in `errors`."""
-        loop = VirtualLoop()
-        with ExitStack() as stack:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
-            sink: BinaryIO | None = None
-            if self.options.trace is not None:
-                sink = stack.enter_context(open_sink(self.options.trace))
-            self.trace = Trace(TRACE_KEPT, sink)
-            stack.callback(loop.close)
-            with sealed():
-                main = loop.create_task(self._main(loop, folder), name="run")
-                main.add_done_callback(lambda _: loop.stop())
-            while not main.done():
-                with sealed():
-                    loop.run_forever()
-                if progress is not None:
-                    progress(self.elapsed_s)
-            error = None if main.cancelled() else main.exception()
-            if isinstance(error, FieldtwinError):
-                self.errors.append(str(error))
-            elif error is not None:
-                raise error
-            self.errors += [f"nobody caught: {context.get('message')}" for context in loop.unhandled[:100]]
+        between = None if progress is None else lambda: progress(self.elapsed_s)
+        drive(self._begin, self._end, trace=self.options.trace, between=between)
+
+    def _begin(self, loop: VirtualLoop, folder: Path, trace: Trace) -> Coroutine[Any, Any, None]:
+        self.trace = trace
+        return self._main(loop, folder)
+
+    def _end(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
+        error = None if main.cancelled() else main.exception()
+        if isinstance(error, FieldtwinError):
+            self.errors.append(str(error))
+        elif error is not None:
+            raise error
+        self.errors += [f"nobody caught: {context.get('message')}" for context in loop.unhandled[:100]]
 
     async def _main(self, loop: VirtualLoop, folder: Path) -> None:
         o = self.options

@@ -7,24 +7,22 @@ looked at again, to show how far it is. What is the same from run to run is trac
 from __future__ import annotations
 
 import asyncio
-import tempfile
 from collections import deque
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from emulators.faults.schema import seconds
 from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.seal import sealed
 from fieldtwin.running.age_oracle import AgeOracle
+from fieldtwin.running.driven import TRACE_KEPT, drive
 from fieldtwin.running.fault_schedule import random_schedule
 from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.virtual_bench import VirtualBench
-from fieldtwin.scenarios.trace import Event, Kind, Trace, open_sink
+from fieldtwin.scenarios.trace import Event, Kind, Trace
 from gateway.core.clock import NS_PER_MS
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
@@ -44,7 +42,6 @@ CALM_S = 60.0
 ASKED_KEPT = 64
 CAN_WIRE_NS = 10 * NS_PER_MS
 """What a frame may need on a CAN bus: several attempts, behind others."""
-TRACE_KEPT = 20_000
 MAX_ERRORS = 100
 
 
@@ -124,23 +121,12 @@ class VirtualRun:
 
     def run(self, progress: Callable[[float], None] | None = None) -> None:
         """Run it. `progress` is told the virtual seconds that are over, from time to time. Errors are kept in `errors`."""
-        loop = VirtualLoop()
-        with ExitStack() as stack:
-            run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
-            sink: BinaryIO | None = None
-            if self.options.trace is not None:
-                sink = stack.enter_context(open_sink(self.options.trace))
-            self.trace = Trace(TRACE_KEPT, sink)
-            stack.callback(loop.close)
-            with sealed():
-                main = loop.create_task(self._main(loop, run_dir), name="run")
-                main.add_done_callback(lambda _: loop.stop())
-            while not main.done():
-                with sealed():
-                    loop.run_forever()
-                if progress is not None:
-                    progress(self.elapsed_s)
-            self._end(main, loop)
+        between = None if progress is None else lambda: progress(self.elapsed_s)
+        drive(self._begin, self._end, trace=self.options.trace, between=between)
+
+    def _begin(self, loop: VirtualLoop, run_dir: Path, trace: Trace) -> Coroutine[Any, Any, None]:
+        self.trace = trace
+        return self._main(loop, run_dir)
 
     def _end(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
         error = None if main.cancelled() else main.exception()

@@ -7,7 +7,7 @@ from random import Random
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from emulators.wires.acoustic import AcousticMedium, Water
@@ -122,6 +122,7 @@ def test_an_order_and_a_front_go_from_one_end_to_the_other_and_are_over_everywhe
     seed=st.integers(0, 10_000),
     told=st.lists(st.tuples(st.sampled_from(["order", "front", "deaf", "restart"]), st.integers(1, 60)), max_size=6),
 )
+@example(0.0, 0, [("order", 1)])  # so fast that a period can be written at no moment between two samples
 def test_in_the_end_all_know_the_same(loss: float, seed: int, told: list[tuple[str, int]]) -> None:
     ocean, random = Ocean(loss, seed), Random(seed)
     ocean.order(20)

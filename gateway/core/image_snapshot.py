@@ -38,7 +38,7 @@ class Message:
 class Snapshot(NamedTuple):
     """One publication of a region, whole. `counter` counts publications from 1; 0 means that there never was one.
 
-    `values`, `qualities`, `reasons` and `times_ns` are columns in the order of the region's tags; `value` joins them
+    `values`, `qualities`, `reasons` and `stamps` are columns in the order of the region's tags; `value` joins them
     for one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, what is new since
     the reader's last snapshot, in order; a tag without news has no entry. Times stay packed in `stamps` until somebody
     asks for one: hardly anybody does. As long as no value, quality or reason changes, snapshots share those columns.
@@ -62,11 +62,6 @@ class Snapshot(NamedTuple):
     def time_ns(self, index: int) -> int:
         """The source's time of the tag at `index` (monotonic)."""
         return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
-
-    @property
-    def times_ns(self) -> tuple[int, ...]:
-        """The sources' times of all tags."""
-        return self.shape.times.unpack(self.stamps)
 
     def all(self) -> dict[str, TagValue]:
         """Every tag by name."""

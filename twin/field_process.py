@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import secrets
 import signal
 import sys
 from collections.abc import Callable
@@ -82,6 +83,7 @@ class FieldProcess:
         self._config = config
         self._stop = asyncio.Event()
         self.control_port = 0
+        self._life = secrets.token_hex(8)  # of this process: started again, it has another one, and counts from nothing
 
     async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
         """Open, call `on_ready`, serve until stopped."""
@@ -141,7 +143,7 @@ class FieldProcess:
         return {"ready": True, "pid": os.getpid()}
 
     async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
-        return self._field.status()
+        return {"life": self._life, **self._field.status()}
 
     async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
         """At most `HELD_AT_ONCE` entries a device, the oldest first: who wants them all asks again."""

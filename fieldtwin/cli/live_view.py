@@ -87,7 +87,7 @@ class LiveView:
         open_ports: set[str] = set()
         with Live(render(self._session), console=talk, auto_refresh=False, transient=True) as live:
             while True:
-                open_ports = self._tell_ports(open_ports)
+                open_ports = self._tell_once(open_ports)
                 live.update(render(self._session), refresh=True)
                 await asyncio.sleep(REFRESH_S)
 
@@ -96,7 +96,7 @@ class LiveView:
         open_ports: set[str] = set()
         while True:
             await asyncio.sleep(LINE_S)
-            open_ports = self._tell_ports(open_ports)
+            open_ports = self._tell_once(open_ports)
             now = troubles(self._session)
             for trouble in now:
                 if trouble not in told:  # once, and again only when it had gone
@@ -104,9 +104,11 @@ class LiveView:
             told = set(now)
             talk.print(line(self._session), soft_wrap=True, markup=False)
 
-    def _tell_ports(self, told: set[str]) -> set[str]:
-        """Say once where the gateway listens: a prototype takes free ports."""
+    def _tell_once(self, told: set[str]) -> set[str]:
+        """Say once where the gateway listens: a prototype takes free ports. And that a lost field side is back."""
         now = set(ports(self._session))
+        if (back := self._session.field_return) is not None and back.news:
+            now.add(back.news)
         for text in sorted(now - told):
             talk.print(f"  {text}", soft_wrap=True, markup=False)
         return now
@@ -131,6 +133,8 @@ def troubles(session: RunSession) -> list[str]:
     what stopped the PLC, the digital thread's carrier and store."""
     gateway = session.gateway_status or {}
     found = list(session.errors)
+    if session.field_return is not None and (trouble := session.field_return.trouble):
+        found.append(trouble)
     closed = {name: bus["error"] for name, bus in gateway.get("buses", {}).items() if bus["error"]}
     found += [f"{name}: {error}" for name, error in closed.items()]
     for kind in ("serve", "bridge"):
@@ -320,9 +324,13 @@ def print_summary(summary: dict[str, Any]) -> None:
     published = summary["published"]
     if summary["prototype"]:
         checked = f"{published['checked']} compared with what the devices held, {published['wrong']} wrong"
+        if published.get("unknown"):
+            checked += f"; {published['unknown']} from when the field side went, and nobody can say"
         data.print(f"  published      {checked}", soft_wrap=True)
     else:
         data.print(f"  published      {published['values']} good values")
+    if (field := summary["field"]) and field["losses"]:
+        data.print(f"  field side     lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True)
     if far := summary["far_end"]:
         data.print(f"  far end        commands {far['commands_sent']}, responses {far['responses']}")
     data.print(f"  logged         {summary['logged']} exchanges")
@@ -341,6 +349,10 @@ def print_summary(summary: dict[str, Any]) -> None:
             continue
         data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
 
 
 def _thread_text(thread: dict[str, Any]) -> str:

@@ -8,6 +8,7 @@ is started here.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from fieldtwin.running.link_child import LinkChild
 from gateway.core.control import ControlClient
@@ -28,6 +29,11 @@ class FieldContact:
         self.mapping = mapping
         self.far = far
         self.links: list[LinkChild] = []
+        self.life = ""
+        """Which process it is: a field side that was started again is another one."""
+        self.listening: dict[str, str] = {}
+        self.far_said: dict[str, str] = {}
+        """Where buses and far modems are, as the field side says it."""
         self.counted_before: dict[str, dict[str, int]] = {}
         """By device, what its counters said when we came: a field side may have served others before us."""
 
@@ -64,14 +70,9 @@ async def contact_elsewhere(host_port: str, token: str, system: System, run_dir:
 
 async def _contact(client: ControlClient, system: System, host: str, run_dir: Path) -> FieldContact:
     status = await client.call("get")
-    if status["system_hash"] != system.hash:
-        raise FileInvalid(
-            f"the field side runs another version of {system.name!r}",
-            path=str(system.path),
-            expected=f"the same file (hash {system.hash})",
-            got=f"{status['system']!r} (hash {status['system_hash']})",
-        )
+    check_same(system, status)
     contact = FieldContact(client, {}, {})
+    contact.life, contact.listening, contact.far_said = status["life"], status["listening"], status["far"]
     contact.counted_before = {name: dict(device["counters"]) for name, device in status["devices"].items()}
     try:
         for bus_name, url in status["listening"].items():
@@ -91,6 +92,17 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
         if name not in status["listening"]:
             contact.mapping[bus.endpoint] = bus.endpoint  # the prototype file says `plant` for this bus
     return contact
+
+
+def check_same(system: System, status: dict[str, Any]) -> None:
+    """Raise `FileInvalid` where a field side with this status has another version of the system file."""
+    if status["system_hash"] != system.hash:
+        raise FileInvalid(
+            f"the field side runs another version of {system.name!r}",
+            path=str(system.path),
+            expected=f"the same file (hash {system.hash})",
+            got=f"{status['system']!r} (hash {status['system_hash']})",
+        )
 
 
 def reachable(listening: Endpoint, host: str) -> Endpoint:

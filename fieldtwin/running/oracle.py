@@ -23,24 +23,35 @@ class Oracle:
         self.checked = 0
         self.wrong: list[str] = []
         self.wrong_count = 0
+        self.unknown = 0
+        """Values from while the field side was away: what its devices held then went with it."""
         self._published = 0
         self._held_numbers: dict[str, int] = {}
         self._held: dict[str, set[str]] = defaultdict(set)
         self._order: dict[str, deque[str]] = defaultdict(deque)
         self._emulated: set[str] = set()
+        self._unjudged: list[Any] = []
+        self._gap = False
 
     async def update(self, gateway: ControlClient, field: ControlClient) -> None:
         """Fetch published first, then held: what was published before is held by then. Both come in pieces."""
-        published: list[Any] = []
-        while piece := (await gateway.call("published", since=self._published))["entries"]:
-            published += piece
+        while len(self._unjudged) < KEPT:  # the rest next time
+            piece = (await gateway.call("published", since=self._published))["entries"]
+            if not piece:
+                break
+            self._unjudged += piece
             self._published = piece[-1][0]
-            if len(published) >= KEPT:
-                break  # the rest next time
         while await self._fetch_held(field):
             pass
-        for _, tag, raw, _, value in published:
+        for _, tag, raw, _, value in self._unjudged:
             self._judge(tag, raw, value)
+        self._unjudged.clear()
+        self._gap = False
+
+    def begin_again(self) -> None:
+        """The field side is another process from now on: its journals begin anew, and the end of the first one's was not seen."""
+        self._held_numbers.clear()
+        self._gap = True
 
     async def _fetch_held(self, field: ControlClient) -> bool:
         """Take the next piece of what the devices held; False when there was nothing new."""
@@ -64,6 +75,9 @@ class Oracle:
     def _judge(self, tag: str, raw: str, value: Any) -> None:
         if tag.split(".", 1)[0] not in self._emulated:
             return  # a real device in a mixed prototype: nobody knows what it held
+        if raw not in self._held[tag] and self._gap:
+            self.unknown += 1
+            return
         self.checked += 1
         if raw not in self._held[tag]:
             self.wrong_count += 1
@@ -71,4 +85,6 @@ class Oracle:
                 self.wrong.append(f"{tag} was published as {value!r} ({raw}); the device never held that")
 
     def describe(self) -> dict[str, Any]:
-        return {"checked": self.checked, "wrong": self.wrong_count, "examples": list(self.wrong)}
+        return {
+            "checked": self.checked, "wrong": self.wrong_count, "unknown": self.unknown, "examples": list(self.wrong)
+        }  # fmt: skip

@@ -17,6 +17,7 @@ import msgspec
 
 from fieldtwin.running.children import Child
 from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
+from fieldtwin.running.field_return import FieldReturn, is_loss
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.oracle import Oracle
 from fieldtwin.running.reloading import Reloaded, reload
@@ -88,6 +89,8 @@ class RunSession:
         self._nursery = Nursery()
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
+        self.field_return: FieldReturn | None = None
+        """Of a field side elsewhere: that it was lost, and came back."""
 
     def _lent_to_the_thread(self) -> str:
         """The transmitter whose mailboxes the thread has, if any. Raises `UsageError` where it cannot have them."""
@@ -106,13 +109,13 @@ class RunSession:
 
     @property
     def disturbed(self) -> bool:
-        """Whether faults were put in."""
-        return bool(self.options.faults)
+        """Whether faults were put in, or the field side was away: then both sides need not count alike."""
+        return bool(self.options.faults) or (self.field_return is not None and self.field_return.losses > 0)
 
     @property
     def calm(self) -> bool:
         """Whether there were no faults: how long recovery takes is a scenario's to say."""
-        return not self.disturbed
+        return not self.options.faults
 
     # -- starting -------------------------------------------------------------------------------------------------------
 
@@ -149,10 +152,13 @@ class RunSession:
         if self.options.thread:
             await self._start_thread(run_dir)
         self.started_ns = self.clock.monotonic_ns()
+        await self._put_faults_in()
+        self._start_watching()
+
+    async def _put_faults_in(self) -> None:
         if self._field is not None:
             for fault in self.options.faults:  # each knows its time
                 await self._field.client.call("fault", fault=fault, start_ns=self.started_ns)
-        self._start_watching()
 
     async def _start_thread(self, run_dir: Path) -> None:
         """The plant's side of the digital thread, a watcher of the process image."""
@@ -210,7 +216,9 @@ class RunSession:
 
     async def _start_field(self, run_dir: Path) -> None:
         if self.options.field_host:
-            self._field = await contact_elsewhere(self.options.field_host, self.options.token, self.system, run_dir)
+            at, token = self.options.field_host, self.options.token
+            self._field = await contact_elsewhere(at, token, self.system, run_dir)
+            self.field_return = FieldReturn(self._field, self.system, at, token, self._field_returned)
         else:
             config = self._write("field.json", self._field_config(run_dir))
             client = await self._start_child("field", "twin.field_process", config, FIELD_LINGER_S)
@@ -231,7 +239,22 @@ class RunSession:
                 self.cables[bridge.name] = cable
                 self.mapping[cable.plant] = cable.gateway
 
+    async def _field_returned(self, another: bool) -> None:
+        if another:
+            self.oracle.begin_again()
+            self.counted_before = {}
+            await self._put_faults_in()
+
+    @property
+    def _field_client(self) -> ControlClient | None:
+        """The field side's, while it is there."""
+        if self.field_return is not None:
+            return self.field_return.client
+        return self._field.client if self._field is not None else None
+
     def _start_watching(self) -> None:
+        if self.field_return is not None:
+            self._nursery.start(self.field_return.run(), "field side's return")
         self._nursery.start(self._watch(), "states")
         self._nursery.start(self._ask(), "status")
         device = next(iter(self.far), None)
@@ -302,7 +325,7 @@ class RunSession:
         """Ask every process for its status."""
         self.gateway_status = await self._get(self._clients.get("gateway"))
         self.plc_status = await self._get(self._clients.get("plc"), brief=True)
-        self.field_status = await self._get(self._field.client if self._field else None)
+        self.field_status = await self._get(self._field_client)
         for name, status in (("gateway", self.gateway_status), ("plc", self.plc_status)):
             if status is not None:
                 self.answered_ns[name] = self.clock.monotonic_ns()
@@ -310,26 +333,30 @@ class RunSession:
             self.thread_status = thread
             if thread["dropped"]:
                 self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they came too fast'}")
-        if self.options.field_host and self.field_status is None:
-            self.note_error(f"the field side at {self.options.field_host} was lost: nobody knows what its devices held")
 
     async def _get(self, client: ControlClient | None, **args: Any) -> dict[str, Any] | None:
         if client is None:
             return None
         try:
             answer: dict[str, Any] = await client.call("get", **args)
-        except FieldtwinError:
+        except FieldtwinError as e:
+            self._maybe_lost(client, e)
             return None  # it is dying or gone: _notice_deaths says so with its reason
         return answer
 
+    def _maybe_lost(self, client: ControlClient, error: FieldtwinError) -> None:
+        if self.field_return is not None and client is self.field_return.client and is_loss(error):
+            self.field_return.lost()
+
     async def _judge(self) -> None:
         gateway = self._clients.get("gateway")
-        if gateway is None or self._field is None:
+        field = self._field_client
+        if gateway is None or field is None:
             return
         try:
-            await self.oracle.update(gateway, self._field.client)
+            await self.oracle.update(gateway, field)
         except FieldtwinError:
-            pass  # as above
+            pass  # as above; what was lost, the next question finds out
 
     async def reload(self, by: str) -> Reloaded:
         """The gateway reads its files again (`fieldtwin.running.reloading`); no poll is lost by that."""
@@ -362,5 +389,7 @@ class RunSession:
                 self.outputs_confirmed_safe, self.gateway_status = answer["safe"], answer["status"]
             except FieldtwinError as e:
                 self.note_error(f"the gateway did not stop in order: {e}")
-        self.field_status = await self._get(self._field.client if self._field else None) or self.field_status
+        self.field_status = await self._get(self._field_client) or self.field_status
         await self._judge()
+        if self.field_return is not None and (trouble := self.field_return.trouble):
+            self.note_error(trouble)

@@ -114,6 +114,7 @@ def summarise(run: Run) -> dict[str, Any]:
         "published": {"values": gateway.get("published", 0), **run.oracle.describe()},
         "mailboxes": gateway.get("mailboxes", {}),
         "far_end": run.shore.describe() if run.shore else None,
+        "field": back.describe() if (back := getattr(run, "field_return", None)) else None,
         "thread": getattr(run, "thread_status", None),
         "learnt": gateway.get("learnt", {}),
         "logged": gateway.get("logged", 0),

@@ -6,7 +6,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from procs import fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
+from procs import CHECKOUT, every_device_online, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 pytestmark = pytest.mark.slow
 
@@ -42,4 +42,39 @@ def test_one_field_side_serves_run_after_run(tmp_path: Path) -> None:
             run.signal(signal.SIGINT)
             assert run.wait(5) == 1
         assert any("the field side at localhost" in error for error in run.summary["errors"])
+    no_tracebacks(tmp_path)
+
+
+@pytest.mark.long
+def test_a_field_side_that_comes_back_is_found_again(tmp_path: Path) -> None:
+    """On the same ports, as in a container: a process that was killed and started again knows nothing of the first one's."""
+    port, can, lan, far = free_port(), free_port(), free_port(), free_port()
+    there = tmp_path / "there"
+    there.mkdir()
+    shipped = CHECKOUT / "profiles/systems/observatory.prototype.yaml"
+    text = shipped.read_text().replace('far: "tcp://127.0.0.1:0"', f'far: "tcp://127.0.0.1:{far}"')
+    (there / "p.yaml").write_text(
+        text.replace("prototype_of: observatory.yaml", f"prototype_of: {shipped.parent}/observatory.yaml")
+    )
+    emulate = ("emulate", "observatory", "--control", f"127.0.0.1:{port}", "--prototype-file", str(there / "p.yaml"),
+               "--listen", f"can0=can:fieldtwin/127.0.0.1:{can}", "--listen", f"lan=tcp://127.0.0.1:{lan}")  # fmt: skip
+    plain = tuple(word for word in RUN if word != "--json")
+    with fieldtwin(tmp_path, *emulate, name="field") as side:
+        wait_for(lambda: "now: fieldtwin run" in side.err, 10, "its advice")
+        with fieldtwin(tmp_path, *plain, "--field", f"localhost:{port}", "--commands", "none") as run:
+            gateway = run.control("r", "gateway")
+            every_device_online(gateway)
+            side.signal(signal.SIGKILL)
+            side.wait(5)
+            wait_for(lambda: not any(d["online"] for d in gateway("get")["devices"].values()), 10, "all lost")
+            wait_for(lambda: run.err.count("was lost: nobody knows") == 1, 10, "that it says so")
+            assert all(tag["quality"] != "good" for tag in gateway("get")["tags"].values())
+            with fieldtwin(tmp_path, *emulate, name="again"):
+                wait_for(lambda: "is back after" in run.err, 15, "that it says so")
+                every_device_online(gateway)
+                run.signal(signal.SIGINT)
+                assert run.wait(5) == 0, run.out
+        assert run.err.count("was lost") == run.err.count("is back after") == 1
+        assert "field side     lost once" in run.out
+    no_tracebacks(tmp_path)
     no_tracebacks(tmp_path)

@@ -1,0 +1,128 @@
+"""A field side elsewhere that goes and comes back: the run's own client of it is connected again, with back-off.
+
+Gateway, far end and links have connections of their own and mend them by themselves; their values are bad meanwhile. What is
+here knows the control channel alone: when it was lost, when it is back, and whether who is back is still the same process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+from fieldtwin.running.field_contact import FieldContact, check_same, connect_control
+from gateway.core.control import ControlClient
+from gateway.core.errors import FieldtwinError, FileInvalid, ReplyTimeout, Unreachable
+from gateway.runtime.backoff import Backoff
+from twin.system import System
+
+FIRST_S, LIMIT_S = 0.25, 4.0
+CONNECT_S = 4.0
+"""A host that is gone answers nothing, and TCP would try for minutes."""
+
+
+class FieldReturn:
+    """Watches over `contact`, whose field side is at `where`. `run` it; tell it of a failed call by `lost`.
+
+    `client` is None while nobody answers. `returned` is called when one does again, with True where it is another process than
+    before, which knows nothing of what the first one counted, held and was told.
+    """
+
+    def __init__(
+        self,
+        contact: FieldContact,
+        system: System,
+        where: str,
+        token: str,
+        returned: Callable[[bool], Awaitable[None]],
+    ) -> None:
+        self._contact = contact
+        self._system = system
+        self._where = where
+        self._token = token
+        self._returned = returned
+        self._gone = asyncio.Event()
+        self._gone_s = 0.0
+        self._away_s = 0.0
+        self._reason = ""
+        self.losses = 0
+        self.news = ""
+        """The latest return, for a person."""
+        self.moved = ""
+        """Why the gateway cannot reach who came back, if so."""
+
+    @property
+    def client(self) -> ControlClient | None:
+        return None if self._gone.is_set() else self._contact.client
+
+    @property
+    def trouble(self) -> str:
+        """What is wrong now, in words that stay the same while it is, or empty."""
+        if not self._gone.is_set():
+            return self.moved
+        return self._reason or f"the field side at {self._where} was lost: nobody knows what its devices held"
+
+    def lost(self) -> None:
+        """A call was not answered, or its connection is gone."""
+        if not self._gone.is_set():
+            self.losses += 1
+            self._gone_s = asyncio.get_running_loop().time()
+            self._gone.set()
+
+    async def run(self) -> None:
+        """Connect again whenever it is lost, until cancelled."""
+        while True:
+            await self._gone.wait()
+            backoff = Backoff(FIRST_S, LIMIT_S)
+            while not await self._try():
+                await asyncio.sleep(backoff.next_s())
+            away_s = asyncio.get_running_loop().time() - self._gone_s
+            self._away_s += away_s
+            self.news = f"the field side at {self._where} is back after {away_s:.1f} s"
+
+    async def _try(self) -> bool:
+        client: ControlClient | None = None
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                client, _ = await connect_control(self._where, self._token)
+                status = await client.call("get")
+            self._check(status)
+            await self._contact.client.aclose()
+            another = status["life"] != self._contact.life
+            self._contact.client, client = client, None
+            await self._returned(another)
+            self._contact.life = status["life"]
+            self._reason = ""
+            self._gone.clear()
+        except (FieldtwinError, TimeoutError) as e:
+            if isinstance(e, FileInvalid):
+                self._reason = f"the field side at {self._where} came back otherwise: {e}"
+            return False
+        finally:
+            if client is not None:
+                await client.aclose()
+        return True
+
+    def _check(self, status: dict[str, Any]) -> None:
+        check_same(self._system, status)
+        was = {**self._contact.listening, **{f"far end of {d}": url for d, url in self._contact.far_said.items()}}
+        now = {**status["listening"], **{f"far end of {d}": url for d, url in status["far"].items()}}
+        elsewhere = [
+            f"{name} at {now.get(name, 'nothing')}, not {url}" for name, url in was.items() if now.get(name) != url
+        ]
+        self.moved = (
+            f"the field side at {self._where} came back and listens elsewhere: {'; '.join(elsewhere)}. "
+            "Give its buses fixed ports, in the prototype file or with --listen"
+            if elsewhere
+            else ""
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """For the run's summary."""
+        gone_s = asyncio.get_running_loop().time() - self._gone_s if self._gone.is_set() else 0.0
+        return {"at": self._where, "losses": self.losses, "away_s": round(self._away_s + gone_s, 3)}
+
+
+def is_loss(error: FieldtwinError) -> bool:
+    """Whether a call's failure says that the other process, or the way to it, is gone."""
+    return isinstance(error, Unreachable | ReplyTimeout)

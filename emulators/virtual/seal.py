@@ -1,11 +1,13 @@
 """What lies outside a virtual run is sealed off while it runs: clocks, sleep, sockets, threads, processes.
 
-The loop itself refuses what asyncio offers; here is what any code can reach past it. Clocks are attributes of ``time``, which
-are replaced; the rest are audit events of the interpreter (PEP 578), which cannot be evaded. Only the sealed thread is watched.
+The loop itself refuses what asyncio offers; here is what any code can reach past it. Clocks are attributes of ``time`` and
+``datetime``, which are replaced, also where a module has taken them by name (`taken_clocks`); the rest are audit events of the
+interpreter (PEP 578), which cannot be evaded. Only the sealed thread is watched.
 """
 
 from __future__ import annotations
 
+import datetime
 import sys
 import threading
 import time
@@ -14,8 +16,14 @@ from contextlib import contextmanager
 from typing import Any
 
 from emulators.virtual.loop import escape
+from emulators.virtual.taken_clocks import guarded_date, replaced
 
-_CLOCKS = ("time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "sleep")
+_CLOCKS = (
+    *("time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "sleep"),
+    *("process_time", "process_time_ns", "thread_time", "thread_time_ns", "clock_gettime", "clock_gettime_ns"),
+)
+_NOW_BY_DEFAULT = {"localtime": 1, "gmtime": 1, "ctime": 1, "asctime": 1, "strftime": 2}
+"""They are told a time or take that of now: with how many arguments they are told."""
 _LOGGING = "logging"
 """A log record is stamped with the wall clock; nothing of a run depends on it."""
 _EVENTS = {
@@ -32,6 +40,8 @@ _EVENTS = {
 _sealed: set[int] = set()
 """Identities of the threads in which a virtual run is under way."""
 _hooked = False
+_guards: list[tuple[Any, str, Any, Any]] = []
+"""As `_made` tells: made once."""
 
 
 def _audit(event: str, args: tuple[Any, ...]) -> None:
@@ -39,15 +49,29 @@ def _audit(event: str, args: tuple[Any, ...]) -> None:
         raise escape(_EVENTS[event])
 
 
-def _guarded(real: Callable[..., Any]) -> Callable[..., Any]:
+def _guarded(real: Callable[..., Any], told_by: int = 1 << 30) -> Callable[..., Any]:
     name = f"time.{real.__name__}"
 
     def guard(*args: Any) -> Any:
-        if threading.get_ident() in _sealed and sys._getframe(1).f_globals.get("__name__") != _LOGGING:
-            raise escape(name)
+        if threading.get_ident() in _sealed and (len(args) < told_by or args[told_by - 1] is None):
+            _refuse(name)
         return real(*args)
 
     return guard
+
+
+def _refuse(name: str) -> None:
+    if threading.get_ident() in _sealed and sys._getframe(2).f_globals.get("__name__") != _LOGGING:
+        raise escape(name)
+
+
+def _made() -> list[tuple[Any, str, Any, Any]]:
+    """What is replaced: the module, the name in it, what it is and what stands in for it."""
+    clocks = [(name, 1 << 30) for name in _CLOCKS] + list(_NOW_BY_DEFAULT.items())
+    made = [(time, name, getattr(time, name), told_by) for name, told_by in clocks if hasattr(time, name)]
+    return [(module, name, real, _guarded(real, told_by)) for module, name, real, told_by in made] + [
+        (datetime, kind.__name__, kind, guarded_date(kind, _refuse)) for kind in (datetime.datetime, datetime.date)
+    ]
 
 
 def _unstartable(real: Callable[[threading.Thread], None]) -> Callable[[threading.Thread], None]:
@@ -66,16 +90,19 @@ def sealed() -> Iterator[None]:
     if not _hooked:  # an audit hook cannot be taken away: it stays, and looks at a set
         sys.addaudithook(_audit)
         _hooked = True
-    kept = {name: getattr(time, name) for name in _CLOCKS}
-    for name, real in kept.items():
-        setattr(time, name, _guarded(real))
+    if not _guards:
+        _guards.extend(_made())
+    kept = [(module, name, getattr(module, name)) for module, name, _, _ in _guards]
+    for module, name, _, guard in _guards:
+        setattr(module, name, guard)
     start = threading.Thread.start
     threading.Thread.start = _unstartable(start)  # type: ignore[method-assign, assignment]
     _sealed.add(threading.get_ident())
     try:
-        yield
+        with replaced({id(real): (real, guard) for _, _, real, guard in _guards}):
+            yield
     finally:
         _sealed.discard(threading.get_ident())
         threading.Thread.start = start  # type: ignore[method-assign]
-        for name, real in kept.items():
-            setattr(time, name, real)
+        for module, name, was in kept:
+            setattr(module, name, was)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import datetime
 import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine
+from datetime import UTC, date
+from time import perf_counter
 from typing import Any
 
 import pytest
@@ -160,6 +163,26 @@ async def _wall_clock(loop: VirtualLoop) -> None:
     time.time()
 
 
+async def _taken_clock(loop: VirtualLoop) -> None:
+    perf_counter()
+
+
+async def _clock_by_number(loop: VirtualLoop) -> None:
+    time.clock_gettime(time.CLOCK_MONOTONIC)
+
+
+async def _local_time(loop: VirtualLoop) -> None:
+    time.strftime("%H")
+
+
+async def _date(loop: VirtualLoop) -> None:
+    datetime.datetime.now(UTC)
+
+
+async def _taken_date(loop: VirtualLoop) -> None:
+    date.today()
+
+
 async def _sleep(loop: VirtualLoop) -> None:
     time.sleep(0)  # noqa: ASYNC251  it must be refused
 
@@ -182,6 +205,11 @@ WAYS_OUT = [
     (_thread, "a thread"),
     (_clock, "time.monotonic_ns"),
     (_wall_clock, "time.time"),
+    (_taken_clock, "time.perf_counter"),
+    (_clock_by_number, "time.clock_gettime"),
+    (_local_time, "time.strftime"),
+    (_date, "datetime.now"),
+    (_taken_date, "date.today"),
     (_sleep, "time.sleep"),
     (_threadsafe, "a call from another thread"),
     (_reader, "loop.add_reader"),
@@ -194,6 +222,31 @@ def test_every_way_out_names_the_culprit(way: Callable[[VirtualLoop], Coroutine[
         run(way)
     assert f"({way.__name__})" in e.value.where
     assert "test_virtual_loop.py" in e.value.where
+
+
+def test_dates_are_what_they_were() -> None:
+    """Only what time it is remains untold: the rest of `datetime` works, and makes objects of the real types."""
+    real, before = datetime.datetime, datetime.datetime(2026, 11, 21, tzinfo=UTC)
+
+    async def main(loop: VirtualLoop) -> None:
+        made = [
+            datetime.datetime(2026, 11, 21, tzinfo=UTC),
+            datetime.datetime.fromisoformat("2026-11-21T00:00:00+00:00"),
+        ]
+        made += [datetime.datetime.fromtimestamp(1795219200, UTC), datetime.datetime.strptime("20261121Z", "%Y%m%d%z")]
+        assert {type(one) for one in made} == {real}
+        assert set(made) == {before}
+        assert isinstance(before, datetime.datetime)
+        assert issubclass(real, datetime.datetime)
+        assert not isinstance(date(2026, 11, 21), datetime.datetime)
+        assert isinstance(before, date)
+        assert time.strftime("%Y", time.gmtime(1795219200)) == "2026"
+
+    run(main)
+    assert datetime.datetime is real
+    assert date is datetime.date
+    assert type(date.today()) is date
+    assert perf_counter is time.perf_counter
 
 
 def test_other_threads_and_later_code_keep_their_clocks() -> None:

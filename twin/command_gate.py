@@ -31,6 +31,11 @@ class CommandGate(PTDigitalThreadProcess):
         self._since_ms = since_ms
         self._last: dict[str, int] = {}
 
+    def restate(self, *, remote: bool, bounds: Bounds) -> None:
+        """The switch and the limits as they are now: a plant that runs may have them changed."""
+        self._remote = remote
+        self._check.restate(bounds)
+
     def admit(self, origin: str, event: Event) -> COMMAND | None:
         """Take a command of the twin's log, or refuse it. What is no command is none of the gate's business."""
         if event.kind != Kind.COMMAND:

@@ -1,7 +1,8 @@
 """The gateway's process: ``python -m twin.controller CONFIG.json``. The same for a plant and for its prototype.
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
-mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, command, reload, stop.
+mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, gate, command, reload,
+stop.
 """
 
 from __future__ import annotations
@@ -118,6 +119,7 @@ class GatewayProcess:
                 "get": self._get,
                 "published": self._published,
                 "watch": self._watch,
+                "gate": self._gate,
                 "command": self._command,
                 "reload": self._reload,
                 "stop": self._request_stop,
@@ -179,6 +181,11 @@ class GatewayProcess:
     async def _watch(self, args: dict[str, Any]) -> dict[str, Any]:
         """Changes of tags since the last question, and some tags now (`twin.watching`)."""
         return self._watching.answer(args)
+
+    async def _gate(self, args: dict[str, Any]) -> dict[str, Any]:
+        """The plant's switch, and what a digital twin may command, as they are now."""
+        may = self._system.commands
+        return {"remote": self._gateway.config.remote, "period_s": list(may.period_s), "per_minute": may.per_minute}
 
     async def _command(self, args: dict[str, Any]) -> dict[str, Any]:
         """A command of the digital twin, ``payload`` in hex, as if the transmitter had brought it: the control logic decides."""

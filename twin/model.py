@@ -1,22 +1,30 @@
-"""The digital model: one state machine, and nothing that could reach the physical twin.
+"""The digital model: one state machine, the variables that the system declares, and nothing that could reach the plant.
 
 Every twin has an instance of its own: the prototype's, the shadow's, and the one by which a run judges what its control logic
-did. It may know no wire, no clock and no store.
+did. It changes by events alone, and may know no wire, no clock and no store.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from gateway.core.statemachine import STATE, EventStateMachine
 from gateway.core.values import COMMAND
+from twin.variables import Variable, Variables
 
 
 class DigitalModel:
-    """SPEC row DigitalModel. Init: STANDBY, period 0. ProcessEvent is the state machine's."""
+    """SPEC row DigitalModel. Init: STANDBY, period 0, nothing known of any variable. ProcessEvent is the state machine's.
 
-    __slots__ = ("state_machine",)
+    `declared`: the system's variables (`twin.declared`). What is heard of them is `variables`; no command and no status changes
+    that, and none of them changes the state.
+    """
 
-    def __init__(self) -> None:
+    __slots__ = ("state_machine", "variables")
+
+    def __init__(self, declared: Iterable[Variable] = ()) -> None:
         self.state_machine = EventStateMachine()
+        self.variables = Variables(declared)
 
     @property
     def state(self) -> STATE:

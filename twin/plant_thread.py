@@ -103,6 +103,11 @@ class ImageProcess(PTDigitalThreadProcess):
                 for message in messages:
                     self.share(Kind.PAYLOAD, tag, RESPONSE(message.data), (message.t_ns + offset_ns) // NS_PER_MS)
 
+    def tell_again(self) -> None:
+        """Share states with the next look, changed or not: a command was refused, and who sent it holds them for others."""
+        for program in self._machines:
+            self._said.pop(f"{program}.", None)
+
     def _value(self, name: str, value: TagValue, now_ms: int, offset_ns: int) -> None:
         what = (value.value, value.quality, value.reason)
         if self._due(name, what, now_ms) and not self._too_soon(name, what, now_ms):
@@ -170,14 +175,14 @@ class PlantThread:
             self._writer = KnowledgeWriter(
                 store, origin, clock, on_written=self._end.appended, make_room=self._end.make_room
             )
-            process = ImageProcess(system, layout, clock, c.every_ms)
-            connection = PTtoDTConnection(self._end, [process, self._gate], self._writer, clock)
+            self._process = ImageProcess(system, layout, clock, c.every_ms)
+            connection = PTtoDTConnection(self._end, [self._process, self._gate], self._writer, clock)
             image = stack.enter_context(attached(layout, Path(c.run_dir) / "image"))
             readers = image.reader(INPUTS), image.reader(OUTPUTS)
             async with Nursery() as nursery:
                 nursery.start(self._end.run(), "thread")
                 nursery.start(self._writer.run(), "knowledge")
-                watching = nursery.start(self._look(process, connection, readers), "image")
+                watching = nursery.start(self._look(connection, readers), "image")
                 await self._serve(nursery)
                 watching.cancel()
                 connection.pump()
@@ -194,25 +199,34 @@ class PlantThread:
     async def _commanded(self, origin: str, events: Sequence[Event]) -> None:
         """What arrived from the digital twin's log, each number once: to the gateway, if the gate admits it."""
         for event in events:
-            command = self._gate.admit(origin, event)
-            if command is None:
+            if event.kind != Kind.COMMAND:
                 continue
             try:
                 client = await ControlClient.connect_unix(Path(self._config.run_dir) / "gateway.sock")
                 try:
-                    taken = (await client.call("command", payload=command.data.hex(), by=origin))["taken"]
+                    await self._hand_over(client, origin, event)
                 finally:
                     await client.aclose()
             except FieldtwinError as e:  # it is not tried again: a command is for now
                 self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: {e}")
-                continue
-            if not taken:
-                self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: the plant says local")
 
-    async def _look(self, process: ImageProcess, connection: PTtoDTConnection, readers: Any) -> None:
+    async def _hand_over(self, client: ControlClient, origin: str, event: Event) -> None:
+        """The switch and the limits are the gateway's, which may have taken over others since it started."""
+        now = await client.call("gate")
+        least_s, most_s = now["period_s"]
+        self._gate.restate(remote=now["remote"], bounds=Bounds(least_s, most_s, now["per_minute"]))
+        command = self._gate.admit(origin, event)
+        if command is None:
+            self._process.tell_again()
+            return
+        if not (await client.call("command", payload=command.data.hex(), by=origin))["taken"]:
+            self._gate.share(Kind.REFUSAL, "gateway", f"number {event.sequence} of {origin}: the plant says local")
+            self._process.tell_again()
+
+    async def _look(self, connection: PTtoDTConnection, readers: Any) -> None:
         inputs, outputs = readers
         while True:
-            process.look(inputs.snapshot(), outputs.snapshot())
+            self._process.look(inputs.snapshot(), outputs.snapshot())
             connection.pump()
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_MS * NS_PER_MS)
 

@@ -13,6 +13,7 @@ from emulators.emulator import EmulatedCommunication
 from emulators.endpoints.ports import Ports
 from emulators.models.packet_link import ModemEnd
 from gateway.core.clock import Clock
+from twin.declared import declared_variables
 from twin.field import FieldSide
 from twin.model import DigitalModel
 from twin.physical import EmbeddedControlSystem
@@ -29,7 +30,7 @@ class DigitalTwinPrototype:
 
     def __init__(self, system: System, prototype: Prototype, clock: Clock) -> None:
         self.ecs = EmbeddedControlSystem(system)
-        self.model = DigitalModel()
+        self.model = DigitalModel(declared_variables(system))
         self.prototype = prototype
         self.real = tuple(name for name in system.devices if name not in prototype.devices)
         self._clock = clock

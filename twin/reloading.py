@@ -1,6 +1,7 @@
 """Two versions of a system's files: what is otherwise, and what of that a running gateway can take over.
 
-Pace, periods, limits, scaling and safe values can change between two polls. Ports, addresses, what a device is, programs and
+Pace, periods, limits, scaling and safe values can change between two polls, and so can the plant's switch and what may be
+commanded over a thread. Ports, addresses, what a device is, programs and
 what is bound to them cannot: that is named, and nothing at all is taken over then. What is not listed here as changeable is not.
 """
 
@@ -20,6 +21,8 @@ from twin.system import System
 from twin.system_schema import SystemForm
 
 Loc = tuple[Key, ...]
+GATE = frozenset({"remote", "commands"})
+"""Who may command, and what: the plant's own say, and nobody who throws a switch may have to stop a plant for it."""
 BUS = frozenset({"timeout_ms", "retries", "spacing_ms", "turnaround_ms", "connect_pause_ms", "probe_percent"})
 """Of a Modbus bus. A CAN bus has nothing that could change."""
 DEVICE = frozenset({"poll", "stale_after_ms", "safe", "backoff_first_ms", "backoff_limit_ms"})
@@ -76,6 +79,8 @@ def _differences(old: Any, new: Any, at: Loc = ()) -> Iterator[tuple[Loc, Any, A
 
 
 def _is_live(new: System, at: Loc, before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
+    if at[0] in GATE:
+        return True
     if len(at) < 3:
         return False
     section, name, key = at[:3]

@@ -6,16 +6,18 @@ of this module, which import contracts keep from connections, drivers, transmitt
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.events import Consumer
-from twin.mape.analyze import Analyze, Limits
+from twin.mape.analyze import Analyze
 from twin.mape.messages import Verdict
 from twin.mape.monitor import Monitor
+from twin.mape.upkeep import Upkeep
 from twin.model import DigitalModel
 from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from twin.variables import Variable
 
 VERDICTS = 1000
 
@@ -23,17 +25,21 @@ VERDICTS = 1000
 class DigitalShadow:
     """SPEC row DigitalShadow: a digital model of its own, thread processes, and a connection that only receives.
 
-    `step` runs the stages, one after the other, on what has arrived. `verdicts` is a consumer for whoever wants to know.
+    `step` runs the stages, one after the other, on what has arrived. `declared` are the variables of the model: events alone
+    change them. `verdicts` is a consumer for whoever wants to know.
     """
 
     def __init__(
-        self, receiving: ReceivingEnd, clock: Clock, *, limits: Mapping[str, Limits], stale_after_ms: int = 30_000
+        self, receiving: ReceivingEnd, clock: Clock, *, declared: Iterable[Variable], stale_after_ms: int = 30_000
     ) -> None:
-        self.digital_model = DigitalModel()
+        self.digital_model = DigitalModel(declared)
         self.receiving = receiving
         self.monitor = Monitor(self.digital_model, clock)
-        self.analyze = Analyze(self.digital_model, clock, limits=limits, stale_after_ms=stale_after_ms)
+        self.analyze = Analyze(self.digital_model, clock, stale_after_ms=stale_after_ms)
+        self.upkeep = Upkeep(self.digital_model, self.monitor.emitter.event, self.analyze.emitter.event)
+        self.monitor.emitter.subscribe(self.upkeep.measured)
         self.monitor.emitter.subscribe(self.analyze.consumer)
+        self.analyze.emitter.subscribe(self.upkeep.analyzed)
         self.verdicts: Consumer[Verdict] = Consumer(self.analyze.emitter.event, VERDICTS)
         self.analyze.emitter.subscribe(self.verdicts)
         self._clock = clock
@@ -52,16 +58,21 @@ class DigitalShadow:
             self.monitor.arrived(event, now_ms)
             self.monitor.handle_state()
             self.monitor.handle_measurements()
+            self.upkeep.keep_up()
             self.analyze.compare()
             count += 1
         self.analyze.look()
+        self.upkeep.keep_up()
         return count
 
     def describe(self) -> dict[str, Any]:
         """The model, and the figures of twinning."""
+        variables = self.digital_model.variables
         return {
             "state": self.digital_model.state.name,
             "period_s": self.digital_model.period_s,
             **self.analyze.figures(),
             "dropped": self.receiving.dropped,
+            "undeclared": variables.undeclared,
+            "variables": variables.describe(),
         }

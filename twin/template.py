@@ -19,8 +19,9 @@ import msgspec
 
 from gateway.core.errors import FileInvalid
 from gateway.core.statemachine import ACCEPTING, delta
+from twin.declared import declared_variables
 from twin.model import DigitalModel
-from twin.physical import EmbeddedControlSystem, plant_tags
+from twin.physical import EmbeddedControlSystem
 from twin.system import System
 
 VERSION = 1
@@ -237,7 +238,7 @@ class DigitalTemplate:
             DOCUMENTS[file.document](file.path, file.sha256) for file in manifest.files if file.kind == "document"
         )
         self.ecs = EmbeddedControlSystem(system)
-        self.digital_model = DigitalModel()
+        self.digital_model = DigitalModel(declared_variables(system))
 
 
 def describe_model(system: System) -> bytes:
@@ -245,7 +246,7 @@ def describe_model(system: System) -> bytes:
 
     Made from the system file, so that a template whose model is not that of its system is found out.
     """
-    model = DigitalModel()
+    model = DigitalModel(declared_variables(system))
     described: dict[str, Any] = {
         "digital_model": 1,
         "system": system.name,
@@ -254,13 +255,6 @@ def describe_model(system: System) -> bytes:
         "on_command": [
             {"period_s": sign, "state": delta(example).name} for sign, example in (("> 0", 1), ("= 0", 0), ("< 0", -1))
         ],
-        "variables": {
-            tag.name: {
-                "kind": tag.kind.name.lower(),
-                **({"unit": tag.unit} if tag.unit else {}),
-                **({"limits": list(tag.limits)} if tag.limits else {}),
-            }
-            for tag in plant_tags(system).values()
-        },
+        "variables": {name: variable.declared() for name, variable in model.variables.items()},
     }
     return json.dumps(described, indent=1, ensure_ascii=False).encode() + b"\n"

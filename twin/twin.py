@@ -6,16 +6,16 @@ Whether the plant obeys is the plant's to say.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
 from gateway.core.clock import Clock
-from twin.mape.analyze import Limits
 from twin.mape.execute import Bounds, Execute
 from twin.mape.plan import Plan, Planner
 from twin.mape.what_if import Question, WhatIf
 from twin.shadow import DigitalShadow
 from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from twin.variables import Variable
 
 
 class DigitalTwin(DigitalShadow):
@@ -30,13 +30,13 @@ class DigitalTwin(DigitalShadow):
         clock: Clock,
         planner: Planner,
         *,
-        limits: Mapping[str, Limits],
+        declared: Iterable[Variable],
         bounds: Bounds,
         stale_after_ms: int = 30_000,
         what_if: WhatIf | None = None,
         question: Question | None = None,
     ) -> None:
-        super().__init__(receiving, clock, limits=limits, stale_after_ms=stale_after_ms)
+        super().__init__(receiving, clock, declared=declared, stale_after_ms=stale_after_ms)
         self.plan = Plan(self.digital_model, planner, clock)
         self.execute = Execute(self.digital_model, clock, bounds=bounds, what_if=what_if, question=question)
         self.analyze.emitter.subscribe(self.plan.consumer)

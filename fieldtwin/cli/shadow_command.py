@@ -111,6 +111,14 @@ def why_nothing(seen: dict[str, Any]) -> str:
     return str(thread.get("trouble") or thread.get("silent") or "no word of its log came")
 
 
+def told_of(variables: dict[str, Any], undeclared: int) -> str:
+    """How many of the model's variables were heard of, and how many of them can be trusted."""
+    heard = [variable for variable in variables.values() if variable["t_ms"] is not None]
+    good = sum(variable["quality"] == "good" for variable in heard)
+    more = f"; {undeclared} values of others, which it does not declare" if undeclared else ""
+    return f"{len(variables)}, {len(heard)} of them heard of, {good} good{more}"
+
+
 def print_shadow(seen: dict[str, Any]) -> None:
     if not seen["origins"]:
         return
@@ -118,6 +126,7 @@ def print_shadow(seen: dict[str, Any]) -> None:
     lag, rate, thread = seen["lag_ms"], seen["twinning_rate_hz"], seen["thread"]
     lines = [
         ("model", f"{seen['state']}, period {seen['period_s']} s"),
+        ("variables", told_of(seen["variables"], seen["undeclared"])),
         ("from", f"{', '.join(seen['origins'])}, {kind}"),
         ("statuses", f"{seen['statuses']}, {seen['agreed']} of them as the model"),
         (

@@ -18,9 +18,9 @@ from gateway.core.nursery import Nursery
 from gateway.store.event import Event, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
 from gateway.wallclock import WallClock
+from twin.declared import declared_variables
 from twin.instance import Instance
 from twin.knowledge import KnowledgeWriter
-from twin.mape.analyze import Limits
 from twin.mape.messages import Verdict
 from twin.shadow import DigitalShadow
 from twin.system import System
@@ -29,6 +29,7 @@ from twin.thread_end import ThreadEnd
 from twin.thread_link import Carrier
 from twin.thread_place import twin_carrier
 from twin.thread_process import ReceivingEnd
+from twin.variables import Limits
 
 STEP_MS = 50
 STALE_AFTER_MS = 30_000
@@ -80,7 +81,9 @@ class Shadowing:
         self._end: ThreadEnd | None = None
 
     def _make(self, system: System) -> DigitalShadow:
-        return DigitalShadow(self.receiving, self.clock, limits=limits_of(system), stale_after_ms=STALE_AFTER_MS)
+        return DigitalShadow(
+            self.receiving, self.clock, declared=declared_variables(system), stale_after_ms=STALE_AFTER_MS
+        )
 
     async def _thread(self, store: KnowledgeStore, carrier: Carrier) -> ThreadEnd:
         """This side of the thread: it receives, and has no log to send."""

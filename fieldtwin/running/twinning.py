@@ -9,16 +9,16 @@ import secrets
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing, limits_of
+from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing
 from fieldtwin.whatif.asking import Asking
 from gateway.core.clock import NS_PER_MS
 from gateway.core.events import Consumer
 from gateway.core.nursery import Nursery
 from gateway.core.values import COMMAND
 from gateway.store.event import Event, Kind, KnowledgeStore
+from twin.declared import declared_variables
 from twin.instance import Instance
 from twin.knowledge import KnowledgeWriter
-from twin.mape.analyze import Limits
 from twin.mape.execute import Bounds
 from twin.mape.messages import Verdict
 from twin.mape.plan import OLD_MS, Planner
@@ -28,6 +28,7 @@ from twin.thread import DTtoPTConnection, Operator, schema_of
 from twin.thread_end import ThreadEnd
 from twin.thread_link import Carrier
 from twin.twin import DigitalTwin
+from twin.variables import Limits
 
 
 class Twinning(Shadowing):
@@ -75,7 +76,7 @@ class Twinning(Shadowing):
         least_s, most_s = system.commands.period_s
         return DigitalTwin(
             self.receiving, self.clock, self._planner,
-            limits=limits_of(system) if self._limits is None else self._limits, stale_after_ms=STALE_AFTER_MS,
+            declared=declared_variables(system, self._limits), stale_after_ms=STALE_AFTER_MS,
             bounds=Bounds(least_s, most_s, system.commands.per_minute), what_if=self._asking, question=self._question,
         )  # fmt: skip
 

@@ -6,7 +6,13 @@ from gateway.core.statemachine import delta
 from gateway.core.values import Quality, Reason
 from gateway.store.event import Event, Kind
 from twin.status import encode_status
+from twin.variables import Variable
 
+DECLARED = (
+    Variable("ctd.pressure", "real", "dbar", (0.0, 100.0)),
+    Variable("ctd.sample_count", "int"),
+    Variable("ctd.sample", "message"),
+)
 NOW_MS = 1_790_000_000_000
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from shadow_rig import NOW_MS, Hands, status, value
+from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 from spec_rig import CHECKOUT, CLOCK, Rig, observatory, rig
 from support import eventually, run
 from wire_rig import Crossed, relay, strange_device
@@ -35,10 +35,11 @@ from gateway.core.events import Consumer, Producer
 from gateway.core.nursery import Nursery
 from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
 from gateway.core.statemachine import decode_period, encode_period
-from gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS
+from gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS, Quality, Reason
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.store.event import Event, Kind
 from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from twin.declared import declared_variables
 from twin.instance import Instance
 from twin.mape.execute import Bounds
 from twin.mape.messages import SeenMeasurement, SeenStatus
@@ -196,8 +197,7 @@ class Twins:
 
     def __init__(self, *rules: Rule, bounds: Bounds = Bounds()) -> None:  # noqa: B008
         self.receiving = ReceivingEnd("from the plant")
-        limits = {"ctd.pressure": (0.0, 100.0)}
-        self.twin = DigitalTwin(self.receiving, Hands(), RulePlanner(rules), limits=limits, bounds=bounds)
+        self.twin = DigitalTwin(self.receiving, Hands(), RulePlanner(rules), declared=DECLARED, bounds=bounds)
         self._sent: Consumer[COMMAND] = Consumer(self.twin.execute.transmitter.event)
         self.twin.execute.transmitter.subscribe(self._sent)
 
@@ -210,17 +210,18 @@ class Twins:
 
 def test_prose_5_all_that_a_shadow_receives_updates_its_model_and_a_difference_is_reported() -> None:
     receiving = ReceivingEnd("from the plant")
-    shadow = DigitalShadow(receiving, Hands(), limits={})
+    shadow = DigitalShadow(receiving, Hands(), declared=DECLARED)
     for event in (status(7), status(5, "OFF"), value(3.0)):
         receiving.observe("plant:1", event)
     shadow.step()
     assert shadow.digital_model.period_s == 5
+    assert shadow.digital_model.variables["ctd.pressure"].value == 3.0
     assert [v.finding for v in shadow.verdicts.drain()] == ["agree", "mismatch"]
 
 
 def test_prose_5_it_reuses_the_physical_twins_event_handlers_and_message_types() -> None:
     """And its transmitter driver: test_schema_digital_thread."""
-    shadow = DigitalShadow(ReceivingEnd("from the plant"), Hands(), limits={})
+    shadow = DigitalShadow(ReceivingEnd("from the plant"), Hands(), declared=())
     assert issubclass(SeenStatus, STATUS)
     assert issubclass(SeenMeasurement, MEASUREMENT)
     assert type(shadow.monitor.emitter) is Producer
@@ -260,9 +261,11 @@ def test_prose_7_what_the_model_does_not_accept_is_not_sent_and_no_user_steps_in
 
 def test_prose_8_the_prototypes_digital_model_is_another_instance_than_the_shadows() -> None:
     prototype = DigitalTwinPrototype(*observatory(), CLOCK)
-    shadow = DigitalShadow(ReceivingEnd("from the plant"), Hands(), limits={})
+    shadow = DigitalShadow(ReceivingEnd("from the plant"), Hands(), declared=declared_variables(observatory()[0]))
     prototype.model.process_event(encode_period(5))
+    prototype.model.variables.changed("ctd.pressure", 3.0, Quality.GOOD, Reason.NONE, NOW_MS)
     assert (prototype.model.period_s, shadow.digital_model.period_s) == (5, 0)
+    assert not shadow.digital_model.variables["ctd.pressure"].heard
 
 
 def test_prose_8_a_digital_twin_asks_a_prototype_what_if_with_the_full_software_stack() -> None:
@@ -328,7 +331,7 @@ def test_prose_10_fidelity_is_measured_and_printed(tmp_path: Path) -> None:
 
 def test_prose_10_twinning_rate_and_lag_are_measured_and_printed(capsys: pytest.CaptureFixture[str]) -> None:
     clock, receiving = Hands(), ReceivingEnd("from the plant")
-    shadow = DigitalShadow(receiving, clock, limits={})
+    shadow = DigitalShadow(receiving, clock, declared=())
     for n in range(11):
         clock.now_ms = NOW_MS + 100 * n
         receiving.observe("plant:1", status(5, t_ms=clock.now_ms - 40))

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from shadow_rig import NOW_MS, Hands, status, value
+from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 
+from fieldtwin.cli.shadow_command import told_of
 from gateway.core.events import Consumer, Producer
 from gateway.core.statemachine import STATE_CODES, delta
 from gateway.core.values import DATA, STATUS, Quality, Reason
@@ -30,9 +31,7 @@ class Rig:
     def __init__(self) -> None:
         self.clock = Hands()
         self.receiving = ReceivingEnd("from the plant")
-        self.shadow = DigitalShadow(
-            self.receiving, self.clock, limits={"ctd.pressure": (0.0, 100.0)}, stale_after_ms=30_000
-        )
+        self.shadow = DigitalShadow(self.receiving, self.clock, declared=DECLARED, stale_after_ms=30_000)
 
     def give(self, *events: Event) -> list[Verdict]:
         for event in events:
@@ -68,7 +67,7 @@ def test_Monitor_handleState_consumes_lets_the_model_process_and_emits_each(peri
 
 @given(numbers=st.lists(st.floats(allow_nan=False), max_size=20), before=PERIODS)
 def test_Monitor_handleMeasurements_emits_each_and_leaves_the_model(numbers: list[float], before: int) -> None:
-    monitor = Monitor(DigitalModel(), Hands())
+    monitor = Monitor(DigitalModel(DECLARED), Hands())
     monitor.arrived(status(before), NOW_MS)
     monitor.handle_state()
     seen: Consumer[DATA] = Consumer(monitor.emitter.event)
@@ -80,6 +79,9 @@ def test_Monitor_handleMeasurements_emits_each_and_leaves_the_model(numbers: lis
     assert [m.event.value for m in emitted if isinstance(m, SeenMeasurement)] == numbers
     assert len(emitted) == len(numbers)
     assert monitor.digital_model.period_s == before
+    assert not monitor.digital_model.variables["ctd.pressure"].heard, (
+        "its variables listen; Monitor does not touch them"
+    )
 
 
 @pytest.mark.parametrize("data", [b"", b"\7\0\1", b"\0\0\1\0"])
@@ -194,9 +196,52 @@ def test_DigitalShadow_updates_its_model_from_everything_that_it_receives() -> N
     """Prose, row 5."""
     rig = Rig()
     for period_s in (1, 2, 0, -1):
-        rig.give(status(period_s), value(1.0))
+        rig.give(status(period_s), value(float(period_s)))
         assert rig.shadow.digital_model.period_s == period_s
+        assert rig.shadow.digital_model.variables["ctd.pressure"].value == period_s
+    rig.give(Event(9, NOW_MS, Kind.PAYLOAD, "ctd.sample", b"\1\2"))
+    assert rig.shadow.digital_model.variables["ctd.sample"].value == b"\1\2"
     assert issubclass(SeenStatus, STATUS), "it reuses the physical twin's message types"
+
+
+def test_DigitalShadow_holds_each_declared_variable_with_quality_and_time_as_it_was_reported_last() -> None:
+    rig = Rig()
+    variables = rig.shadow.digital_model.variables
+    never = {"value": None, "unit": "dbar", "quality": "bad", "reason": "never read", "t_ms": None}
+    assert rig.shadow.describe()["variables"]["ctd.pressure"] == never
+    rig.give(value(50.0, NOW_MS - 7))
+    assert rig.shadow.describe()["variables"]["ctd.pressure"] == {
+        "value": 50.0, "unit": "dbar", "quality": "good", "reason": "none", "t_ms": NOW_MS - 7,
+    }  # fmt: skip
+    rig.give(value(50.0, quality=Quality.BAD, reason=Reason.TIMEOUT))
+    assert (variables["ctd.pressure"].value, variables["ctd.pressure"].reason) == (50.0, Reason.TIMEOUT)
+    rig.give(value(51.0))
+    assert variables["ctd.pressure"].good
+    rig.clock.now_ms += 31_000
+    rig.give()
+    assert (variables["ctd.pressure"].value, variables["ctd.pressure"].reason) == (51.0, Reason.STALE), (
+        "never good: old"
+    )
+    assert not variables["ctd.sample_count"].heard
+
+
+def test_DigitalShadow_what_the_system_does_not_declare_is_no_part_of_its_model_and_is_counted() -> None:
+    rig = Rig()
+    rig.give(value(1.0)._replace(name="somebody.else"))
+    assert list(rig.shadow.digital_model.variables) == [variable.name for variable in DECLARED]
+    assert rig.shadow.describe()["undeclared"] == 1
+    seen = rig.shadow.describe()
+    assert told_of(seen["variables"], seen["undeclared"]) == (
+        "3, 0 of them heard of, 0 good; 1 values of others, which it does not declare"
+    )
+
+
+def test_Analyze_a_quality_and_a_reason_that_a_newer_plant_knows_are_bad_and_unnamed() -> None:
+    """Both are numbers on the wire, with room for more than are known here."""
+    rig = Rig()
+    (told,) = rig.give(value(1.0)._replace(quality=7, reason=31))
+    assert (told.finding, told.text) == ("bad", "ctd.pressure is bad: none")
+    assert rig.shadow.digital_model.variables["ctd.pressure"].quality is Quality.BAD
 
 
 def test_DigitalShadow_is_bounded_and_counts_what_it_drops() -> None:

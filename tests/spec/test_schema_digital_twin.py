@@ -7,7 +7,7 @@ from collections import deque
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from shadow_rig import NOW_MS, Hands, status, value
+from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 
 from gateway.core.events import Consumer, Producer
 from gateway.core.statemachine import decode_period, delta, encode_period
@@ -65,7 +65,7 @@ class Rig:
         self.clock = Hands()
         self.receiving = ReceivingEnd("from the plant")
         self.twin = DigitalTwin(
-            self.receiving, self.clock, RulePlanner(rules), limits={"ctd.pressure": (0.0, 100.0)}, bounds=bounds,
+            self.receiving, self.clock, RulePlanner(rules), declared=DECLARED, bounds=bounds,
             what_if=what_if, question=EMPTY if what_if else None,
         )  # fmt: skip
         self.sent: Consumer[COMMAND] = Consumer(self.twin.execute.transmitter.event)
@@ -227,7 +227,7 @@ def test_DigitalTwin_is_the_shadow_plus_plan_and_execute_and_the_way_back() -> N
     assert isinstance(twin, DigitalShadow)
     assert [p.name for p in twin.processes] == ["monitor", "analyze", "plan", "execute"]
     operator = Operator("operator", Hands())
-    assert not hasattr(DigitalShadow(ReceivingEnd("x"), Hands(), limits={}), "execute"), "a shadow has no way back"
+    assert not hasattr(DigitalShadow(ReceivingEnd("x"), Hands(), declared=()), "execute"), "a shadow has no way back"
     assert isinstance(operator, DTDigitalThreadProcess)
 
 

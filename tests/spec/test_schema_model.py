@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
+import json
 
 import pytest
 from hypothesis import given
@@ -12,9 +14,12 @@ from spec_rig import CLOCK, observatory
 from fieldtwin.running.states import expected_states
 from gateway.core.errors import Desync
 from gateway.core.statemachine import ACCEPTING, ACTIVE, OFF, STANDBY, STATE, STATES, EventStateMachine, encode_period
-from gateway.core.values import COMMAND
+from gateway.core.values import COMMAND, Quality, Reason, Scalar
+from twin.declared import declared_variables
 from twin.model import DigitalModel
 from twin.prototype import DigitalTwinPrototype
+from twin.template import describe_model
+from twin.variables import Variable, Variables
 
 PERIODS = st.integers(-32768, 32767)
 
@@ -70,12 +75,18 @@ def test_EventStateMachine_what_is_no_command_changes_nothing(bits: bytes, x: in
     assert (machine.period_s, type(machine.state)) == (x, state_of(x))
 
 
-def test_DigitalModel_contains_one_state_machine_and_nothing_else() -> None:
+def test_DigitalModel_contains_one_state_machine_and_the_declared_variables_and_nothing_else() -> None:
     """No connection to the physical twin of its own: there is no attribute in which it could hold one."""
-    model = DigitalModel()
-    assert DigitalModel.__slots__ == ("state_machine",)
+    model = DigitalModel(declared_variables(observatory()[0]))
+    assert DigitalModel.__slots__ == ("state_machine", "variables")
     assert type(model.state_machine) is EventStateMachine
     assert set(vars(model.state_machine)) == {"state", "period_s"}
+    assert type(model.variables) is Variables
+    assert Variables.__slots__ == ("_held", "undeclared")
+    assert {type(variable) for variable in model.variables.values()} == {Variable}
+    for variable in model.variables.values():
+        for field in dataclasses.fields(variable):
+            assert isinstance(getattr(variable, field.name), Scalar | tuple | None)
     with pytest.raises(AttributeError):
         model.connection = object()  # type: ignore[attr-defined]
 
@@ -89,9 +100,49 @@ def test_DigitalModel_ProcessEvent_delegates(events: list[int]) -> None:
         assert model.state is model.state_machine.state
 
 
+def test_DigitalModel_variables_are_those_of_the_system_and_of_its_template() -> None:
+    """With kind, unit and limits; what comes into a transmitter's inbox is a command and no variable."""
+    system, _ = observatory()
+    declared = DigitalModel(declared_variables(system)).variables
+    assert declared["ctd.pressure"].declared() == {"kind": "real", "unit": "dbar"}
+    assert declared["inclinometer.slope_long"].limits == (-327.68, 327.67)
+    assert {name.partition(".")[0] for name in declared} == set(system.devices)
+    assert "modem.inbox" not in declared
+    packed = json.loads(describe_model(system))["variables"]
+    assert packed == {name: variable.declared() for name, variable in declared.items()}
+    assert list(packed) == list(declared)
+
+
+@given(
+    told=st.lists(
+        st.tuples(st.sampled_from(["a.x", "a.y", "b.z"]), st.integers() | st.none(), st.sampled_from(Quality))
+    )
+)
+def test_DigitalModel_variables_change_by_events_alone_and_the_last_counts(
+    told: list[tuple[str, int | None, Quality]],
+) -> None:
+    """Their state does not follow from them, nor they from it."""
+    model, other = (DigitalModel([Variable("a.x", "int"), Variable("a.y", "int")]) for _ in range(2))
+    model.process_event(encode_period(3))
+    for t_ms, (name, value, quality) in enumerate(told, 1):
+        assert model.variables.changed(name, value, quality, Reason.NONE, t_ms) is (name != "b.z")
+    for name in ("a.x", "a.y"):
+        last = max((n for n, (of, _, _) in enumerate(told) if of == name), default=None)
+        held = model.variables[name]
+        if last is None:
+            assert (held.value, held.heard, held.quality, held.reason) == (None, False, Quality.BAD, Reason.NEVER_READ)
+        else:
+            assert (held.value, held.quality, held.t_ms) == (told[last][1], told[last][2], last + 1)
+    assert model.variables.undeclared == sum(name == "b.z" for name, _, _ in told)
+    assert model.period_s == 3
+    assert not any(held.heard for held in other.variables.values()), "another instance"
+
+
 def test_DigitalModel_is_another_instance_in_every_twin() -> None:
     one, other = (DigitalTwinPrototype(*observatory(), CLOCK) for _ in range(2))
     one.model.process_event(encode_period(5))
+    one.model.variables.changed("ctd.pressure", 1.0, Quality.GOOD, Reason.NONE, 1)
+    assert (one.model.variables["ctd.pressure"].value, other.model.variables["ctd.pressure"].value) == (1.0, None)
     assert type(one.model.state) is ACTIVE
     assert type(other.model.state) is STANDBY
     assert one.model.state_machine is not other.model.state_machine

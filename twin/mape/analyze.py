@@ -7,14 +7,13 @@ they hear of each other, how late. It must never know a connection, nor anything
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from typing import Any
 
 from gateway.core.clock import Clock
 from gateway.core.errors import Desync
 from gateway.core.events import Consumer, Producer
-from gateway.core.values import DATA, Quality, Reason
-from gateway.store.event import Event, Kind
+from gateway.core.values import DATA, Quality
+from gateway.store.event import Kind
 from twin.mape.messages import SeenMeasurement, SeenStatus, Verdict, verdict
 from twin.model import DigitalModel
 from twin.status import decode_status
@@ -25,23 +24,22 @@ LAGS = 10_000
 """Arrivals of which the lag is kept for the figures."""
 LATE_MS = 10_000
 """What is older than this when it arrives was backfilled: it is counted, and is no part of lag and rate."""
-Limits = tuple[float, float]
 
 
 class Analyze(DTDigitalThreadProcess):
-    """SPEC row Analyze. `limits` are those of the tags' profiles; what is not heard of for `stale_after_ms` is stale.
+    """SPEC row Analyze. Values are held against the limits of the model's variables; what is not heard of for `stale_after_ms` is
+    stale.
 
     Every status gets a verdict; of a tag only changes are told: outside and inside again, bad and good, stale and fresh.
     """
 
-    def __init__(self, model: DigitalModel, clock: Clock, *, limits: Mapping[str, Limits], stale_after_ms: int) -> None:
+    def __init__(self, model: DigitalModel, clock: Clock, *, stale_after_ms: int) -> None:
         super().__init__("analyze", clock)
         self.consumer: Consumer[DATA] = Consumer("monitored", CAPACITY)
         self.emitter: Producer[Verdict] = Producer("analyzed")
         self.digital_model = model
         self.compared = self.equal = 0
         self.measurements = self.backfilled = 0
-        self._limits = limits
         self._stale_after_ms = stale_after_ms
         self._lags: deque[int] = deque(maxlen=LAGS)
         self._heard: dict[str, int] = {}
@@ -67,7 +65,7 @@ class Analyze(DTDigitalThreadProcess):
                 self._note_lag(message.event.t_ms, message.arrived_ms)
                 self.measurements += 1
                 if message.event.kind == Kind.VALUE:
-                    self._weigh(message.event, message.arrived_ms)
+                    self._weigh(message)
 
     def _judge(self, status: SeenStatus) -> None:
         equal = self.check_statuses(status)
@@ -84,17 +82,15 @@ class Analyze(DTDigitalThreadProcess):
             text = f"the plant reports {state} with period {period_s} s; the model is {model.state.name} with {model.period_s} s"
             self._say("mismatch", status.whose, text, status.t_ms)
 
-    def _weigh(self, event: Event, arrived_ms: int) -> None:
-        self._heard[event.name] = arrived_ms
+    def _weigh(self, message: SeenMeasurement) -> None:
+        event = message.event
+        self._heard[event.name] = message.arrived_ms
         self._turn(event.name, "stale", "fresh", False, f"{event.name} is heard of again", event.t_ms)
-        bad = event.quality >= Quality.BAD
-        why = (
-            f"{event.name} is {Quality(event.quality)}: {Reason(event.reason)}"
-            if bad
-            else f"{event.name} is good again"
-        )
+        bad = message.quality >= Quality.BAD
+        why = f"{event.name} is {message.quality}: {message.reason}" if bad else f"{event.name} is good again"
         self._turn(event.name, "bad", "good", bad, why, event.t_ms)
-        limits = self._limits.get(event.name)
+        variable = self.digital_model.variables.get(event.name)
+        limits = variable.limits if variable is not None else None
         if limits is None or bad or not isinstance(event.value, int | float):
             return
         outside = not limits[0] <= event.value <= limits[1]

@@ -41,6 +41,12 @@ class CommandCheck:
         self._clock = clock
         self._taken: deque[int] = deque(maxlen=bounds.per_minute)
 
+    def restate(self, bounds: Bounds) -> None:
+        """Other bounds from now on; what was taken before counts."""
+        if bounds != self.bounds:
+            self.bounds = bounds
+            self._taken = deque(self._taken, maxlen=bounds.per_minute)
+
     def objection(self, command: COMMAND) -> str:
         """Why it is refused; empty when nothing speaks against it."""
         try:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.values import DATA, MEASUREMENT, STATUS
+from gateway.core.values import DATA, MEASUREMENT, STATUS, Quality, Reason
 from gateway.store.event import Event
+
+_REASONS = frozenset(int(reason) for reason in Reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +25,16 @@ class SeenMeasurement(MEASUREMENT):
 
     event: Event = Event(0, 0, 0, "")  # noqa: RUF009  immutable
     arrived_ms: int = 0
+
+    @property
+    def quality(self) -> Quality:
+        """How far it can be trusted. A worse word than any that is known here, from a newer plant, is bad."""
+        return Quality(min(self.event.quality, Quality.BAD))
+
+    @property
+    def reason(self) -> Reason:
+        """Why it is not good; one that is not known here, from a newer plant, is none."""
+        return Reason(self.event.reason) if self.event.reason in _REASONS else Reason.NONE
 
 
 @dataclass(frozen=True, slots=True)

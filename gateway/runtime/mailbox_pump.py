@@ -43,10 +43,11 @@ class MailboxPump:
         if not lent:
             driver.emitter.subscribe(self.inbox)
         self.commands_refused = 0
+        self.remote = remote
+        """The plant's switch; it may be thrown at any time."""
         self._bus = bus
         self._audit = audit
         self._allow_writes = allow_writes
-        self._remote = remote
         self._lent = lent
         self._busy = False
         self._sending = 0
@@ -58,14 +59,14 @@ class MailboxPump:
     def command(self, payload: bytes, by: str) -> bool:
         """A command that did not come through the mailbox; False when the plant's switch says `local`. On record either way."""
         name = self.driver.config.name
-        result = "taken" if self._remote else "the plant says local"
+        result = "taken" if self.remote else "the plant says local"
         with suppress(Unreachable):
-            self._audit.note("command" if self._remote else "refuse", name, by=by, result=result, payload=payload.hex())
-        if self._remote:
+            self._audit.note("command" if self.remote else "refuse", name, by=by, result=result, payload=payload.hex())
+        if self.remote:
             self.inbox.observe(COMMAND(payload))
         else:
             self.commands_refused += 1
-        return self._remote
+        return self.remote
 
     def offer(self, payloads: list[bytes]) -> None:
         """The control logic sent these, in order. Where the mailbox is lent, its thread has seen them in the process image."""
@@ -81,7 +82,7 @@ class MailboxPump:
 
     def refuse_when_local(self) -> None:
         """Drop what came in while the plant's switch says `local`."""
-        if not self._remote:
+        if not self.remote:
             for item in self.inbox.drain():
                 self.commands_refused += 1
                 with suppress(Unreachable):  # refused with or without a record, and counted

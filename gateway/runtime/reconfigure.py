@@ -1,4 +1,5 @@
 """Another configuration for a gateway that runs: pace, limits, scaling, safe values; between two polls, none lost or doubled.
+The plant's switch with it, at once.
 
 Buses, devices, addresses, tags and what is bound to them have to be the same: whoever calls has compared the files
 (`twin.reloading`). A device has either its old configuration or its new one, never some of each; values that it holds are
@@ -23,7 +24,9 @@ OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, 
 
 async def reconfigure(gateway: Gateway, config: GatewayConfig) -> None:
     """Take over `config`. Returns when every device has it: where a long group is being read, at its end."""
-    gateway.config = replace(gateway.config, buses=config.buses, devices=config.devices)
+    gateway.config = replace(gateway.config, buses=config.buses, devices=config.devices, remote=config.remote)
+    for pump in gateway.pumps:
+        pump.remote = config.remote
     coming = []
     for name, bus in gateway.buses.items():
         on_it = {d.name: d for d in config.devices.values() if d.bus == name}

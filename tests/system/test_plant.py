@@ -16,6 +16,7 @@ from procs import (
     CHECKOUT,
     Asking,
     command_from_far,
+    every_device_online,
     fieldtwin,
     free_port,
     held_by,
@@ -23,6 +24,7 @@ from procs import (
     run_to_end,
     wait_for,
 )
+from stores import Row, log_of, own
 
 pytestmark = pytest.mark.slow
 
@@ -138,6 +140,59 @@ def test_a_plant_is_only_read_until_it_may_be_written(plant: Plant) -> None:
         assert run.wait(4) == 0, run.err
     assert plant.held()[-1] == "0000"
     assert run.summary["outputs_safe"] is True
+
+
+@pytest.mark.long
+def test_a_plant_obeys_its_twin_while_its_switch_says_remote_and_both_know_the_same_in_the_end(plant: Plant) -> None:
+    """No emulated connection anywhere: the plant's own file on both sides, the switch thrown while the plant runs."""
+    place = f"tcp://127.0.0.1:{free_port()}"
+    with plant.system.open("a", encoding="utf-8") as file:
+        file.write("commands: {period_s: [0, 60], per_minute: 60}\n")
+    stores = [plant.folder / instance / "knowledge.sqlite" for instance in ("pt", "dt")]
+    wanted: list[Row] = []
+    args = ("run", str(plant.system), "--plant", "--allow-writes", "--instance", "pt", "--thread", place)
+    with fieldtwin(plant.folder, *args) as run:
+        every_device_online(run.control("pt", "gateway"))
+        thread = run.control("pt", "thread")
+
+        def twin(period_s: int, counts: str, model_s: int, name: str, *, dies: bool = False) -> None:
+            n = thread("get")[counts]
+            command = ("--command", str(period_s), "--instance", "dt")
+            with fieldtwin(plant.folder, "twin", str(plant.system), "--from", place, *command, name=name) as its:
+                wait_for(lambda: thread("get")[counts] == n + 1, 20, f"{counts}; {its.err}")
+                mine, own_log = its.control("dt", "twin"), own(stores[0], "plant")
+                wait_for(lambda: mine("get")["period_s"] == model_s, 5, "its model is as the plant is")
+                wanted[:] = log_of(stores[0], own_log)
+                wait_for(lambda: len(log_of(stores[1], own_log)) >= len(wanted), 20, "it knows what the plant knows")
+                its.signal(signal.SIGKILL if dies else signal.SIGINT)
+                its.process.wait(10)
+
+        def switch(old: str, new: str) -> None:
+            text = plant.system.read_text(encoding="utf-8")
+            assert old in text
+            plant.system.write_text(text.replace(old, new), encoding="utf-8")
+            done = run_to_end(plant.folder, "reload", "pt", name="reload")
+            assert done.process.returncode == 0, done.err
+            assert f"{old} -> {new.partition(': ')[2]}" in done.out
+
+        twin(2, "commands_taken", 2, "first", dies=True)
+        switch("remote: remote", "remote: local")
+        twin(3, "commands_refused", 2, "second")
+        switch("remote: local", "remote: remote")
+        twin(4, "commands_taken", 4, "third")
+        assert plant.held()[-1] == "0004"
+        assert "refused    by the plant: number 2 of twin:" in (plant.folder / "second.err").read_text()
+        assert (thread("get")["commands_taken"], thread("get")["commands_refused"]) == (2, 1), "nothing is repeated"
+        run.signal(signal.SIGINT)
+        assert run.wait(6) == 0, run.err
+    audit = [json.loads(line) for line in (plant.folder / "pt" / "audit.jsonl").read_text().splitlines()]
+    assert [(e["action"], e.get("payload", "")) for e in audit if e["action"] in ("command", "reload")] == [
+        ("command", "0002"), ("reload", ""), ("reload", ""), ("command", "0004"),
+    ]  # fmt: skip
+    plants, twins = own(stores[0], "plant"), own(stores[1], "twin")
+    assert log_of(stores[1], plants)[: len(wanted)] == wanted, "no gap, none twice, row by row"
+    assert log_of(stores[0], twins) == log_of(stores[1], twins)
+    assert [row[5] for row in log_of(stores[0], twins)] == [b"\0\2", b"\0\3", b"\0\4"]
 
 
 @pytest.mark.long

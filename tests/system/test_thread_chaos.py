@@ -10,15 +10,14 @@ import random
 import re
 import shutil
 import socket
-import sqlite3
 import sys
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 from procs import CHECKOUT, Fieldtwin, fieldtwin, free_port, no_tracebacks, wait_for
+from stores import ask, log_of, own
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
 from mosquitto_here import broker
@@ -30,32 +29,6 @@ FAULTS = """faults:
   - {name: duplicate, direction: both, probability: 0.1}
   - {name: reorder, direction: both, probability: 0.1}
 """
-Row = tuple[Any, ...]
-
-
-def ask(path: Path, question: str, *what: str) -> list[Row]:
-    """What a store answers; nothing where there is none yet."""
-    with suppress(sqlite3.OperationalError), closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as db:
-        return db.execute(question, what).fetchall()
-    return []
-
-
-def log_of(path: Path, origin: str) -> list[Row]:
-    """An origin's events as they are stored, in order."""
-    return ask(
-        path,
-        "SELECT sequence, t_ms, kind, text, typeof(value), value, quality, reason FROM event"
-        " JOIN origin ON origin.id = event.origin JOIN event_name ON event_name.id = event.name"
-        " WHERE origin.name = ? ORDER BY sequence",
-        origin,
-    )
-
-
-def own(path: Path, side: str) -> str:
-    """The origin under which that side writes; empty before it has one."""
-    return next(
-        (str(row[0]) for row in ask(path, "SELECT name FROM origin WHERE own AND name GLOB ?", f"{side}:*")), ""
-    )
 
 
 class Chaos:

@@ -105,6 +105,21 @@ def test_the_rate_is_bounded_and_recovers() -> None:
         Hands.now_ms = NOW_MS
 
 
+def test_switch_and_limits_may_change_and_what_was_taken_before_counts() -> None:
+    made = gate(bounds=Bounds(0, 3600, 3))
+    assert all(made.admit("t", number(n)) is not None for n in (1, 2))
+    made.restate(remote=False, bounds=Bounds(0, 3600, 3))
+    assert made.admit("t", number(3)) is None
+    made.restate(remote=True, bounds=Bounds(0, 60, 2))
+    assert made.admit("t", number(4, 10)) is None
+    assert [why.partition(": ")[2] for why in refusals(made)] == [
+        "the plant says local", "more than 2 commands in a minute",
+    ]  # fmt: skip
+    made.restate(remote=True, bounds=Bounds(0, 60, 4))
+    assert made.admit("t", number(5, 61)) is None
+    assert [made.admit("t", number(n, 10)) is not None for n in (6, 7, 8)] == [True, True, False]
+
+
 def test_what_is_no_command_is_none_of_its_business() -> None:
     made = gate()
     assert made.admit("twin:1", Event(1, NOW_MS, Kind.VERDICT, "x", "y")) is None

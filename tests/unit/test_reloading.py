@@ -98,6 +98,8 @@ def edit(path: Path, *changes: tuple[str, str]) -> None:
         ("timeout_ms: 300", "timeout_ms: 500, retries: 3, spacing_ms: 20", "buses.line.timeout_ms: 300 -> 500"),
         ("stale_after_ms: 3000}\n  tilt", "stale_after_ms: 3000, timeout_ms: 900}\n  tilt", "devices.other.timeout_ms"),
         ("node: 5, poll: {values: {every_ms: 1000}", "node: 5, poll: {values: {every_ms: 200}", "devices.tilt.poll"),
+        ("remote: remote", "remote: local", "remote: remote -> local"),
+        ("remote: remote", "remote: remote\ncommands: {per_minute: 6}", "commands.per_minute: 60 -> 6"),
     ],
 )
 def test_what_can_be_taken_over(plant: Path, old: str, new: str, says: str | None) -> None:
@@ -123,7 +125,6 @@ def test_what_can_be_taken_over(plant: Path, old: str, new: str, says: str | Non
         ("plant", "node: 5, poll: {values: {every_ms: 1000}}, ", "node: 5, ", "10:3", "devices.tilt.poll.values"),
         ("plant", "  other:", "  another:", "9:3", "devices.another"),
         ("plant", "cycle_ms: 50", "cycle_ms: 20", "11:7", "plc.cycle_ms"),
-        ("plant", "remote: remote", "remote: local", "13:1", "remote"),
         ("tank", 'level:  {at: "holding:0"', 'level:  {at: "holding:3"', "7:12", "test/tank: tags.level.at"),
         ("tank", "scale: 0.1, unit", "unit", "7:3", "test/tank: tags.level.scale"),  # a whole number from now on
         ("tank", "  volume:", '  depth: {at: "holding:9"}\n  volume:', "9:3", "test/tank: tags.depth"),

@@ -10,6 +10,7 @@ from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from gateway.core.errors import UsageError
 from gateway.core.image import INPUTS, OUTPUTS
+from gateway.core.statemachine import STATE_CODES
 from gateway.core.values import Quality, Reason, TagValue
 from gateway.store.event import Event, Kind
 from gateway.wallclock import WallClock
@@ -85,6 +86,28 @@ def test_a_thread_that_is_thinned_out_has_a_value_a_second_and_whatever_matters_
     assert [e.value for e in watched.look(3.0, 10)] == [3.0], "it is good again"
     (message,) = watched.look(3.0, 10, b"sample")
     assert (message.kind, message.value) == (Kind.PAYLOAD, b"sample")
+
+
+def test_a_state_is_told_when_it_changes_and_again_to_whom_was_refused() -> None:
+    """A twin's model is ahead of the plant with every command that it sends; one that was refused takes it back."""
+    layout = image_layout(OBSERVATORY)
+    memory = memoryview(bytearray(layout.size))
+    layout.format(memory)
+    image, clock = layout.attach(memory), Hands()
+    process = ImageProcess(OBSERVATORY, layout, clock)
+    writer, readers = image.writer(OUTPUTS), (image.reader(INPUTS), image.reader(OUTPUTS))
+    names = readers[1].snapshot().shape.index
+    row = {n: TagValue(STATE_CODES["ACTIVE"] if n == "relay.state" else 2, Quality.GOOD) for n in names}
+    writer.publish([row[n] for n in sorted(names, key=names.__getitem__)], clock.monotonic_ns(), {})
+
+    def states() -> list[Event]:
+        clock.now_ms += 50
+        process.look(*(reader.snapshot() for reader in readers))
+        return [e for e in process.collect() if e.kind == Kind.STATE]
+
+    assert [len(states()) for _ in range(3)] == [1, 0, 0]
+    process.tell_again()
+    assert [len(states()) for _ in range(2)] == [1, 0]
 
 
 def test_a_system_with_one_transmitter_lends_that() -> None:

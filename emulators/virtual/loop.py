@@ -19,6 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
 
+from emulators.virtual.waiting import waits_at
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import Bug
 
@@ -264,7 +265,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def _who_waits(self) -> str:
         tasks = sorted(asyncio.all_tasks(self), key=lambda task: task.get_name())
-        told = [f"{task.get_name()} at {_waits_at(task)}" for task in tasks[:_WAITING_SHOWN]]
+        told = [f"{task.get_name()} at {waits_at(task, _is_plumbing)}" for task in tasks[:_WAITING_SHOWN]]
         more = len(tasks) - len(told)
         return "; ".join(told) + (f"; and {more} more" if more > 0 else "")
 
@@ -368,20 +369,6 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     remove_writer: Any = _way_out("remove_writer")
     add_signal_handler: Any = _way_out("add_signal_handler")
     remove_signal_handler: Any = _way_out("remove_signal_handler")
-
-
-def _waits_at(task: asyncio.Task[Any]) -> str:
-    """Where in the code a task waits: the innermost line of ours, with what it awaits there."""
-    inner: Any = task.get_coro()
-    while (deeper := getattr(inner, "cr_await", None)) is not None and hasattr(deeper, "cr_frame"):
-        inner = deeper
-    frame = getattr(inner, "cr_frame", None)
-    awaited = getattr(inner, "cr_await", None)
-    name = getattr(inner, "__qualname__", repr(inner))
-    if frame is None:
-        return str(name)
-    for_what = f" for {type(awaited).__name__}" if awaited is not None else ""
-    return f"{name} ({Path(frame.f_code.co_filename).name}:{frame.f_lineno}){for_what}"
 
 
 def culprit() -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import datetime
+import re
 import socket
 import subprocess
 import sys
@@ -102,14 +103,48 @@ def test_timeouts_and_waits_of_asyncio_work() -> None:
 
 
 def test_a_deadlock_says_who_waits_for_what() -> None:
-    async def stuck(event: asyncio.Event) -> None:
-        await event.wait()
+    """Each task by its name, with the line of its author's and what is waited for there, not with asyncio's innermost line."""
+
+    async def takes(first: asyncio.Lock, second: asyncio.Lock) -> None:
+        async with first:
+            await asyncio.sleep(1)
+            async with second:
+                pass
+
+    async def reads(queue: asyncio.Queue[bytes]) -> None:
+        await queue.get()
 
     async def main(loop: VirtualLoop) -> None:
-        task = loop.create_task(stuck(asyncio.Event()), name="the reader")
-        await task
+        one, other = asyncio.Lock(), asyncio.Lock()
+        tasks = [
+            loop.create_task(takes(one, other), name="bus"),
+            loop.create_task(takes(other, one), name="plc"),
+            loop.create_task(reads(asyncio.Queue(8)), name="reader"),
+        ]
+        await asyncio.gather(*tasks)
 
-    with pytest.raises(Deadlock, match=r"the reader at .*wait.*\(locks.py:\d+\) for Future"):
+    with pytest.raises(Deadlock) as e:
+        run(main)
+    here = r"test_a_deadlock\S+<locals>\.{} \(test_virtual_loop.py:\d+\)"
+    for told in (
+        f"bus at {here.format('takes')} for Lock.acquire \\[locked, waiters:1\\]; ",
+        f"plc at {here.format('takes')} for Lock.acquire \\[locked, waiters:1\\]; ",
+        f"reader at {here.format('reads')} for Queue.get maxsize=8 ",
+        f"at {here.format('main')} for tasks bus, plc, reader",
+    ):
+        assert re.search(told, str(e.value)), str(e.value)
+
+
+def test_a_deadlock_names_the_task_that_is_waited_for() -> None:
+    async def main(loop: VirtualLoop) -> None:
+        await loop.create_task(waits(loop.create_future()), name="who never ends")
+
+    async def waits(future: asyncio.Future[None]) -> None:
+        await future
+
+    with pytest.raises(
+        Deadlock, match=r"main \(test_v\S+ for task who never ends.*who never ends at .*waits .* for a future"
+    ):
         run(main)
 
 

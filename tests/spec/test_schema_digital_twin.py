@@ -15,7 +15,7 @@ from gateway.core.values import COMMAND, DATA, Quality, Reason
 from gateway.store.event import Kind
 from twin.mape.execute import Bounds, Execute
 from twin.mape.messages import verdict
-from twin.mape.plan import Plan, Rule, RulePlanner
+from twin.mape.plan import Plan, Planner, Rule, RulePlanner
 from twin.mape.what_if import Question
 from twin.model import DigitalModel
 from twin.shadow import DigitalShadow
@@ -61,11 +61,12 @@ class Rig:
         bounds: Bounds = Bounds(),  # noqa: B008
         what_if: Prototype | None = None,
         rules: tuple[Rule, ...] = RULES,
+        planner: Planner | None = None,
     ) -> None:
         self.clock = Hands()
         self.receiving = ReceivingEnd("from the plant")
         self.twin = DigitalTwin(
-            self.receiving, self.clock, RulePlanner(rules), declared=DECLARED, bounds=bounds,
+            self.receiving, self.clock, planner or RulePlanner(rules), declared=DECLARED, bounds=bounds,
             what_if=what_if, question=EMPTY if what_if else None,
         )  # fmt: skip
         self.sent: Consumer[COMMAND] = Consumer(self.twin.execute.transmitter.event)
@@ -239,3 +240,21 @@ def test_DigitalTwin_changes_of_the_model_reach_the_plant_and_those_of_the_plant
     assert rig.give(status(1)) == []
     assert rig.give(status(3)) == [], "somebody at the plant: the model follows"
     assert rig.twin.digital_model.period_s == 3
+
+
+class Deep:
+    """A planner in Python that reads the model's variables: sample each second while it is below 80 dbar."""
+
+    def plan(self, data: DATA, model: DigitalModel) -> COMMAND | None:
+        pressure = model.variables["ctd.pressure"]
+        deep = pressure.good and isinstance(pressure.value, float) and pressure.value > 80.0
+        return encode_period(1) if deep and model.period_s != 1 else None
+
+
+def test_DigitalTwin_a_planner_is_given_the_variables_as_they_were_reported_and_may_rely_on_their_quality() -> None:
+    rig = Rig(planner=Deep())
+    assert rig.give(value(120.0, quality=Quality.BAD, reason=Reason.TIMEOUT), status(60)) == [], (
+        "bad: nobody relies on it"
+    )
+    assert rig.give(value(50.0), status(60)) == []
+    assert rig.give(value(90.0), status(60)) == [1], "not outside of its limits: no rule would have seen it"

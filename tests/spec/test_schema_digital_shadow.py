@@ -225,6 +225,18 @@ def test_DigitalShadow_holds_each_declared_variable_with_quality_and_time_as_it_
     assert not variables["ctd.sample_count"].heard
 
 
+def test_DigitalShadow_has_its_variables_kept_up_before_a_verdict_on_them_is_reached() -> None:
+    rig, seen = Rig(), []
+
+    class Looks(Consumer[Verdict]):
+        def observe(self, item: Verdict) -> None:
+            seen.append((item.finding, rig.shadow.digital_model.variables["ctd.pressure"].value))
+
+    rig.shadow.analyze.emitter.subscribe(Looks(rig.shadow.analyze.emitter.event))
+    rig.give(value(150.0), value(50.0))
+    assert seen == [("outside", 150.0), ("inside", 50.0)]
+
+
 def test_DigitalShadow_what_the_system_does_not_declare_is_no_part_of_its_model_and_is_counted() -> None:
     rig = Rig()
     rig.give(value(1.0)._replace(name="somebody.else"))

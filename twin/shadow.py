@@ -11,6 +11,7 @@ from typing import Any
 
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.events import Consumer
+from gateway.store.event import Event
 from twin.mape.analyze import Analyze
 from twin.mape.messages import Verdict
 from twin.mape.monitor import Monitor
@@ -48,6 +49,15 @@ class DigitalShadow:
     def processes(self) -> tuple[DTDigitalThreadProcess, ...]:
         """The thread processes; what they share is this side's knowledge."""
         return (self.monitor, self.analyze)
+
+    def recall(self, events: Iterable[Event]) -> None:
+        """Begin with what was known before a restart, the last of each name: the model as it was, and what was wrong."""
+        for event in events:
+            self.monitor.arrived(event, event.t_ms)
+            self.monitor.handle_state()
+            self.monitor.handle_measurements()
+            self.upkeep.keep_up()
+            self.analyze.recall()
 
     def step(self) -> int:
         """Take in what arrived and analyze it, one by one: each is compared with the model as it was then. How many events."""

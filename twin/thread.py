@@ -24,9 +24,10 @@ COLLECT_MS = 50
 
 
 def schema_of(system: System) -> Schema:
-    """The names that a system's two twins have in common, in the system file's order: tags, then programs and devices."""
+    """The names that a system's two twins have in common, in the system file's order: tags, then programs and devices. It is
+    of that system alone: a twin of another one that is built alike neither hears this plant nor commands it."""
     names = [f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()]
-    return Schema((*names, *system.plc.programs, *system.devices))
+    return Schema((*names, *system.plc.programs, *system.devices), system.name)
 
 
 class Operator(DTDigitalThreadProcess):

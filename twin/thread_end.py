@@ -188,6 +188,7 @@ class ThreadEnd:
             if self.into.unknown_schema:
                 self.trouble = (
                     f"the other side writes with a schema that this one does not have: {self.into.unknown_schema.hex()}"
+                    " (another system, or another version of its file)"
                 )
         elif out is not None and frame.tag == out.tag:
             if isinstance(frame, Ack):
@@ -199,7 +200,8 @@ class ThreadEnd:
             elif isinstance(frame, Refused):
                 out.on_refused(now_ns)
                 self.trouble = (
-                    f"the other side does not have our schema {frame.schema.hex()}; nothing is lost meanwhile"
+                    f"the other side does not have our schema {frame.schema.hex()} (another system, or another version of its"
+                    " file); nothing is lost meanwhile"
                 )
 
     async def _do(self, effects: list[Effect]) -> None:
@@ -220,7 +222,7 @@ class ThreadEnd:
 
     async def _keep(self, effect: Keep) -> None:
         try:
-            await self._store.keep(effect.origin, effect.events, prototype=effect.prototype)
+            await self._store.keep(effect.origin, effect.events, system=self._schema.system, prototype=effect.prototype)
         except FieldtwinError:
             self.into.not_kept(effect.origin, effect.events)
             raise

@@ -44,14 +44,17 @@ _F32, _F64 = struct.Struct(">f"), struct.Struct(">d")
 
 @dataclass(frozen=True, slots=True)
 class Schema:
-    """Names that both ends know, in one order; `id` tells one list from every other."""
+    """Names that both ends know, in one order, and of which system; `id` tells one list from every other."""
 
     names: tuple[str, ...]
+    system: str = ""
 
     @property
     def id(self) -> bytes:
-        """The first bytes of a SHA-256 over this encoding's version and the names."""
-        return hashlib.sha256("\n".join((str(VERSION), *self.names)).encode()).digest()[:SCHEMA_BYTES]
+        """The first bytes of a SHA-256 over this encoding's version, the system and the names: of two plants that are built
+        alike, neither has the schema of the other."""
+        whole = "\n".join((str(VERSION), self.system, *self.names))
+        return hashlib.sha256(whole.encode()).digest()[:SCHEMA_BYTES]
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,10 +12,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.whatif.known import recall
 from gateway.core.clock import NS_PER_MS
 from gateway.core.control import ControlServer
 from gateway.core.nursery import Nursery
-from gateway.store.event import Event, KnowledgeStore
+from gateway.store.event import Event, Kind, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
 from gateway.wallclock import WallClock
 from twin.declared import declared_variables
@@ -32,6 +33,7 @@ from twin.thread_process import ReceivingEnd
 from twin.variables import Limits
 
 STEP_MS = 50
+ABOUT_THE_PLANT = (Kind.VALUE, Kind.STATE, Kind.PAYLOAD)
 STALE_AFTER_MS = 30_000
 """Three times as long as a plant is silent about what does not change."""
 
@@ -98,6 +100,7 @@ class Shadowing:
             await server.listen_unix(self._socket)
             own = await store.own("shadow", system=system.name, prototype=False, log=secrets.token_hex(4))
             carrier = twin_carrier(self._place, system, clock)
+            await self._recall(store)
             self._end = await self._thread(store, carrier)
             writer = KnowledgeWriter(store, own, clock)
             try:
@@ -124,6 +127,20 @@ class Shadowing:
         finally:
             await server.aclose()
             await store.aclose()
+
+    async def _recall(self, store: KnowledgeStore) -> None:
+        """Begin with what was known of this plant when the shadow ended, if it was there before."""
+        newest: dict[tuple[int, str], Event] = {}
+
+        def take(events: Sequence[Event]) -> None:
+            for event in events:
+                key = (event.kind, event.name)
+                if event.kind in ABOUT_THE_PLANT and (key not in newest or newest[key].t_ms <= event.t_ms):
+                    newest[key] = event
+
+        for origin in await store.origins(self._system.name):
+            await recall(store, origin, take)
+        self.shadow.recall(newest.values())
 
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"ready": bool(self.origins) and self._end is not None and self._end.connected}

@@ -106,7 +106,7 @@ class Twinning(Shadowing):
 
     async def _beside(self, nursery: Nursery, store: KnowledgeStore) -> None:
         if self._asking is not None:
-            await self._asking.recall(store, list(await store.origins()))
+            await self._asking.recall(store, list(await store.origins(self._system.name)))
             nursery.start(self._asking.run(), "what if")
 
     def _step(self, writer: KnowledgeWriter) -> None:

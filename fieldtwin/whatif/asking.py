@@ -94,7 +94,7 @@ class Asking:
         from fieldtwin.whatif.known import recall
 
         for origin in origins:
-            await recall(store, origin, self.known)
+            await recall(store, origin, self.known.take)
 
     async def check(self, questions: Sequence[Question]) -> None:
         """Whether the prototype can be made and what is required can be looked at. Raises `UsageError`."""

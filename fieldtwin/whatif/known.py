@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 from fieldtwin.whatif.last_known import LastKnown
 from fieldtwin.whatif.state import KnownState
 from gateway.core.errors import UsageError
-from gateway.store.event import KnowledgeStore
+from gateway.store.event import Event, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
 from twin.system import System
 
@@ -20,13 +22,13 @@ async def known_state(place: str, system: System, origin: str = "") -> KnownStat
     """
     store = await open_knowledge(place)
     try:
-        origins = list(await store.origins())
+        origins = list(await store.origins(system.name))
         if origin and origin not in origins:
             raise UsageError(f"nothing is known of {origin!r}", expected=", ".join(origins) or "an origin with events")
         found = {}
         for name in [origin] if origin else origins:
             known = LastKnown(system)
-            await recall(store, name, known)
+            await recall(store, name, known.take)
             if known.utc_ms or origin:
                 found[name] = known
         if len(found) != 1:
@@ -42,13 +44,13 @@ async def known_state(place: str, system: System, origin: str = "") -> KnownStat
         await store.aclose()
 
 
-async def recall(store: KnowledgeStore, origin: str, known: LastKnown) -> None:
-    """Let `known` take the end of what a store has of an origin."""
+async def recall(store: KnowledgeStore, origin: str, take: Callable[[Sequence[Event]], None]) -> None:
+    """Let `take` have the end of what a store has of an origin, block by block."""
     first, last = await store.span(origin)
     at = max(first, last - RECENT + 1)
     while at <= last:
         events = await store.read(origin, at, BLOCK)
         if not events:
             return
-        known.take(events)
+        take(events)
         at = events[-1].sequence + 1

@@ -93,16 +93,17 @@ class KnowledgeStore(Protocol):
         """
         ...
 
-    async def origins(self) -> dict[str, bool]:
-        """Every origin in the store, and whether its events come from a prototype."""
+    async def origins(self, system: str = "") -> dict[str, bool]:
+        """Every origin in the store, and whether its events come from a prototype. With `system`: those of it, and those of
+        which an older store does not say whose they are."""
         ...
 
     async def append(self, origin: str, events: Sequence[Event]) -> int:
         """Number `events` and keep all of them or none; the last number. For the one who writes this origin's log."""
         ...
 
-    async def keep(self, origin: str, events: Sequence[Event], *, prototype: bool = False) -> int:
-        """Keep numbered events of somebody else's log; how many were new. The same event twice is one."""
+    async def keep(self, origin: str, events: Sequence[Event], *, system: str = "", prototype: bool = False) -> int:
+        """Keep numbered events of somebody else's log, of `system`; how many were new. The same event twice is one."""
         ...
 
     async def span(self, origin: str) -> tuple[int, int]:

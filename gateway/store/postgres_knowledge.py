@@ -40,6 +40,8 @@ class PostgresKnowledge:
         self._lock = asyncio.Lock()
         self._db: asyncpg.Connection | None = None
         self._origins: dict[str, int] = {}
+        self._whose: set[str] = set()
+        """Origins of others of which the store says whose they are."""
 
     @classmethod
     async def open(cls, url: str) -> PostgresKnowledge:
@@ -117,8 +119,9 @@ class PostgresKnowledge:
             raise UsageError("the name of a side of a thread", expected="a word without colon or star", got=repr(name))
         return await self._do(work)
 
-    async def origins(self) -> dict[str, bool]:
-        rows = await self._do(lambda db: db.fetch("SELECT name, prototype FROM origin ORDER BY id"))
+    async def origins(self, system: str = "") -> dict[str, bool]:
+        which = "SELECT name, prototype FROM origin WHERE $1 IN ('', system) OR system = '' ORDER BY id"
+        rows = await self._do(lambda db: db.fetch(which, system))
         return {row["name"]: row["prototype"] for row in rows}
 
     async def _add_origin(self, db: asyncpg.Connection, name: str, *, own: bool, system: str, prototype: bool) -> int:
@@ -147,13 +150,16 @@ class PostgresKnowledge:
 
         return await self._do(work)
 
-    async def keep(self, origin: str, events: Sequence[Event], *, prototype: bool = False) -> int:
+    async def keep(self, origin: str, events: Sequence[Event], *, system: str = "", prototype: bool = False) -> int:
         async def work(db: asyncpg.Connection) -> int:
             async with db.transaction():
                 number = self._origins.get(origin)
                 if number is None:
-                    number = await self._add_origin(db, origin, own=False, system="", prototype=prototype)
+                    number = await self._add_origin(db, origin, own=False, system=system, prototype=prototype)
+                if system and origin not in self._whose:
+                    await db.execute("UPDATE origin SET system = $2 WHERE id = $1 AND system = ''", number, system)
                 done = await db.execute(f"{_INSERT} ON CONFLICT DO NOTHING", number, *_columns(events))
+            self._whose.add(origin)
             return int(done.split()[-1])
 
         try:

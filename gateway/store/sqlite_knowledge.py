@@ -45,6 +45,8 @@ class SqliteKnowledge:
         self._thread = ThreadPoolExecutor(1, "knowledge") if offload is None else None
         self._offload = offload or self._in_thread
         self._origins: dict[str, int] = {}
+        self._whose: set[str] = set()
+        """Origins of others of which the store says whose they are."""
         self._names: dict[str, int] = {}
         self._texts: dict[int, str] = {}
 
@@ -125,9 +127,12 @@ class SqliteKnowledge:
             raise UsageError("the name of a side of a thread", expected="a word without colon or star", got=repr(name))
         return await self._do(work)
 
-    async def origins(self) -> dict[str, bool]:
+    async def origins(self, system: str = "") -> dict[str, bool]:
         def work() -> dict[str, bool]:
-            return {n: bool(p) for n, p in self._db.execute("SELECT name, prototype FROM origin ORDER BY id")}
+            rows = self._db.execute(
+                "SELECT name, prototype FROM origin WHERE ? IN ('', system) OR system = '' ORDER BY id", (system,)
+            )
+            return {n: bool(p) for n, p in rows}
 
         return await self._do(work)
 
@@ -154,14 +159,17 @@ class SqliteKnowledge:
 
         return await self._do(work)
 
-    async def keep(self, origin: str, events: Sequence[Event], *, prototype: bool = False) -> int:
+    async def keep(self, origin: str, events: Sequence[Event], *, system: str = "", prototype: bool = False) -> int:
         def work() -> int:
             self._db.execute("BEGIN IMMEDIATE")
             number = self._origins.get(origin)
             if number is None:
-                number = self._add_origin(origin, own=False, system="", prototype=prototype)
+                number = self._add_origin(origin, own=False, system=system, prototype=prototype)
+            if system and origin not in self._whose:
+                self._db.execute("UPDATE origin SET system = ? WHERE id = ? AND system = ''", (system, number))
             new = self._insert(number, events, "OR IGNORE")
             self._db.execute("COMMIT")
+            self._whose.add(origin)
             return new
 
         return await self._do(work)

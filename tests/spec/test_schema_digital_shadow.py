@@ -131,14 +131,15 @@ def test_Analyze_says_what_is_outside_of_the_model_bad_or_stale_once_and_when_it
 def test_Analyze_measures_rate_and_lag_of_twinning_and_leaves_out_what_was_backfilled() -> None:
     """Prose, row 10."""
     rig = Rig()
-    for n in range(11):
+    rig.give(value(1.0, NOW_MS - 1))
+    for n in range(1, 12):
         rig.clock.now_ms = NOW_MS + 100 * n
         rig.give(value(1.0, rig.clock.now_ms - 40))
     rig.give(value(1.0, NOW_MS - 3_600_000))
     figures = rig.shadow.describe()
     assert figures["twinning_rate_hz"] == pytest.approx(10.0)
     assert figures["lag_ms"] == {"median": 40, "p95": 40, "max": 40}
-    assert figures["backfilled"] == 1
+    assert figures["backfilled"] == 2, "of an hour ago, and of before the shadow began"
 
 
 def test_DigitalShadow_has_a_model_of_its_own_processes_and_a_connection_that_only_receives() -> None:

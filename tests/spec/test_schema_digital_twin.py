@@ -119,6 +119,34 @@ def test_Plan_does_nothing_about_history() -> None:
     assert rig.twin.plan.too_old == 1
 
 
+def test_Plan_does_something_about_history_as_soon_as_it_is_the_present_too() -> None:
+    """An hour's outage of the thread: what began in it and is so still is planned for, and so is what ended in it."""
+    rig = Rig(rules=(*RULES, Rule("stale", "", 0), Rule("fresh", "", 10)))
+    hour_ago = NOW_MS - 3_600_000
+    assert rig.give(status(60, t_ms=hour_ago), value(200.0, hour_ago)) == []
+    assert rig.give(value(201.0)) == [1], "outside, still"
+    assert rig.give(value(202.0)) == []
+    rig.clock.now_ms += 3_600_000
+    assert rig.give() == [0], "nothing was heard of it"
+    assert rig.give(value(5.0, NOW_MS + 60_000)) == [10], "it is heard of again; inside, an hour ago"
+    rig.twin.digital_model.process_event(encode_period(1))
+    assert rig.give(value(5.0, rig.clock.now_ms)) == [10], "inside"
+
+
+def test_DigitalTwin_begins_again_where_it_ended() -> None:
+    """What it knows of the plant is its model; what was wrong is planned for when the plant says how it is now."""
+    rig = Rig()
+    rig.twin.recall([status(1, t_ms=NOW_MS - 60_000), value(200.0, NOW_MS - 60_000)])
+    seen = rig.twin.describe()
+    assert (seen["state"], seen["period_s"], seen["wrong"]) == ("ACTIVE", 1, {"ctd.pressure": ["outside"]})
+    assert (seen["measurements"], seen["statuses"], seen["backfilled"]) == (0, 0, 0), "nothing has come yet"
+    assert rig.give() == []
+    assert rig.give(value(5.0)) == [10], "it came back while nobody looked"
+    rig.twin.recall([status(1), value(200.0)])
+    assert rig.give(value(201.0)) == [], "the model has that period"
+    assert rig.twin.digital_model.variables["ctd.pressure"].value == 201.0
+
+
 @given(x=PERIODS, before=PERIODS)
 def test_Execute_asks_the_model_first_and_emits_the_command_if_and_only_if_it_accepts(x: int, before: int) -> None:
     """Ruling 9, and prose, row 7: no user steps in."""

@@ -120,6 +120,28 @@ def test_an_origin_is_the_same_after_a_restart_and_another_for_another_system_or
     run(main())
 
 
+def test_a_store_says_whose_every_origin_is_and_learns_it_of_one_from_before(place: str) -> None:
+    async def main() -> None:
+        store = await opened(place)
+        await own(store)
+        of_west, of_nobody = EVERY_KIND[0]._replace(sequence=1), EVERY_KIND[1]._replace(sequence=1)
+        await store.keep("plant:w", [of_west], system="west", prototype=True)
+        await store.keep("plant:n", [of_nobody])
+        await store.note_lost("plant:l", 1, 3)
+        assert set(await store.origins("observatory")) == {"plant:aa", "plant:n", "plant:l"}
+        assert set(await store.origins("west")) == {"plant:w", "plant:n", "plant:l"}
+        await store.aclose()
+        store = await opened(place)
+        for _ in range(2):
+            await store.keep("plant:n", [of_nobody], system="east")
+        await store.keep("plant:w", [of_west], system="east")
+        assert await store.origins("east") == {"plant:n": False, "plant:l": False}
+        assert set(await store.origins("west")) == {"plant:w", "plant:l"}, "whose it is stays"
+        await store.aclose()
+
+    run(main())
+
+
 def test_the_same_event_twice_is_one_and_gaps_are_known_until_they_are_filled_or_lost(place: str) -> None:
     async def main() -> None:
         store = await opened(place)

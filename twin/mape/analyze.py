@@ -7,6 +7,7 @@ they hear of each other, how late. It must never know a connection, nor anything
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from typing import Any
 
 from gateway.core.clock import Clock
@@ -23,14 +24,16 @@ CAPACITY = 10_000
 LAGS = 10_000
 """Arrivals of which the lag is kept for the figures."""
 LATE_MS = 10_000
-"""What is older than this when it arrives was backfilled: it is counted, and is no part of lag and rate."""
+"""What is older than this when it arrives was backfilled: it is counted, and is no part of lag and rate. So was what is from
+before there was anybody to hear it."""
 
 
 class Analyze(DTDigitalThreadProcess):
     """SPEC row Analyze. Values are held against the limits of the model's variables; what is not heard of for `stale_after_ms` is
     stale.
 
-    Every status gets a verdict; of a tag only changes are told: outside and inside again, bad and good, stale and fresh.
+    Every status gets a verdict; of a tag only changes are told: outside and inside again, bad and good, stale and fresh. A change
+    that was history when it was heard of is told again when the plant says that it is so still: for who plans by what is.
     """
 
     def __init__(self, model: DigitalModel, clock: Clock, *, stale_after_ms: int) -> None:
@@ -45,7 +48,18 @@ class Analyze(DTDigitalThreadProcess):
         self._heard: dict[str, int] = {}
         self._wrong: dict[str, set[str]] = {}
         """What is wrong with a tag now."""
+        self._history: set[tuple[str, str]] = set()
+        """Of what in `_wrong`, or no more in it, was heard as history only."""
+        self._began_ms = clock.utc_ns() // 1_000_000
         self._first_ms = self._last_ms = self._reports = 0
+
+    def recall(self) -> None:
+        """Take in what was known before a restart. What was wrong then is told as soon as the plant says how it is now."""
+        for message in self.consumer.drain():
+            if isinstance(message, SeenMeasurement) and message.event.kind == Kind.VALUE:
+                name = message.event.name
+                self._wrong[name] = {wrong for wrong, _, is_so, _ in self._weighed(message) if is_so}
+                self._history |= {(name, wrong) for wrong in self._wrong[name]}
 
     def check_statuses(self, status: SeenStatus) -> bool | None:
         """CheckStatuses: whether the reported state and period are the model's. None for a status that is none."""
@@ -85,17 +99,24 @@ class Analyze(DTDigitalThreadProcess):
     def _weigh(self, message: SeenMeasurement) -> None:
         event = message.event
         self._heard[event.name] = message.arrived_ms
-        self._turn(event.name, "stale", "fresh", False, f"{event.name} is heard of again", event.t_ms)
+        self._turn(event.name, "stale", "fresh", False, f"{event.name} is heard of again", message.arrived_ms)
+        late = message.arrived_ms - event.t_ms > LATE_MS
+        for wrong, right, is_wrong, text in self._weighed(message):
+            self._turn(event.name, wrong, right, is_wrong, text, event.t_ms, late=late)
+
+    def _weighed(self, message: SeenMeasurement) -> Iterator[tuple[str, str, bool, str]]:
+        """What a value can be found to be: the word for wrong, the one for right, which of them it is, and in words."""
+        event = message.event
         bad = message.quality >= Quality.BAD
         why = f"{event.name} is {message.quality}: {message.reason}" if bad else f"{event.name} is good again"
-        self._turn(event.name, "bad", "good", bad, why, event.t_ms)
+        yield "bad", "good", bad, why
         variable = self.digital_model.variables.get(event.name)
         limits = variable.limits if variable is not None else None
         if limits is None or bad or not isinstance(event.value, int | float):
             return
         outside = not limits[0] <= event.value <= limits[1]
         text = f"{event.name} is {event.value:g}; the model has {limits[0]:g} to {limits[1]:g}"
-        self._turn(event.name, "outside", "inside", outside, text, event.t_ms)
+        yield "outside", "inside", outside, text
 
     def look(self) -> None:
         """Time has gone on: say which tags were not heard of for too long."""
@@ -105,11 +126,15 @@ class Analyze(DTDigitalThreadProcess):
                 text = f"{name} was not heard of for {(now_ms - heard_ms) / 1000:.0f} s"
                 self._turn(name, "stale", "fresh", True, text, now_ms)
 
-    def _turn(self, name: str, wrong: str, right: str, is_wrong: bool, text: str, t_ms: int) -> None:
-        now = self._wrong.setdefault(name, set())
-        if is_wrong != (wrong in now):
-            (now.add if is_wrong else now.discard)(wrong)
-            self._say(wrong if is_wrong else right, name, text, t_ms)
+    def _turn(
+        self, name: str, wrong: str, right: str, is_wrong: bool, text: str, t_ms: int, *, late: bool = False
+    ) -> None:
+        now, about = self._wrong.setdefault(name, set()), (name, wrong)
+        if is_wrong == (wrong in now) and (late or about not in self._history):
+            return
+        (now.add if is_wrong else now.discard)(wrong)
+        (self._history.add if late else self._history.discard)(about)
+        self._say(wrong if is_wrong else right, name, text, t_ms)
 
     def _say(self, finding: str, subject: str, text: str, t_ms: int) -> None:
         made = verdict(finding, subject, text, t_ms)
@@ -118,7 +143,7 @@ class Analyze(DTDigitalThreadProcess):
         self.emitter.emit(made)
 
     def _note_lag(self, t_ms: int, arrived_ms: int) -> None:
-        if arrived_ms - t_ms > LATE_MS:
+        if arrived_ms - t_ms > LATE_MS or t_ms < self._began_ms:
             self.backfilled += 1
             return
         self._lags.append(max(0, arrived_ms - t_ms))

@@ -119,6 +119,10 @@ def told_of(variables: dict[str, Any], undeclared: int) -> str:
     return f"{len(variables)}, {len(heard)} of them heard of, {good} good{more}"
 
 
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
 def print_shadow(seen: dict[str, Any]) -> None:
     if not seen["origins"]:
         return
@@ -134,7 +138,7 @@ def print_shadow(seen: dict[str, Any]) -> None:
             f"{f'{rate:.1f} reports a second' if rate else 'too few reports'}, {seen['backfilled']} backfilled",
         ),
         ("lag", f"median {lag['median']} ms, 95 % {lag['p95']} ms, most {lag['max']} ms" if lag else "unknown"),
-        ("thread", f"{thread['links']} links, {thread['duplicates']} events came twice"),
+        ("thread", f"{_count(thread['links'], 'link')}, {_count(thread['duplicates'], 'event')} came twice"),
     ]
     if thread["trouble"]:
         lines.append(("trouble", thread["trouble"]))

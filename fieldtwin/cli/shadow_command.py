@@ -33,7 +33,8 @@ class ShadowTalk:
         self._states: dict[str, str] = {}
 
     def __call__(self, verdict: Verdict) -> None:
-        if self._quiet or (verdict.finding == "agree" and self._states.get(verdict.subject) == verdict.text):
+        known = verdict.finding == "agree" and self._states.get(verdict.subject) == verdict.text
+        if self._quiet or known or (verdict.again and verdict.fine):
             return
         if verdict.finding == "agree":
             self._states[verdict.subject] = verdict.text

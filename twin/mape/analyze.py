@@ -130,14 +130,15 @@ class Analyze(DTDigitalThreadProcess):
         self, name: str, wrong: str, right: str, is_wrong: bool, text: str, t_ms: int, *, late: bool = False
     ) -> None:
         now, about = self._wrong.setdefault(name, set()), (name, wrong)
-        if is_wrong == (wrong in now) and (late or about not in self._history):
+        again = is_wrong == (wrong in now)
+        if again and (late or about not in self._history):
             return
         (now.add if is_wrong else now.discard)(wrong)
         (self._history.add if late else self._history.discard)(about)
-        self._say(wrong if is_wrong else right, name, text, t_ms)
+        self._say(wrong if is_wrong else right, name, text, t_ms, again=again)
 
-    def _say(self, finding: str, subject: str, text: str, t_ms: int) -> None:
-        made = verdict(finding, subject, text, t_ms)
+    def _say(self, finding: str, subject: str, text: str, t_ms: int, *, again: bool = False) -> None:
+        made = verdict(finding, subject, text, t_ms, again=again)
         if not made.fine:
             self.share(Kind.VERDICT, subject, f"{finding}: {text}", t_ms)
         self.emitter.emit(made)

@@ -39,12 +39,16 @@ class SeenMeasurement(MEASUREMENT):
 
 @dataclass(frozen=True, slots=True)
 class Verdict(DATA):
-    """What an analysis says of `subject`: `finding` is a word of `FINDINGS`, `text` a sentence. `data` is the text as UTF-8."""
+    """What an analysis says of `subject`: `finding` is a word of `FINDINGS`, `text` a sentence. `data` is the text as UTF-8.
+
+    `again`: the same was said when it was history, or before a restart; now it is so.
+    """
 
     finding: str = ""
     subject: str = ""
     text: str = ""
     t_ms: int = 0
+    again: bool = False
 
     @property
     def fine(self) -> bool:
@@ -65,5 +69,5 @@ FINDINGS = {
 }
 
 
-def verdict(finding: str, subject: str, text: str, t_ms: int) -> Verdict:
-    return Verdict(text.encode(), finding, subject, text, t_ms)
+def verdict(finding: str, subject: str, text: str, t_ms: int, *, again: bool = False) -> Verdict:
+    return Verdict(text.encode(), finding, subject, text, t_ms, again)

@@ -20,3 +20,7 @@ class NetworkRequest(NamedTuple):
     cold: bool
     as_json: bool
     thread: str = ""
+    faults: str = ""
+    seeds: str = ""
+    jobs: int = 1
+    ledger: str | None = None

@@ -15,18 +15,21 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from emulators.faults.schema import load_faults
 from fieldtwin.cli.live_view import troubles
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.talk import data, talk
-from fieldtwin.cli.virtual_view import progress_bar, shown_time
+from fieldtwin.cli.virtual_view import parse_seeds, progress_bar, run_many, shown_time
 from fieldtwin.running.network_session import NetworkOptions, NetworkSession
 from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import Scripted, script
 from fieldtwin.running.summary import summarise
+from fieldtwin.running.virtual_network_run import VirtualNetworkOptions
 from gateway.core.errors import FieldtwinError, UsageError
 from gateway.wallclock import WallClock
 from twin.network import SHIP, Network, load_network
+from twin.network_faults import check_network_fault
 
 FIRST_S = 1.0
 BASE_S = 10
@@ -48,9 +51,19 @@ def run_network(request: NetworkRequest) -> int:
             "each system of a network has a thread and a port of its own",
             expected=f"--thread {THREAD}, without --virtual",
         )
+    if not request.virtual and (request.seeds or request.faults == "random"):
+        raise UsageError("--seeds and random faults go with --virtual")
     network = load_network(request.path, [Path(p) for p in request.profiles])
+    if request.virtual and request.seeds:
+        return _many(request, network)
     _print_network(network)
     return _virtual(request, network) if request.virtual else asyncio.run(_on_this_host(request, network))
+
+
+def _faults(request: NetworkRequest, network: Network) -> tuple[dict[str, Any], ...]:
+    if request.faults in ("", "random"):
+        return ()
+    return load_faults(Path(request.faults), lambda spec: check_network_fault(network, spec))
 
 
 def _commands(request: NetworkRequest) -> tuple[Scripted, ...]:
@@ -69,17 +82,29 @@ def _print_network(network: Network) -> None:
         talk.print(f"  {name}{what}: hears {heard}", soft_wrap=True, highlight=False)
 
 
-def _virtual(request: NetworkRequest, network: Network) -> int:
-    from fieldtwin.running.virtual_network_run import VirtualNetworkOptions, VirtualNetworkRun
-
-    options = VirtualNetworkOptions(
+def _options(request: NetworkRequest, network: Network) -> VirtualNetworkOptions:
+    return VirtualNetworkOptions(
+        str(request.path),
         request.duration_s,
         request.seed,
         tuple(Path(p) for p in request.profiles),
         _commands(request),
+        _faults(request, network),
+        request.faults == "random",
         Path(request.trace) if request.trace else None,
     )
-    run = VirtualNetworkRun(network, options)
+
+
+def _many(request: NetworkRequest, network: Network) -> int:
+    if request.trace or request.seed is not None:
+        raise UsageError("--seeds makes many runs", hint="--seed and --trace belong to one")
+    ledger = Path(request.ledger) if request.ledger else None
+    return run_many(_options(request, network), parse_seeds(request.seeds), request.jobs, request.as_json, ledger)
+
+
+def _virtual(request: NetworkRequest, network: Network) -> int:
+    options = _options(request, network)
+    run = options.make()
     talk.print(f"virtual time, seed {run.seed}, {shown_time(options.duration_s)}", markup=False, highlight=False)
     began_ns = WallClock().monotonic_ns()
     with progress_bar(options.duration_s) as at:
@@ -103,6 +128,7 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
         tuple(Path(p) for p in request.profiles),
         request.cold,
         commands=_commands(request),
+        faults=_faults(request, network),
         thread=request.thread,
     )
     session = NetworkSession(network, options)

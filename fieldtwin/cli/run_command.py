@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import shlex
 import signal
 import sys
 from dataclasses import replace
@@ -182,13 +181,14 @@ def command(
     if network is not None:
         others = {
             "--field": field_host, "--recording": recordings, "--speed": speed, "--listen": listen, "--can": can,
-            "--capture": capture, "--seeds": seeds, "--ledger": ledger, "--compare": compare, "--faults": faults,
-            "--thread-store": thread_store, "--metrics": metrics, "--log": log, "--prototype-file": prototype_file,
+            "--capture": capture, "--compare": compare, "--thread-store": thread_store, "--metrics": metrics, "--log": log,
+            "--prototype-file": prototype_file,
         }  # fmt: skip
         return _run_network(
             NetworkRequest(
                 network, virtual, duration_s, seed, instance, profiles,
                 parse_periods(commands) if commands is not None else None, trace, cold, as_json, thread,
+                faults, seeds, jobs, ledger,
             ),
             plant,
             [option for option, said in others.items() if said],
@@ -280,7 +280,8 @@ def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int
     if others:
         raise UsageError(
             f"{', '.join(others)}: nothing of a network",
-            expected="--for, --virtual, --seed, --trace, --commands, --instance, --thread, --cold, --json",
+            expected="--for, --virtual, --seed, --seeds, --jobs, --ledger, --faults, --trace, --commands, --instance, --thread, "
+            "--cold, --json",
             hint="its systems can be run one by one",
         )
     return run_network(request)
@@ -338,7 +339,7 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | 
         return _run_against(options, Path(request.compare), as_json) if request.compare else run_one(options, as_json)
     if request.trace or request.compare or request.seed is not None:
         raise UsageError("--seeds makes many runs", hint="--seed, --trace and --compare belong to one")
-    return run_many(options, parse_seeds(seeds), jobs, as_json, _again, ledger)
+    return run_many(options, parse_seeds(seeds), jobs, as_json, ledger)
 
 
 def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
@@ -358,19 +359,6 @@ def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
         return max(
             code, show(judged(load_system(options.system, options.profiles), old, trace, Allowed()), old, as_json=False)
         )
-
-
-def _again(seed: int) -> str:
-    """The command line that repeats the run of one seed."""
-    words, skip = [], False
-    for word in sys.argv[1:]:
-        if skip:
-            skip = False
-        elif word in ("--seeds", "--jobs", "--ledger"):
-            skip = True
-        elif not word.startswith(("--seeds=", "--jobs=", "--ledger=")):
-            words.append(word)
-    return shlex.join(["fieldtwin", *words, "--seed", str(seed)])
 
 
 async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bool) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,7 +19,7 @@ from gateway.core.errors import UsageError
 from gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
-    from fieldtwin.running.many_seeds import SeedResult
+    from fieldtwin.running.many_seeds import Options, SeedResult
     from fieldtwin.running.virtual_run import VirtualOptions
 
 
@@ -61,15 +62,27 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
     return 0 if summary["ok"] else 1
 
 
+def again(seed: int) -> str:
+    """The command line that repeats the run of one seed, of those that are run now."""
+    words, skip = [], False
+    for word in sys.argv[1:]:
+        if skip:
+            skip = False
+        elif word in ("--seeds", "--jobs", "--ledger"):
+            skip = True
+        elif not word.startswith(("--seeds=", "--jobs=", "--ledger=")):
+            words.append(word)
+    return shlex.join(["fieldtwin", *words, "--seed", str(seed)])
+
+
 def run_many(
-    options: VirtualOptions,
+    options: Options,
     seeds: range,
     jobs: int,
     as_json: bool,
-    again: Callable[[int], str],
     ledger_path: Path | None = None,
 ) -> int:
-    """A run a seed. `again(seed)` is the line that repeats one. The exit status: 0 when all were well.
+    """A run a seed. The exit status: 0 when all were well.
 
     With a ledger, seeds that it has are not run again, and each that ends is written down at once.
     """
@@ -119,7 +132,7 @@ def run_many(
     return 1 if failed else 0
 
 
-def _shrink(options: VirtualOptions, failed: SeedResult) -> None:
+def _shrink(options: Options, failed: SeedResult) -> None:
     """The first failing schedule, as few faults as it takes, as a scenario file in the working directory."""
     from fieldtwin.running.many_seeds import shrunk
     from fieldtwin.running.shrink import as_scenario

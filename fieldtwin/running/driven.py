@@ -8,42 +8,96 @@ from __future__ import annotations
 
 import asyncio
 import tempfile
-from collections.abc import Callable, Coroutine
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.seal import sealed
 from fieldtwin.scenarios.trace import Trace, open_sink
+from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 
 TRACE_KEPT = 20_000
 """Events that stay in memory; the hash and a file have them all."""
+PIECE_S = 10.0
+"""Virtual seconds between two looks at the world, and between two judgements."""
+MAX_ERRORS = 100
 
 
-def drive(
-    begin: Callable[[VirtualLoop, Path, Trace], Coroutine[Any, Any, None]],
-    ended: Callable[[asyncio.Task[None], VirtualLoop], None],
-    *,
-    trace: Path | None = None,
-    between: Callable[[], None] | None = None,
-) -> None:
-    """Run what `begin` gives for a loop, an empty folder and a trace, to its end; then `ended` is told, while both are there.
+class Timed(Protocol):
+    """What a run's time is asked of."""
 
-    `trace` is a file for every event, `between` is called after each piece. Raises what `ended` raises, and `FileInvalid` when
-    the file cannot be written.
-    """
-    loop = VirtualLoop()
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
-        sink: BinaryIO | None = stack.enter_context(open_sink(trace)) if trace is not None else None
-        stack.callback(loop.close)
-        with sealed():
-            main = loop.create_task(begin(loop, folder, Trace(TRACE_KEPT, sink)), name="run")
-            main.add_done_callback(lambda _: loop.stop())
-        while not main.done():
+    def now_s(self) -> float: ...
+
+    async def sleep_until_s(self, t_s: float) -> None: ...
+
+
+class DrivenRun(ABC):
+    """One run, of whatever `_main` does. ``run()``, then `summary()`; errors are kept in `errors`."""
+
+    faults: tuple[dict[str, Any], ...] = ()
+    """What is put in, the seed's choice included."""
+
+    def __init__(self, seed: int, duration_s: float, trace: Path | None) -> None:
+        self.seed = seed
+        self.elapsed_s = 0.0
+        self.errors: list[str] = []
+        self.trace = Trace(TRACE_KEPT)
+        self._duration_s = duration_s
+        self._trace_file = trace
+        self._judged = False
+        """Whether there is anything to judge: what is wrong before is somebody's mistake, and raised."""
+
+    @abstractmethod
+    async def _main(self, loop: VirtualLoop, folder: Path) -> None:
+        """The run, from start to end. `folder` is empty and goes with it."""
+
+    @abstractmethod
+    def summary(self) -> dict[str, Any]:
+        """Plain data; nothing in it depends on how fast it was."""
+
+    @property
+    @abstractmethod
+    def files(self) -> tuple[str, ...]:
+        """What was run: texts, or their hashes, that are others where a file is another."""
+
+    def run(self, progress: Callable[[float], None] | None = None) -> None:
+        """Run it. `progress` is told the virtual seconds that are over, from time to time. Raises `FileInvalid` where the trace
+        cannot be written, or what was asked for makes no sense in this system (`UsageError`)."""
+        loop = VirtualLoop()
+        with ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
+            sink: BinaryIO | None = stack.enter_context(open_sink(self._trace_file)) if self._trace_file else None
+            stack.callback(loop.close)
+            self.trace = Trace(TRACE_KEPT, sink)
             with sealed():
-                loop.run_forever()
-            if between is not None:
-                between()
-        ended(main, loop)
+                main = loop.create_task(self._main(loop, folder), name="run")
+                main.add_done_callback(lambda _: loop.stop())
+            while not main.done():
+                with sealed():
+                    loop.run_forever()
+                if progress is not None:
+                    progress(self.elapsed_s)
+            self._ended(main, loop)
+
+    def _ended(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
+        error = None if main.cancelled() else main.exception()
+        if isinstance(error, FileInvalid | UsageError) and not self._judged:
+            raise error
+        if isinstance(error, FieldtwinError):
+            self.errors.append(str(error))
+        elif error is not None:
+            raise error
+        for context in loop.unhandled[:MAX_ERRORS]:
+            self.errors.append(f"nobody caught: {context.get('message')} {context.get('exception') or ''}".strip())
+
+    async def _through(self, bench: Timed, loop: VirtualLoop, judge: Callable[[], None]) -> None:
+        """To the end of the run's time, piece by piece."""
+        while (left_s := self._duration_s - bench.now_s()) > 0:
+            await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
+            self.elapsed_s = bench.now_s()
+            judge()
+            loop.stop()  # the world is looked at
+            await asyncio.sleep(0)

@@ -9,11 +9,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.running.shrink import smallest
-from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.running.virtual_network_run import VirtualNetworkOptions
+from fieldtwin.running.virtual_run import VirtualOptions
 from fieldtwin.running.workers import Workers
 
 MAX_SEEDS = 100_000
 _ERRORS_SHOWN = 5
+Options = VirtualOptions | VirtualNetworkOptions
+"""Of a run that a seed makes: a system's, or a network's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,34 +40,37 @@ def fingerprint(*parts: str) -> str:
     return digest.hexdigest()[:16]
 
 
-def what_runs(options: VirtualOptions) -> str:
+def what_runs(options: Options) -> str:
     """A name for what these options run, whatever the seed: of the files' contents and what the command line says."""
-    run = VirtualRun(options)
-    prototype = run.prototype.path.read_text(encoding="utf-8")
-    said = repr(replace(options, seed=None, trace=None, profiles=(), prototype_file=None))
-    return fingerprint(run.system.hash, prototype, said)
+    anyhow = replace(options, seed=None, trace=None, profiles=())
+    if isinstance(anyhow, VirtualOptions):
+        anyhow = replace(anyhow, prototype_file=None)
+    return fingerprint(*options.make().files, repr(anyhow))
 
 
-def run_seed(options: VirtualOptions) -> SeedResult:
+def run_seed(options: Options) -> SeedResult:
     """One run, whole."""
-    run = VirtualRun(options)
+    run = options.make()
     run.run()
     summary = run.summary()
+    systems: dict[str, dict[str, Any]] = summary.get("systems", {})
+    errors = summary["errors"] + [f"{name}: {error}" for name, one in systems.items() for error in one["errors"]]
+    published = [one["published"] for one in systems.values() or [summary]]
     return SeedResult(
         run.seed,
         summary["ok"],
-        tuple(summary["errors"][:_ERRORS_SHOWN]),
-        summary["published"]["checked"],
-        summary["published"]["wrong"],
+        tuple(errors[:_ERRORS_SHOWN]),
+        sum(one["checked"] for one in published),
+        sum(one["wrong"] for one in published),
         summary["trace"]["events"],
         summary["trace"]["sha256"],
     )
 
 
-def shrunk(options: VirtualOptions, seed: int, most_runs: int = 60) -> tuple[list[dict[str, Any]], SeedResult]:
+def shrunk(options: Options, seed: int, most_runs: int = 60) -> tuple[list[dict[str, Any]], SeedResult]:
     """The fewest faults with which the run of `seed` still fails, and how it fails with them. It must fail with all."""
     options = replace(options, seed=seed)
-    faults = VirtualRun(options).faults
+    faults = options.make().faults
     base = replace(options, random_faults=False, faults=())
 
     def fails(part: Sequence[dict[str, Any]]) -> bool:
@@ -75,7 +81,7 @@ def shrunk(options: VirtualOptions, seed: int, most_runs: int = 60) -> tuple[lis
 
 
 def run_seeds(
-    options: VirtualOptions, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
+    options: Options, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
 ) -> list[SeedResult]:
     """A run a seed, `jobs` at a time, in the order of the seeds. `on_result` is told of each as it ends."""
     if jobs <= 1:
@@ -94,7 +100,7 @@ def run_seeds(
     return [found[seed] for seed in seeds]
 
 
-def _as_they_end(pool: Workers, options: VirtualOptions, seeds: Sequence[int], at_once: int) -> Iterator[SeedResult]:
+def _as_they_end(pool: Workers, options: Options, seeds: Sequence[int], at_once: int) -> Iterator[SeedResult]:
     waiting: set[Future[SeedResult]] = set()
     for seed in seeds:
         waiting.add(pool.submit(run_seed, replace(options, seed=seed)))

@@ -17,6 +17,7 @@ from fieldtwin.scenarios.trace import Event, Kind, Trace
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import UsageError
 from twin.network import WATER, Network
+from twin.network_faults import placed
 from twin.water_faults import WaterFaults
 
 
@@ -113,8 +114,8 @@ class NetworkBench:
         await part.bench.set_value(local, tag, value)
 
     async def inject(self, fault: dict[str, Any]) -> None:
-        aim = str(fault.get("device") or fault.get("bus") or "")
-        if fault.get("bus") == WATER:
+        where, local = placed(self.network, fault)
+        if where == WATER:
             id = self.faults.inject(fault)
             self._where[id] = WATER
             target = f"{WATER} {fault.get('device', '')}".strip()
@@ -122,10 +123,8 @@ class NetworkBench:
                 self.now_ns(), Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault}
             )
             return
-        part, _ = self._part(aim)
-        local = {key: self.network.split(fault[key])[1] if key in ("device", "bus") else fault[key] for key in fault}
-        await part.bench.inject(local)
-        self._where[str(fault["id"])] = self.network.split(aim)[0]
+        await self.parts[where].bench.inject(local)
+        self._where[str(fault["id"])] = where
 
     async def clear(self, id: str) -> None:
         where = self._where.pop(id, None)

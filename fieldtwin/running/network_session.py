@@ -20,7 +20,8 @@ from gateway.core.endpoint import Endpoint
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 from twin.instance import Instance
-from twin.network import Network
+from twin.network import WATER, Network
+from twin.network_faults import placed_all
 from twin.ship import Ship
 from twin.water_faults import WaterFaults
 
@@ -38,7 +39,7 @@ class NetworkOptions:
     """What goes over each system's wires into ``capture.jsonl`` in its run directory."""
     commands: tuple[Scripted, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
-    """Of the water."""
+    """Of the systems and of the water, under the network's names."""
     thread: str = ""
     """Where each system's thread listens: on a free port. Empty for none."""
 
@@ -59,6 +60,7 @@ class NetworkSession:
         self.ship: Endpoint | None = None
         self.stopped = asyncio.Event()
         self.started_ns = 0
+        self._faults = placed_all(network, options.faults)
         self._stack = AsyncExitStack()
         self._nursery = Nursery()
 
@@ -88,7 +90,7 @@ class NetworkSession:
             self._stack.push_async_callback(ship.aclose)
         await self._start_systems(socket)
         self.started_ns = self.faults.start_ns = self.clock.monotonic_ns()
-        for fault in self.options.faults:  # each knows its time
+        for fault in self._faults.get(WATER, ()):  # each knows its time
             self.faults.inject(fault)
         if self.ship is not None:
             like = next(iter(self.network.members.values()))
@@ -121,6 +123,7 @@ class NetworkSession:
             cold=self.options.cold,
             seed=member.prototype.seed + 1_000_003 * self.seed + number,
             thread=self.options.thread,
+            faults=self._faults.get(name, ()),
             water={member.modem: (str(socket), name)},
         )
 

@@ -5,43 +5,52 @@ Each system is judged as it is alone (`VirtualRun`): what was published against 
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from emulators.virtual.loop import VirtualLoop
-from fieldtwin.running.driven import TRACE_KEPT, drive
+from fieldtwin.running.driven import DrivenRun
+from fieldtwin.running.fault_schedule import random_network_schedule
 from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.shore import Scripted
 from fieldtwin.running.virtual_network import VirtualNetwork
-from fieldtwin.running.virtual_run import PIECE_S, VirtualOptions, VirtualRun
-from fieldtwin.scenarios.trace import Trace
-from gateway.core.errors import FieldtwinError
-from twin.network import Network
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from twin.network import load_network
+from twin.network_faults import placed_all
 
 
 @dataclass(frozen=True)
 class VirtualNetworkOptions:
-    """What to run, and for how long. `trace` is a file for every event."""
+    """What to run, and for how long. `system` is the network's file; `faults` is put in besides; `trace` is a file for every
+    event."""
 
+    system: str
     duration_s: float
     seed: int | None = None
     profiles: tuple[Path, ...] = ()
     commands: tuple[Scripted, ...] = ()
+    faults: tuple[dict[str, Any], ...] = ()
+    random_faults: bool = False
+    """Faults that the seed chooses, besides."""
     trace: Path | None = None
 
+    def make(self) -> VirtualNetworkRun:
+        """The run of these options."""
+        return VirtualNetworkRun(self)
 
-class VirtualNetworkRun:
+
+class VirtualNetworkRun(DrivenRun):
     """One run. `summary()` afterwards."""
 
-    def __init__(self, network: Network, options: VirtualNetworkOptions) -> None:
-        self.network = network
+    def __init__(self, options: VirtualNetworkOptions) -> None:
+        self.network = network = load_network(Path(options.system), options.profiles)
         self.options = options
-        self.seed = network.seed if options.seed is None else options.seed
-        self.elapsed_s = 0.0
-        self.trace = Trace(TRACE_KEPT)
+        super().__init__(network.seed if options.seed is None else options.seed, options.duration_s, options.trace)
+        self.faults = options.faults
+        if options.random_faults:
+            self.faults += random_network_schedule(network, self.seed, options.duration_s)
+        faults = placed_all(network, self.faults)
         self.runs = {
             name: VirtualRun(
                 VirtualOptions(
@@ -49,44 +58,30 @@ class VirtualNetworkRun:
                     options.duration_s,
                     profiles=options.profiles,
                     prototype_file=member.prototype.path,
+                    faults=faults.get(name, ()),
                 )
             )
             for name, member in network.members.items()
         }
-        self.errors: list[str] = []
         self.water: dict[str, dict[str, int]] = {}
         self.ship: dict[str, Any] | None = None
 
-    def run(self, progress: Callable[[float], None] | None = None) -> None:
-        """Run it. `progress` is told the virtual seconds that are over, from time to time. Errors are kept in `errors`."""
-        between = None if progress is None else lambda: progress(self.elapsed_s)
-        drive(self._begin, self._end, trace=self.options.trace, between=between)
-
-    def _begin(self, loop: VirtualLoop, folder: Path, trace: Trace) -> Coroutine[Any, Any, None]:
-        self.trace = trace
-        return self._main(loop, folder)
-
-    def _end(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
-        error = None if main.cancelled() else main.exception()
-        if isinstance(error, FieldtwinError):
-            self.errors.append(str(error))
-        elif error is not None:
-            raise error
-        self.errors += [f"nobody caught: {context.get('message')}" for context in loop.unhandled[:100]]
+    @property
+    def files(self) -> tuple[str, ...]:
+        return self.network.path.read_text(encoding="utf-8"), *(
+            text for run in self.runs.values() for text in run.files
+        )
 
     async def _main(self, loop: VirtualLoop, folder: Path) -> None:
-        o = self.options
-        whole = VirtualNetwork(self.network, loop, folder, self.trace, seed=self.seed, commands=list(o.commands))
+        commands = list(self.options.commands)
+        whole = VirtualNetwork(self.network, loop, folder, self.trace, seed=self.seed, commands=commands)
         async with whole:
             for name, run in self.runs.items():
                 run.attach(whole.systems[name])
-            while (left_s := o.duration_s - whole.bench.now_s()) > 0:
-                await whole.bench.sleep_until_s(whole.bench.now_s() + min(left_s, PIECE_S))
-                self.elapsed_s = whole.bench.now_s()
-                for name, run in self.runs.items():
-                    run.judge(whole.systems[name])
-                loop.stop()  # the world is looked at
-                await asyncio.sleep(0)
+            self._judged = True
+            for fault in self.faults:  # each knows its time
+                await whole.bench.inject(fault)
+            await self._through(whole.bench, loop, lambda: self._judge(whole))
             if whole.bench.shore is not None:
                 await whole.bench.shore.halt()
                 self.ship = whole.bench.shore.describe()
@@ -94,8 +89,11 @@ class VirtualNetworkRun:
                 await run.finish(whole.systems[name])
             self.water = {name: counters.as_dict() for name, counters in whole.medium.counters.items()}
 
+    def _judge(self, whole: VirtualNetwork) -> None:
+        for name, run in self.runs.items():
+            run.judge(whole.systems[name])
+
     def summary(self) -> dict[str, Any]:
-        """Nothing in it depends on how fast it was."""
         systems = {name: run.summary() for name, run in self.runs.items()}
         for one in systems.values():
             for key in ("seed", "trace", "virtual"):

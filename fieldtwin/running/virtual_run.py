@@ -6,9 +6,8 @@ looked at again, to show how far it is. What is the same from run to run is trac
 
 from __future__ import annotations
 
-import asyncio
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,24 +15,21 @@ from typing import Any
 from emulators.faults.schema import seconds
 from emulators.virtual.loop import VirtualLoop
 from fieldtwin.running.age_oracle import AgeOracle
-from fieldtwin.running.driven import TRACE_KEPT, drive
+from fieldtwin.running.driven import DrivenRun
 from fieldtwin.running.fault_schedule import random_schedule
 from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.virtual_bench import VirtualBench
-from fieldtwin.scenarios.trace import Event, Kind, Trace
+from fieldtwin.scenarios.trace import Event, Kind
 from gateway.core.clock import NS_PER_MS
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from gateway.core.values import Quality, TagValue
 from gateway.runtime.learnt import describe_learnt
 from gateway.runtime.status import describe
 from twin.field import FieldSide
 from twin.field_process import FieldConfig, resolve
 
-PIECE_S = 10.0
-"""Virtual seconds between two looks at the world, and between two judgements."""
 SETTLE_S = 10.0
 """How long a command that is still under way may take after the run's time is over."""
 LAST_REPLIES_S = 0.5
@@ -42,7 +38,6 @@ CALM_S = 60.0
 ASKED_KEPT = 64
 CAN_WIRE_NS = 10 * NS_PER_MS
 """What a frame may need on a CAN bus: several attempts, behind others."""
-MAX_ERRORS = 100
 
 
 @dataclass(frozen=True)
@@ -61,15 +56,20 @@ class VirtualOptions:
     random_faults: bool = False
     """Faults that the seed chooses, besides."""
     trace: Path | None = None
+
     prototype: bool = True
     field_host: str = ""
+
+    def make(self) -> VirtualRun:
+        """The run of these options."""
+        return VirtualRun(self)
 
 
 class _Instance:
     name = "virtual"
 
 
-class VirtualRun:
+class VirtualRun(DrivenRun):
     """One run. `summary()` afterwards; `trace` and `oracle` while it runs."""
 
     def __init__(self, options: VirtualOptions) -> None:
@@ -85,21 +85,20 @@ class VirtualRun:
         self.options = options
         self.system = twin.ecs.system
         self.prototype = twin.prototype
-        self.seed = self.prototype.seed if options.seed is None else options.seed
-        self.faults: tuple[dict[str, Any], ...] = options.faults
+        super().__init__(
+            self.prototype.seed if options.seed is None else options.seed, options.duration_s, options.trace
+        )
+        self.faults = options.faults
         if options.random_faults:
             self.faults += random_schedule(self.system, self.seed, options.duration_s)
         self.instance = _Instance()
         self.states = StateWatch(self.system)
         self.oracle = AgeOracle()
-        self.errors: list[str] = []
-        self.trace = Trace(TRACE_KEPT)
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: dict[str, Any] | None = None
         self.field_status: dict[str, Any] | None = None
         self.counted_before: dict[str, dict[str, int]] = {}
         self.outputs_confirmed_safe: bool | None = None
-        self.elapsed_s = 0.0
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
         self.shore: Shore | None = None
@@ -107,7 +106,6 @@ class VirtualRun:
         self._asked: dict[str, deque[int]] = {}
         """By bus: when requests were sent, ns since the start."""
         self._emulated: frozenset[str] = frozenset()
-        self._attached = False
 
     @property
     def disturbed(self) -> bool:
@@ -119,25 +117,9 @@ class VirtualRun:
         ends = (fault.get("until") for fault in self.faults)
         return all(end is not None and seconds(end) <= self.elapsed_s - CALM_S for end in ends)
 
-    def run(self, progress: Callable[[float], None] | None = None) -> None:
-        """Run it. `progress` is told the virtual seconds that are over, from time to time. Errors are kept in `errors`."""
-        between = None if progress is None else lambda: progress(self.elapsed_s)
-        drive(self._begin, self._end, trace=self.options.trace, between=between)
-
-    def _begin(self, loop: VirtualLoop, run_dir: Path, trace: Trace) -> Coroutine[Any, Any, None]:
-        self.trace = trace
-        return self._main(loop, run_dir)
-
-    def _end(self, main: asyncio.Task[None], loop: VirtualLoop) -> None:
-        error = None if main.cancelled() else main.exception()
-        if isinstance(error, FileInvalid | UsageError) and not self._attached:
-            raise error  # nothing ran that could be judged
-        if isinstance(error, FieldtwinError):
-            self.errors.append(str(error))
-        elif error is not None:
-            raise error
-        for context in loop.unhandled[:MAX_ERRORS]:
-            self.errors.append(f"nobody caught: {context.get('message')} {context.get('exception') or ''}".strip())
+    @property
+    def files(self) -> tuple[str, ...]:
+        return self.system.hash, self.prototype.path.read_text(encoding="utf-8")
 
     async def _main(self, loop: VirtualLoop, run_dir: Path) -> None:
         o = self.options
@@ -155,7 +137,7 @@ class VirtualRun:
             self.attach(bench)
             for fault in self.faults:  # each knows its time
                 await bench.inject(fault)
-            await self._through(bench, loop)
+            await self._through(bench, loop, lambda: self.judge(bench))
             await self._settle(bench)
             if self.shore is not None:
                 await self.shore.halt()
@@ -163,7 +145,7 @@ class VirtualRun:
 
     def attach(self, bench: VirtualBench) -> None:
         """From now on what happens on `bench` is judged."""
-        self._attached = True
+        self._judged = True
         self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
         self._emulated = frozenset(bench.run.field.devices)
         bench.run.gateway.tags.on_put = self._watched(bench)
@@ -186,14 +168,6 @@ class VirtualRun:
         await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
         self._judge(bench.run.field)
         self._take_status(bench, outputs)
-
-    async def _through(self, bench: VirtualBench, loop: VirtualLoop) -> None:
-        """To the end of the run's time, piece by piece."""
-        while (left_s := self.options.duration_s - bench.now_s()) > 0:
-            await bench.sleep_until_s(bench.now_s() + min(left_s, PIECE_S))
-            self.judge(bench)
-            loop.stop()  # the world is looked at
-            await asyncio.sleep(0)
 
     async def _settle(self, bench: VirtualBench) -> None:
         """A command that is still under way may arrive."""

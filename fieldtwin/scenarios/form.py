@@ -18,9 +18,9 @@ from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.data_files import network_file
 from twin.fault_aims import target
-from twin.network import WATER, Network, load_network
+from twin.network import Network, load_network
+from twin.network_faults import check_network_fault
 from twin.system import System, load_system
-from twin.water_faults import check_water_fault
 
 Time = str | float | int
 Number = float | int
@@ -366,8 +366,8 @@ def _check_set(scenario: Scenario, said: Set, loc: tuple[Key, ...]) -> None:
 
 def _aim(scenario: Scenario, spec: FaultSpec) -> None:
     """Raises `WrongAim` for what is not there, in the system or between the systems of a network."""
-    if scenario.network is not None and spec.aim.bus == WATER:
-        check_water_fault(scenario.network, spec)
+    if scenario.network is not None:
+        check_network_fault(scenario.network, spec)
     else:
         target(scenario.system, spec)
 

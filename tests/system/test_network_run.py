@@ -40,17 +40,23 @@ def test_a_scenario_of_a_network_runs_unchanged_as_processes(tmp_path: Path) -> 
 
 
 def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
+    """Also of faults: one system is struck for a while, and the water where the western one listens."""
+    (tmp_path / "f.yaml").write_text(
+        "faults:\n  - {name: silence, device: east.current, from: 0, until: 2}\n  - {name: drop, bus: water, device: west}\n"
+    )
     words = (
         "run",
         "ocean_network",
         "--prototype",
         "--for",
-        "8s",
+        "9s",
         "--commands",
         "none",
         "--json",
         "--thread",
         "tcp://127.0.0.1:0",
+        "--faults",
+        str(tmp_path / "f.yaml"),
     )
     ended = run_to_end(tmp_path, *words, within_s=180)
     summary = json.loads(ended.out)
@@ -63,4 +69,7 @@ def test_a_run_of_a_network_says_what_became_of_each(tmp_path: Path) -> None:
         assert one["thread"]["written"] > 0
     assert ended.err.count("digital thread  ←  tcp://127.0.0.1:") == 3
     assert {name for name, sea in summary["water"].items() if sea["said"]} == {"west", "middle", "east"}
+    struck = {name for name, one in summary["systems"].items() if one["exchanges"]["line"]["timeouts"]}
+    assert "east" in struck
+    assert {name for name, sea in summary["water"].items() if sea["fault"]} == {"west"}
     no_tracebacks(tmp_path)

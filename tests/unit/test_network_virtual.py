@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
+import pytest
 from click.testing import CliRunner
 
+from emulators.faults.schema import parse_fault
 from fieldtwin.cli.main import cli
 from fieldtwin.report.model import Verdict
+from fieldtwin.running.fault_schedule import CALM_S, random_network_schedule
 from fieldtwin.running.shore import Scripted
 from fieldtwin.running.virtual_network_run import VirtualNetworkOptions, VirtualNetworkRun
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.scenarios.trace import read_trace
-from twin.network import load_network
+from gateway.core.errors import FileInvalid, UsageError
+from twin.network import WATER, load_network
+from twin.network_faults import check_network_fault, placed_all
 
 SHIPPED = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "ocean_network.yaml"
 
 
 def run(seed: int, trace: Path | None = None) -> VirtualNetworkRun:
-    options = VirtualNetworkOptions(12.0, seed, commands=(Scripted(0.5, 3),), trace=trace)
-    made = VirtualNetworkRun(load_network(SHIPPED), options)
+    made = VirtualNetworkOptions(str(SHIPPED), 12.0, seed, commands=(Scripted(0.5, 3),), trace=trace).make()
     made.run()
     return made
 
@@ -56,6 +61,77 @@ def test_a_run_on_the_command_line() -> None:
     assert {name: one["states"]["adapt"] for name, one in summary["systems"].items()} == {
         "west": ["STANDBY"], "middle": ["STANDBY"], "east": ["STANDBY"],
     }  # fmt: skip
+
+
+FAULTS = """faults:
+  - {id: mute, name: silence, device: middle.optode, from: 1, until: 4}
+  - {id: deaf, name: drop, bus: water, device: middle, from: 0, until: 9}
+"""
+
+
+def on_the_command_line(folder: Path, *words: str) -> Any:
+    (folder / "f.yaml").write_text(FAULTS)
+    line = ["run", "ocean_network", "--prototype", "--virtual", *words]
+    return CliRunner().invoke(cli, line, standalone_mode=False)
+
+
+def test_a_run_with_a_file_of_faults(tmp_path: Path) -> None:
+    result = on_the_command_line(tmp_path, "--for", "10s", "--faults", str(tmp_path / "f.yaml"), "--json")
+    summary = json.loads(result.stdout)
+    timeouts = {
+        name: sum(row["timeouts"] for row in one["exchanges"].values()) for name, one in summary["systems"].items()
+    }
+    assert timeouts.pop("middle") > 0
+    assert timeouts == {"west": 0, "east": 0}
+    assert summary["water"]["middle"]["fault"] > 0
+    assert summary["water"]["east"]["fault"] == 0
+
+
+def test_a_fault_that_aims_at_nobody_is_an_error_with_its_place(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text("faults:\n  - {name: silence, device: middel.optode}\n")
+    result = on_the_command_line(tmp_path, "--for", "10s", "--faults", str(tmp_path / "x.yaml"))
+    assert isinstance(result.exception, FileInvalid)
+    assert result.exception.line == 2
+    assert "middle.optode" in str(result.exception)
+
+
+def test_a_seed_chooses_faults_of_all_systems_and_of_the_water() -> None:
+    network = load_network(SHIPPED)
+    found = random_network_schedule(network, 3, 20_000.0)
+    assert found == random_network_schedule(network, 3, 20_000.0) != random_network_schedule(network, 4, 20_000.0)
+    assert {where for where, faults in placed_all(network, found).items() if faults} == {WATER, *network.members}
+    assert len({fault["id"] for fault in found}) == len(found)
+    assert list(found) == sorted(found, key=lambda fault: fault["from"])
+    for number, said in enumerate(found, 1):
+        spec = parse_fault(dict(said), number=number)
+        check_network_fault(network, spec)
+        assert spec.until_s is not None
+        assert spec.until_s <= 20_000 - CALM_S
+
+
+def test_many_seeds_are_run_and_the_ledger_leaves_out_what_it_has(tmp_path: Path) -> None:
+    words = ("--for", "3s", "--seeds", "1..2", "--ledger", str(tmp_path / "l"), "--commands", "none", "--json")
+    first = json.loads(on_the_command_line(tmp_path, *words).stdout)
+    assert [one["seed"] for one in first["results"]] == [1, 2]
+    assert first["failed"] == []
+    assert all(one["checked"] > 10 for one in first["results"])
+    assert json.loads(on_the_command_line(tmp_path, *words).stdout)["results"] == []
+    again = on_the_command_line(tmp_path, *words, "--seed", "3")
+    assert isinstance(again.exception, UsageError)
+
+
+def test_what_a_failing_seed_takes_is_left_and_is_a_scenario_of_the_network(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wrong bits behind Modbus TCP, which has no check sum: nobody can notice, and the published values are wrong."""
+    monkeypatch.chdir(tmp_path)
+    bits = "  - {id: bits, name: corrupt-bits, device: west.modem, from: 0, until: 20}\n"
+    (tmp_path / "x.yaml").write_text(FAULTS + bits)
+    result = on_the_command_line(tmp_path, "--for", "20s", "--faults", "x.yaml", "--seeds", "1")
+    assert result.return_value == 1
+    assert "published values were never held by their device" in result.stdout
+    scenario = load_scenario(tmp_path / "ocean_network-seed1.scenario.yaml")
+    assert [step.fault["id"] for step in scenario.form.steps if step.fault] == ["bits"]
 
 
 def test_faults_of_a_system_and_of_the_water_are_put_in_where_they_are_aimed(tmp_path: Path) -> None:

@@ -55,10 +55,12 @@ def broker_carrier(place: str, clock: Clock, plant: System | None) -> Carrier:
     broker = Broker(url.hostname, port, url.username, _password(), tls)
     if plant is None:
         HostApplication(group, node, host)  # names that are none are said at once
-        return MqttCarrier(broker, lambda number: HostApplication(group, node, host), clock)
+        return MqttCarrier(broker, lambda number, began_ms: HostApplication(group, node, host, began_ms), clock)
     schema, types = schema_of(plant), types_of(plant)
     EdgeNode(group, node, host, schema, types, 0)
-    return MqttCarrier(broker, lambda number: EdgeNode(group, node, host, schema, types, number), clock)
+    return MqttCarrier(
+        broker, lambda number, began_ms: EdgeNode(group, node, host, schema, types, number, began_ms), clock
+    )
 
 
 def _split(place: str) -> tuple[Any, str, str, dict[str, str]]:

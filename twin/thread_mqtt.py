@@ -165,9 +165,10 @@ class MqttLink(Link):
 
 
 class MqttCarrier(Carrier):
-    """Goes to the broker. `make_side` is called for each session with its number: births and deaths are counted."""
+    """Goes to the broker. `make_side` is called for each session with its number, since births and deaths are counted, and with
+    when it began (UTC, ms)."""
 
-    def __init__(self, broker: Broker, make_side: Callable[[int], Side], clock: Clock) -> None:
+    def __init__(self, broker: Broker, make_side: Callable[[int, int], Side], clock: Clock) -> None:
         self.name = f"thread over {broker}"
         self._broker = broker
         self._make_side = make_side
@@ -178,7 +179,7 @@ class MqttCarrier(Carrier):
 
     async def open(self) -> MqttLink:
         b = self._broker
-        side = self._make_side(self._sessions)
+        side = self._make_side(self._sessions, self._clock.utc_ns() // NS_PER_MS)
         self._sessions += 1
         will = side.will()
         heard = _Heard()

@@ -15,6 +15,7 @@ Pure: frames to messages and back. It knows no broker.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -100,6 +101,15 @@ def event_of(metric: Metric, sequence: int, names: Mapping[int, str], types: Map
     return Event(sequence, metric.t_ms, judged >> 16 & 7, name, value, judged >> 8 & 7, judged & 31)
 
 
+def _is_online(data: bytes) -> bool:
+    """Whether a host says that it is there. What is no state of Sparkplug 3 says nothing."""
+    try:
+        state = json.loads(data)
+    except ValueError:  # no JSON, or no UTF-8
+        return False
+    return isinstance(state, dict) and state.get("online") is True
+
+
 class _Side:
     """What edge and host have in common."""
 
@@ -142,10 +152,18 @@ class _Side:
 
 
 class EdgeNode(_Side):
-    """The physical twin's side. A new one for each link; `bd_seq` counts its births and deaths and is one more each time."""
+    """The physical twin's side. A new one for each link, which began at `began_ms` (UTC); `bd_seq` counts its births and deaths
+    and is one more each time."""
 
     def __init__(
-        self, group: str, node: str, host: str, schema: Schema, types: Mapping[str, DataType], bd_seq: int
+        self,
+        group: str,
+        node: str,
+        host: str,
+        schema: Schema,
+        types: Mapping[str, DataType],
+        bd_seq: int,
+        began_ms: int = 0,
     ) -> None:
         super().__init__()
         self.subscriptions = (topic(group, "NCMD", node), state_topic(host))
@@ -157,13 +175,14 @@ class EdgeNode(_Side):
         }
         self._aliases = {name: i for i, name in enumerate((*schema.names, *OURS), 1)}
         self._bd_seq = bd_seq & 0xFF
+        self._began_ms = began_ms
         self._seq = 0
         self._tag = b""
 
     def will(self) -> Message:
         """What the broker says when we are gone (NDEATH); published by us before we go by ourselves."""
-        bd = Metric(BD_SEQ, datatype=DataType.INT64, value=self._bd_seq)
-        return Message(topic(self._group, "NDEATH", self._node), encode_payload(Payload(0, (bd,))), qos=1)
+        bd = Metric(BD_SEQ, None, self._began_ms, DataType.INT64, self._bd_seq)
+        return Message(topic(self._group, "NDEATH", self._node), encode_payload(Payload(self._began_ms, (bd,))), qos=1)
 
     def hello(self) -> list[Message]:
         """What to publish as soon as there is a link: the birth comes with the thread's HELLO."""
@@ -204,7 +223,7 @@ class EdgeNode(_Side):
     def frame(self, where: str, data: bytes) -> Frame | None:
         """What came: of the host's thread, a rebirth, or that the host is there now. Raises `Desync`."""
         if where == self._state:
-            there = b'"online":true' in data.replace(b" ", b"")
+            there = _is_online(data)
             return Ask(self._tag) if there and self._tag else None
         metrics = decode_payload(data).metrics
         if any(m.name == REBIRTH and m.value for m in metrics):
@@ -213,9 +232,10 @@ class EdgeNode(_Side):
 
 
 class HostApplication(_Side):
-    """The digital twin's side, host `host` of one edge node."""
+    """The digital twin's side, host `host` of one edge node. A new one for each link, which began at `began_ms` (UTC): birth and
+    death of a session have that time, both (Sparkplug 3.0.0, 6.4.27)."""
 
-    def __init__(self, group: str, node: str, host: str) -> None:
+    def __init__(self, group: str, node: str, host: str, began_ms: int = 0) -> None:
         super().__init__()
         self.subscriptions = tuple(topic(group, kind, node) for kind in ("NBIRTH", "NDATA", "NDEATH"))
         self.alive = False
@@ -223,6 +243,7 @@ class HostApplication(_Side):
         self.missed = 0
         """Messages that were missing by their `seq`."""
         self._group, self._node, self._state = group, node, state_topic(host)
+        self._began_ms = began_ms
         self._names: dict[int, str] = {}
         self._types: dict[str, DataType] = {}
         self._seq = -1
@@ -230,7 +251,8 @@ class HostApplication(_Side):
         self._tag = b""
 
     def _says(self, online: bool) -> Message:
-        return Message(self._state, b'{"online":%s}' % (b"true" if online else b"false"), qos=1, retain=True)
+        state = {"online": online, "timestamp": self._began_ms}
+        return Message(self._state, json.dumps(state, separators=(",", ":")).encode(), qos=1, retain=True)
 
     def will(self) -> Message:
         """What the broker says when we are gone."""
@@ -238,7 +260,7 @@ class HostApplication(_Side):
 
     def hello(self) -> list[Message]:
         """What to publish as soon as there is a link: that we are here, and whoever was born before may say so again."""
-        return [self._says(online=True), self._rebirth(0)]
+        return [self._says(online=True), self._rebirth(self._began_ms)]
 
     def _rebirth(self, now_ms: int) -> Message:
         return self._publish((Metric(REBIRTH, None, now_ms, DataType.BOOLEAN, 1),), now_ms)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -184,6 +185,17 @@ def test_a_host_that_comes_online_is_told_at_once() -> None:
     edge.messages(HELLO, 5)
     assert over(host.hello()[:1], edge) == [Ask(HELLO.tag)]
     assert over([host.will()], edge) == []
+    for said in (b'{ "timestamp": 5, "online" : true }', b"ONLINE", b"\xff", b"[]", b'{"online": 1}'):
+        assert bool(over([Message("spBv1.0/STATE/shore", said)], edge)) is said.startswith(b"{ ")
+
+
+def test_birth_and_death_of_a_host_have_the_time_of_its_session() -> None:
+    host = HostApplication("plants", "observatory", "shore", 1_790_000_000_123)
+    (birth, rebirth), death = host.hello(), host.will()
+    assert json.loads(birth.payload) == {"online": True, "timestamp": 1_790_000_000_123}
+    assert json.loads(death.payload) == {"online": False, "timestamp": 1_790_000_000_123}
+    assert (birth.qos, birth.retain, death.qos, death.retain) == (1, True, 1, True)
+    assert decode_payload(rebirth.payload).t_ms == 1_790_000_000_123
 
 
 def test_deaths_of_this_session_count_and_those_of_an_earlier_one_do_not() -> None:

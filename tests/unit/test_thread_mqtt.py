@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from pathlib import Path
 
 import pytest
@@ -24,12 +25,16 @@ CLOCK = WallClock()
 
 def edge(here: Mosquitto, **who: str) -> MqttCarrier:
     return MqttCarrier(
-        Broker("127.0.0.1", here.port, **who), lambda n: EdgeNode("plants", "test", "shore", SCHEMA, {}, n), CLOCK
+        Broker("127.0.0.1", here.port, **who),
+        lambda n, ms: EdgeNode("plants", "test", "shore", SCHEMA, {}, n, ms),
+        CLOCK,
     )
 
 
 def host(here: Mosquitto) -> MqttCarrier:
-    return MqttCarrier(Broker("127.0.0.1", here.port), lambda n: HostApplication("plants", "test", "shore"), CLOCK)
+    return MqttCarrier(
+        Broker("127.0.0.1", here.port), lambda n, ms: HostApplication("plants", "test", "shore", ms), CLOCK
+    )
 
 
 @pytest.mark.slow
@@ -111,7 +116,9 @@ def test_a_host_of_others_sees_births_data_and_deaths(tmp_path: Path) -> None:
                 await plant.log(value(1), value(2))
                 await eventually(lambda: equal(plant, shore))
                 await plant.kill()
-                await eventually(lambda: any("NDEATH" in topic for topic, _ in seen))
+                await shore.kill()
+                last = {"spBv1.0/plants/NDEATH/test": 1, "spBv1.0/STATE/shore": 2}
+                await eventually(lambda: all(sum(t == topic for t, _ in seen) == n for topic, n in last.items()))
                 watching.cancel()
                 await asyncio.gather(watching, return_exceptions=True)
             kinds = [topic.split("/")[2] for topic, _ in seen if topic.startswith("spBv1.0/plants/")]
@@ -120,7 +127,8 @@ def test_a_host_of_others_sees_births_data_and_deaths(tmp_path: Path) -> None:
             values = [m.value for payload in data for m in payload.metrics if m.alias in (1, 2)]
             assert values[:2] == [value(1).value, value(2).value]
             assert all(m.historical for payload in data for m in payload.metrics if m.alias in (1, 2))
-            assert ("spBv1.0/STATE/shore", b'{"online":true}') in seen
-            await shore.kill()
+            birth, death = (json.loads(payload) for topic, payload in seen if topic == "spBv1.0/STATE/shore")
+            assert (birth["online"], death["online"]) == (True, False)
+            assert birth["timestamp"] == death["timestamp"] == pytest.approx(CLOCK.utc_ns() / 1e6, abs=60_000)
 
     run(main())

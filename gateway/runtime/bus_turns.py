@@ -29,6 +29,8 @@ class DeviceState:
     polls: int = 0
     poll_errors: int = 0
     next_try_ns: int = 0
+    busy_until_ns: int = 0
+    """It said that it is busy, and is given time until then."""
     reading: Reading | None = None
     """The group that is being read, of which some transactions are left; it began to be due at `reading_due_ns`."""
     reading_due_ns: int = 0

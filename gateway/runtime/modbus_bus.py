@@ -381,7 +381,8 @@ class ModbusBus:
         """It answers, and says no to this group; the other groups go on.
 
         Busy (06) and acknowledge (05, it takes long) mean later: the last value lives on until it is stale, never a 0
-        in its place, and the device is given time (MB-023, MB-024).
+        in its place, and the device is given time (MB-023, MB-024). The time is the device's: what else of it says so
+        before that is over waits for the same moment, and only who says so behind it makes the next one longer.
         """
         device.poll_errors += 1
         device.reading = None
@@ -390,7 +391,10 @@ class ModbusBus:
             return
         device.online, device.error = True, str(error)
         if isinstance(error, Acknowledged | ServerBusy):
-            device.schedule.defer(group, self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S))
+            now_ns = self._clock.monotonic_ns()
+            if now_ns >= device.busy_until_ns:
+                device.busy_until_ns = now_ns + int(device.backoff.next_s() * NS_PER_S)
+            device.schedule.defer(group, device.busy_until_ns)
             return
         names = [f"{device.driver.config.name}.{t.name}" for t in device.driver.profile.group(group)]
         self._tags.put_bad(names, reason_of(error))

@@ -1,5 +1,5 @@
-"""The variables that a system file declares: every tag with a value or a payload that the plant reports. The digital model's are
-these, whichever twin it is in, and so are those of a template's ``model.json``."""
+"""The variables that a system file declares: every tag with a value or a payload that the plant reports, and of each program
+whether it runs. The digital model's are these, whichever twin it is in, and so are those of a template's ``model.json``."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ def declared_variables(system: System, limits: Mapping[str, Limits] | None = Non
 
     A transmitter's inbox is none: what comes in there are commands, which a model takes as such (`DigitalModel.process_event`).
     """
-    return tuple(
+    tags = [
         Variable(tag.name, tag.kind.name.lower(), tag.unit, tag.limits if limits is None else limits.get(tag.name))
         for tag in plant_tags(system).values()
         if not (tag.kind is TagKind.MESSAGE and tag.name.endswith(".inbox"))
-    )
+    ]
+    return (*tags, *(Variable(program, "bool") for program in system.plc.programs))

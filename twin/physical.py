@@ -45,6 +45,16 @@ def fastest_ms(system: System) -> int:
     return min(intervals, default=system.plc.cycle_ms)
 
 
+def plc_lost_ms(system: System) -> int:
+    """How old the PLC's last scan is when it counts as lost, and its outputs are made safe."""
+    return max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system))
+
+
+def gateway_lost_ms(system: System) -> int:
+    """How old what the gateway published last is when it counts as dead, and everything that it read as bad."""
+    return max(GATEWAY_LOST_MS, 10 * fastest_ms(system))
+
+
 def _kind(tag: Tag) -> TagKind:
     if tag.type == "bool":
         return TagKind.BOOL
@@ -156,7 +166,7 @@ def gateway_config(
         buses={name: replace(bus, strict=bus.strict and true_silences) for name, bus in system.buses.items()},
         devices={n: _without_inbox(d) if n in lent else d for n, d in system.devices.items()},
         cycle_ms=fastest_ms(system),
-        plc_lost_ms=max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system)),
+        plc_lost_ms=plc_lost_ms(system),
         outputs=frozenset(outputs),
         log_tags=frozenset(f"{name}.log" for name in system.plc.programs),
         allow_writes=allow_writes,
@@ -183,7 +193,7 @@ def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfi
         cycle_ms=float(fastest_ms(system)),
         late_ms=float(watchdog.late_ms),
         stop_after=watchdog.stop_after,
-        heartbeat_limit_ms=float(max(GATEWAY_LOST_MS, 10 * fastest_ms(system))),
+        heartbeat_limit_ms=float(gateway_lost_ms(system)),
         python_path=(str(system.path.parent),),
         tasks=tuple(
             TaskSpec(name, float(form.interval_ms or 0), form.priority, form.single or "")

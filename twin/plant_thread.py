@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from gateway.connections.os_connector import OsConnector
 from gateway.core.clock import NS_PER_MS, Clock
@@ -29,7 +30,7 @@ from gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
 from gateway.core.image_snapshot import Snapshot
 from gateway.core.nursery import Nursery
 from gateway.core.statemachine import STATE_CODES, STATES
-from gateway.core.values import COMMAND, RESPONSE, TagValue
+from gateway.core.values import COMMAND, RESPONSE, Quality, Reason, TagValue
 from gateway.runtime.audit import AuditLog
 from gateway.store.event import Event, Kind, KnowledgeStore
 from gateway.store.knowledge import open_knowledge
@@ -38,7 +39,7 @@ from twin.command_gate import CommandGate
 from twin.knowledge import KnowledgeWriter
 from twin.mape.execute import Bounds
 from twin.mapping import MappedConnector, mapping_from_json
-from twin.physical import attached, image_layout
+from twin.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
 from twin.status import encode_status
 from twin.system import System, load_system
 from twin.thread import PTtoDTConnection, schema_of
@@ -68,7 +69,10 @@ class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 class ImageProcess(PTDigitalThreadProcess):
     """Shares what the process image shows: `look` at both regions, as often as changes are not to be missed. Of a tag whose
-    quality stays, a new value is shared at most every `every_ms`; states and messages always."""
+    quality stays, a new value is shared at most every `every_ms`; states and messages always.
+
+    Whether a program runs is a value of its own name, bad when it does not (SPEC ruling 18). The last that a dead one said is no
+    state of the plant any more, and what a dead gateway read last is bad."""
 
     def __init__(self, system: System, layout: ImageLayout, clock: Clock, every_ms: int = 0) -> None:
         super().__init__("image", clock)
@@ -81,18 +85,29 @@ class ImageProcess(PTDigitalThreadProcess):
             for p, form in system.plc.programs.items()
             if f"{p}.state" in tags and [word for _, word in tags[f"{p}.state"].words] == NAMES
         }
+        self._programs = list(system.plc.programs)
+        self._lost_ns = {INPUTS: gateway_lost_ms(system) * NS_PER_MS, OUTPUTS: plc_lost_ms(system) * NS_PER_MS}
         self._said: dict[str, tuple[object, int]] = {}
 
     def look(self, inputs: Snapshot, outputs: Snapshot) -> None:
         """Share what is new, and what was not shared for `REFRESH_MS`."""
-        now_ms, offset_ns = self._clock.utc_ns() // NS_PER_MS, self._clock.utc_ns() - self._clock.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
+        now_ms, offset_ns = self._clock.utc_ns() // NS_PER_MS, self._clock.utc_ns() - now_ns
+        gateway_dead = Reason.GATEWAY_DEAD if inputs.age_ns(now_ns) > self._lost_ns[INPUTS] else Reason.NONE
+        plc_dead = (
+            Reason.NOT_OPERATIONAL if outputs.stopped
+            else Reason.HEARTBEAT_LOST if outputs.age_ns(now_ns) > self._lost_ns[OUTPUTS]
+            else Reason.NONE
+        )  # fmt: skip
         for name in self._plain:
-            held = inputs if name in inputs.shape.index else outputs
+            held, dead = (inputs, gateway_dead) if name in inputs.shape.index else (outputs, plc_dead)
             if held.counter:
-                self._value(name, held.value(name), now_ms, offset_ns)
+                value = held.value(name)
+                self._value(
+                    name, replace(value, quality=Quality.BAD, reason=dead) if dead else value, now_ms, offset_ns
+                )
         if outputs.counter:
-            for program, period in self._machines.items():
-                self._status(program, outputs.value(f"{program}.state"), outputs.value(period), now_ms)
+            self._controller(plc_dead, outputs, now_ms, offset_ns)
         for tag, messages in inputs.messages.items():
             for message in messages:
                 data = COMMAND(message.data) if tag.endswith(".inbox") else RESPONSE(message.data)
@@ -102,6 +117,17 @@ class ImageProcess(PTDigitalThreadProcess):
             if tag.endswith(".outbox"):
                 for message in messages:
                     self.share(Kind.PAYLOAD, tag, RESPONSE(message.data), (message.t_ns + offset_ns) // NS_PER_MS)
+
+    def _controller(self, dead: Reason, outputs: Snapshot, now_ms: int, offset_ns: int) -> None:
+        """Whether its programs run; and the states of those that do."""
+        runs = TagValue(not dead, Quality.BAD if dead else Quality.GOOD, dead, outputs.t_ns)
+        for program in self._programs:
+            self._value(program, runs, now_ms, offset_ns)
+        if dead:
+            self.tell_again()
+            return
+        for program, period in self._machines.items():
+            self._status(program, outputs.value(f"{program}.state"), outputs.value(period), now_ms)
 
     def tell_again(self) -> None:
         """Share states with the next look, changed or not: a command was refused, and who sent it holds them for others."""

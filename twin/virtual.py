@@ -19,6 +19,7 @@ from gateway.connections.tap import TappedConnector
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import Connector, Tap
 from gateway.core.endpoint import Endpoint
+from gateway.core.image import Image
 from gateway.core.nursery import Nursery
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.gateway import Gateway
@@ -70,6 +71,8 @@ class VirtualPrototype:
         self.field: FieldSide = self.twin.field(Path("virtual"), self.net, water)
         self.gateway: Gateway
         self.plc: Runner
+        self.image: Image
+        """The process image, for whoever watches."""
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.started_ns = loop.now_ns
         self.outputs_confirmed_safe: bool | None = None
@@ -99,6 +102,7 @@ class VirtualPrototype:
         ecs.layout.format(memory)
         for_gateway = self._stack.enter_context(ecs.layout.attach(memory))
         for_plc = self._stack.enter_context(ecs.layout.attach(memory))
+        self.image = self._stack.enter_context(ecs.layout.attach(memory))
         audit = AuditLog(self._run_dir / "audit.jsonl", clock)
         self._stack.callback(audit.close)
         log = ExchangeLog(_IN_MEMORY, system=self.system.name, prototype=True)

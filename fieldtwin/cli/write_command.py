@@ -16,7 +16,7 @@ from fieldtwin.cli.device_options import device_options, logged, raw_form, raw_o
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.commissioning import writing
-from fieldtwin.commissioning.address import tags_of, with_care
+from fieldtwin.commissioning.address import of_behaviour, tags_of, with_care
 from fieldtwin.commissioning.live import frame_of, modbus_at
 from fieldtwin.commissioning.point import Answer, Point, decoded
 from fieldtwin.commissioning.reading import Target, dry_point, point_at, text_of
@@ -34,6 +34,9 @@ RESTART_COMMUNICATIONS = 1
 @click.argument("items", nargs=-1, metavar="ITEM=VALUE...")
 @device_options
 @raw_options
+@click.option(
+    "--behaviour", "behaviours", multiple=True, metavar="NAME", help="The writes that the profile has under a name."
+)
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @click.option("--restore", is_flag=True, help="Put the old values back afterwards.")
 @click.option("--hold", "hold_s", type=Duration(), default="0s", help="With --restore: how long the new values stay.")
@@ -47,6 +50,7 @@ RESTART_COMMUNICATIONS = 1
 def command(
     endpoint: str,
     items: tuple[str, ...],
+    behaviours: tuple[str, ...],
     log: Path | None,
     yes: bool,
     restore: bool,
@@ -66,8 +70,10 @@ def command(
     fieldtwin write tcp://192.168.0.7 holding:100=42
     fieldtwin write rtu:/dev/ttyUSB0 --profile eastron-sdm630 demand_period=15 --yes
     fieldtwin write can:socketcan/can0 --node 5 6060h:00=1 --type int8 --restore --hold 10s
+    fieldtwin write can:socketcan/can0 --node 5 --profile drive-cia402 --behaviour quick_stop
     """
     target = target_from(endpoint, options)
+    items = (*(item for name in behaviours for item in of_behaviour(name, target.profile)), *items)
     if restart:
         return _restart(target, items, log, i_know=i_know, yes=yes, dry_run=dry_run)
     writes = writing.plan_writes(_pairs(items, target, options), i_know=i_know, restore=restore)

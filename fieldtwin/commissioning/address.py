@@ -52,6 +52,16 @@ class RawForm:
             raise UsageError("count or length out of range", expected="1 to 2000 values, 1 to 125 registers")
 
 
+def of_behaviour(name: str, profile: DeviceProfile | None) -> list[str]:
+    """The writes that a profile has under `name`, as ``TAG=VALUE``, in its order. Raises `UsageError`."""
+    if profile is None:
+        raise UsageError(f"the behaviour {name!r}: of which device?", expected="--profile NAME")
+    if name not in profile.form.behaviours:
+        known = ", ".join(profile.form.behaviours) or "none"
+        raise UsageError(f"{profile.name} has no behaviour {name!r}", expected=known)
+    return [f"{profile.form.commands[command]}={value}" for command, value in profile.form.behaviours[name].items()]
+
+
 def tags_of(
     items: Sequence[str],
     protocol: str,

@@ -82,6 +82,29 @@ class DeviceDriver(ABC):
                 f"no command {command.name!r}", expected=", ".join(sorted(self.command_list)), where=self.config.where
             )
 
+    def command(self, tag_name: str, value: float) -> COMMAND:
+        """The command that writes `value` (engineering units) to a tag. Raises `NotAllowed` for what cannot be written, or is
+        outside of its limits."""
+        raise NotAllowed(f"the tag {tag_name!r} cannot be written", where=self.config.where)
+
+    def behaviour(self, name: str) -> tuple[COMMAND, ...]:
+        """The commands that the profile maps to a named behaviour, in its order (SPEC ruling 14).
+
+        Raises `NotAllowed` for a name that the profile does not have, and as `command`.
+        """
+        form = self.profile.form
+        if name not in form.behaviours:
+            known = ", ".join(form.behaviours) or "none"
+            raise NotAllowed(f"no behaviour {name!r}", expected=known, where=self.config.where)
+        return tuple(self.command(form.commands[command], value) for command, value in form.behaviours[name].items())
+
+    def change_behaviour(self, name: str) -> int:
+        """ChangeBehavior: the behaviour's commands wait to be sent, all of them or none; how many. Raises as `behaviour`."""
+        commands = self.behaviour(name)
+        for command in commands:
+            self.consumer.observe(command)
+        return len(commands)
+
     async def send(self) -> None:
         """Send: consume ; write. The consumer's queue must not be empty.
 

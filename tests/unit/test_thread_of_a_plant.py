@@ -14,7 +14,7 @@ from gateway.core.statemachine import STATE_CODES
 from gateway.core.values import Quality, Reason, TagValue
 from gateway.store.event import Event, Kind
 from gateway.wallclock import WallClock
-from twin.physical import gateway_config, image_layout
+from twin.physical import gateway_config, gateway_lost_ms, image_layout
 from twin.plant_thread import REFRESH_MS, ImageProcess
 from twin.system import load_system
 from twin.thread_place import lent_transmitter, twin_carrier
@@ -60,9 +60,14 @@ class Watched:
         row = [values.get(name, TagValue(0, Quality.GOOD)) for name in self._names]
         messages = {"ctd.sample": [(self.clock.monotonic_ns(), message)]} if message else {}
         self._inputs.publish(row, self.clock.monotonic_ns(), messages)
+        return self.watch(0)
+
+    def watch(self, after_ms: int) -> list[Event]:
+        """What is shared so long after the last look although nobody published anything."""
+        self.clock.now_ms += after_ms
         self._process.look(*(reader.snapshot() for reader in self._readers))
         shared = self._process.collect()
-        assert {e.name for e in shared} <= {
+        assert {e.name for e in shared} <= {"relay"} | {
             f"{d.name}.{t}" for d in OBSERVATORY.devices.values() for t in [*d.profile.tags, "sample", "inbox"]
         }, "tags of devices, and messages; nothing of how far these were taken"
         return [e for e in shared if e.name in ("ctd.pressure", "ctd.sample")]
@@ -108,6 +113,18 @@ def test_a_state_is_told_when_it_changes_and_again_to_whom_was_refused() -> None
     assert [len(states()) for _ in range(3)] == [1, 0, 0]
     process.tell_again()
     assert [len(states()) for _ in range(2)] == [1, 0]
+
+
+def test_what_a_dead_gateway_read_last_is_not_told_as_good() -> None:
+    """It may be dead for as long as it likes: the image still holds what it published."""
+    watched = Watched()
+    (told,) = watched.look(1.0, 0)
+    assert told.quality == Quality.GOOD
+    assert watched.watch(gateway_lost_ms(OBSERVATORY)) == []
+    (told,) = watched.watch(1)
+    assert (told.value, told.quality, told.reason) == (1.0, Quality.BAD, Reason.GATEWAY_DEAD)
+    (told,) = watched.look(1.0, 50)
+    assert told.quality == Quality.GOOD, "it is back"
 
 
 def test_a_system_with_one_transmitter_lends_that() -> None:

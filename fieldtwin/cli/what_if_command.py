@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.talk import data, talk
@@ -91,9 +92,15 @@ def command(
         faults = _faults(fault_file, loaded)
         plans.append(Plan("as said", tuple(parsed(c) for c in commands), faults, require, finally_))
     fork = Fork(system, state, horizon_s, folders, prototype_file, seed, settle_s)
-    talk.print(f"{loaded.name}: {len(plans)} plan{'s'[: len(plans) != 1]}, {horizon_s:g} s ahead, from {state.source}")
+    talk.print(
+        f"{loaded.name}: {len(plans)} plan{'s'[: len(plans) != 1]}, {_ahead(horizon_s)} ahead, from {escape(state.source)}",
+        soft_wrap=True,
+    )
     outcomes = answers(
-        fork, plans, jobs, lambda o: talk.print(f"  {o.plan}: {'met' if o.met else 'not met'}, {o.took_s:.1f} s")
+        fork,
+        plans,
+        jobs,
+        lambda o: talk.print(f"  {escape(o.plan)}: {'met' if o.met else 'not met'}, {o.took_s:.1f} s"),
     )
     if as_json:
         found: dict[str, Any] = {
@@ -104,8 +111,17 @@ def command(
         }
         click.echo(json.dumps(found | {"outcomes": [o.described() for o in outcomes]}, indent=1))
     else:
-        show(data, outcomes)
+        units = {f"{d.name}.{t.name}": t.unit or "" for d in loaded.devices.values() for t in d.profile.tags.values()}
+        show(data, outcomes, units)
     return 0 if any(o.met for o in outcomes) else 1
+
+
+def _ahead(seconds: float) -> str:
+    """A horizon as people say it."""
+    for unit, name in ((86_400, "d"), (3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:g} {name}"
+    return f"{seconds:g} s"
 
 
 def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> KnownState:

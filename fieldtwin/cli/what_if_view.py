@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -13,8 +13,8 @@ from fieldtwin.whatif.outcome import Outcome
 _SHOWN = 40
 
 
-def show(console: Console, outcomes: Sequence[Outcome]) -> None:
-    """Each plan: its verdict, its requirements, its states, its variables."""
+def show(console: Console, outcomes: Sequence[Outcome], units: Mapping[str, str]) -> None:
+    """Each plan: its verdict, its requirements, its states, its variables. `units` by the name of a tag."""
     for outcome in outcomes:
         console.print()
         console.print(f"[bold]{outcome.plan}[/]: {'met' if outcome.met else 'not met'}", markup=True)
@@ -28,19 +28,20 @@ def show(console: Console, outcomes: Sequence[Outcome]) -> None:
             console.print(f"  {program}  {told}{' …' if len(seen) > 8 else ''}", markup=False)
         if outcome.not_taken:
             console.print(f"  begun without what is known of: {', '.join(outcome.not_taken)}", markup=False)
-        console.print(_table(outcome))
+        console.print(_table(outcome, units))
 
 
-def _table(outcome: Outcome) -> Table:
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("variable", overflow="fold")
+def _table(outcome: Outcome, units: Mapping[str, str]) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
+    table.add_column("variable", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
     for column in ("first", "last", "min", "max", "mean", "good of"):
         table.add_column(column, justify="right", overflow="fold")
     shown = sorted(outcome.variables.items())
     for name, variable in shown[:_SHOWN]:
         v = variable.described()
         numbers = [_number(v.get(key)) for key in ("first", "last", "min", "max", "mean")]
-        table.add_row(name, *numbers, f"{v['good']}/{v['updates']}")
+        table.add_row(name, units.get(name, ""), *numbers, f"{v['good']}/{v['updates']}")
     if len(shown) > _SHOWN:
         table.add_row(f"and {len(shown) - _SHOWN} more: --json")
     return table
@@ -50,7 +51,7 @@ def _number(value: Any) -> str:
     if value is None:
         return "-"
     if isinstance(value, float):
-        return f"{value:.5g}"
+        return f"{value:.0f}" if 1e5 <= abs(value) < 1e9 else f"{value:.5g}"
     text = str(value)
     return text if len(text) <= 24 else f"{text[:23]}…"
 

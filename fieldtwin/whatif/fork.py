@@ -136,6 +136,7 @@ class _ForkRun:
             for fault in self.plan.faults:
                 run.field.faults.inject(fault)
             await self._watch(run, loop)
+            self.outcome.ends(loop.now_ns)
             run.gateway.tags.on_put, self._over = None, True  # what its end brings (safe outputs) is none of the plan's
             for requirement, expression in self._at_the_end:
                 self._judge(requirement, expression)
@@ -169,8 +170,9 @@ class _ForkRun:
         if self._over:
             return
         value = self._named(change.tag, change.after)
-        self.outcome.saw_variable(change.tag, value)
-        if change.tag in self._words and self._run is not None:
+        assert self._run is not None  # it was made before anything of it moved
+        self.outcome.saw_variable(change.tag, value, self._run.loop.now_ns)
+        if change.tag in self._words:
             seen = self.outcome.states.setdefault(change.tag.removesuffix(".state"), [])
             if len(seen) < MAX_TRANSITIONS:
                 seen.append((self._now_s(), str(value)))

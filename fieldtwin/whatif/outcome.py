@@ -11,19 +11,24 @@ from gateway.core.values import Quality, TagValue
 
 @dataclass(slots=True)
 class VariableOutcome:
-    """A tag or a program's variable: how often it was new, and its values that were good."""
+    """A tag or a program's variable: how often it was new, and its values that were good. Its mean is one over time, each value
+    counted for as long as it was the last: sampling less often, which is what plans are about, is no reason for another mean."""
 
     updates: int = 0
     good: int = 0
     lowest: float = math.inf
     highest: float = -math.inf
-    total: float = 0.0
     first: Any = None
     last: Any = None
-    numbers: int = 0
+    _weighed: float = 0.0
+    _spent_ns: int = 0
+    _held: float | None = None
+    _since_ns: int = 0
 
-    def saw(self, value: Any, good: bool) -> None:
+    def saw(self, value: Any, good: bool, t_ns: int) -> None:
+        """It was this at `t_ns`, of the fork's monotonic clock."""
         self.updates += 1
+        self.ends(t_ns)
         if not good or value is None:
             return
         self.good += 1
@@ -31,9 +36,22 @@ class VariableOutcome:
             self.first = value
         self.last = value
         if isinstance(value, int | float) and not math.isnan(value):
-            self.numbers += 1
-            self.total += value
+            self._held, self._since_ns = value, t_ns
             self.lowest, self.highest = min(self.lowest, value), max(self.highest, value)
+
+    def ends(self, t_ns: int) -> None:
+        """What it was counts until then."""
+        if self._held is not None and t_ns > self._since_ns:
+            self._weighed += self._held * (t_ns - self._since_ns)
+            self._spent_ns += t_ns - self._since_ns
+        self._held = None
+
+    @property
+    def mean(self) -> float | None:
+        """Over time; None where there never was a number."""
+        if self._spent_ns:
+            return self._weighed / self._spent_ns
+        return self.lowest if self.lowest <= self.highest else None
 
     def described(self) -> dict[str, Any]:
         shown: dict[str, Any] = {
@@ -42,8 +60,8 @@ class VariableOutcome:
             "first": _shown(self.first),
             "last": _shown(self.last),
         }
-        if self.numbers:
-            shown |= {"min": self.lowest, "max": self.highest, "mean": self.total / self.numbers}
+        if (mean := self.mean) is not None:
+            shown |= {"min": self.lowest, "max": self.highest, "mean": mean}
         return shown
 
 
@@ -85,11 +103,16 @@ class Outcome:
 
     def saw_tag(self, name: str, value: TagValue) -> None:
         """A tag was published."""
-        self._of(name).saw(value.value, value.quality is not Quality.BAD)
+        self._of(name).saw(value.value, value.quality is not Quality.BAD, value.t_ns)
 
-    def saw_variable(self, name: str, value: Any) -> None:
+    def saw_variable(self, name: str, value: Any, t_ns: int) -> None:
         """A program changed a variable."""
-        self._of(name).saw(value, True)
+        self._of(name).saw(value, True, t_ns)
+
+    def ends(self, t_ns: int) -> None:
+        """The horizon."""
+        for variable in self.variables.values():
+            variable.ends(t_ns)
 
     def _of(self, name: str) -> VariableOutcome:
         found = self.variables.get(name)

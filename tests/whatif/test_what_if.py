@@ -16,9 +16,11 @@ from fieldtwin.whatif.fork import Fork, answer
 from fieldtwin.whatif.known import known_state
 from fieldtwin.whatif.last_known import of_period
 from fieldtwin.whatif.many import answers
+from fieldtwin.whatif.outcome import VariableOutcome
 from fieldtwin.whatif.plan import Plan, load_plans
 from fieldtwin.whatif.plan import command as parsed
 from fieldtwin.whatif.state import KnownState, read_state
+from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.values import Quality, Reason
 from gateway.store.event import Event, Kind
@@ -44,6 +46,26 @@ def test_a_fork_goes_on_from_what_is_known() -> None:
     assert pressure.lowest > 200
     assert outcome.variables["ctd.sample_period_s"].last == 1
     assert outcome.not_taken == []
+
+
+def test_a_mean_is_one_over_time_however_often_somebody_looked() -> None:
+    """10 for ten seconds and each second told, 20 for thirty and told once, then bad for a minute, then 40 for ten."""
+    seen = VariableOutcome()
+    for second in range(10):
+        seen.saw(10, True, second * NS_PER_S)
+    seen.saw(20.0, True, 10 * NS_PER_S)
+    seen.saw(20.0, False, 40 * NS_PER_S)
+    seen.saw(None, False, 0)
+    seen.saw(40, True, 100 * NS_PER_S)
+    seen.ends(110 * NS_PER_S)
+    told = seen.described()
+    assert told["mean"] == pytest.approx((10 * 10 + 20 * 30 + 40 * 10) / 50)
+    assert (told["updates"], told["good"], told["min"], told["max"]) == (14, 12, 10, 40)
+    once, words = VariableOutcome(), VariableOutcome()
+    once.saw(7, True, 0)
+    words.saw("0042", True, 0)
+    assert once.described()["mean"] == 7
+    assert "mean" not in words.described()
 
 
 def test_without_knowledge_it_begins_as_any_prototype() -> None:

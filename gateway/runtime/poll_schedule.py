@@ -13,6 +13,8 @@ from typing import NamedTuple, TypeVar
 from gateway.core.clock import NS_PER_MS
 
 K = TypeVar("K", bound=Hashable)
+SOONER = 8
+"""A group that is not at its place goes there by at most one part in so many of its period, each time that it is read."""
 
 
 class Rate(NamedTuple):
@@ -54,6 +56,8 @@ class PollSchedule:
         self._rates = dict(rates)
         self._once = tuple(once)
         self._epoch_ns = 0
+        self._goal_ns: dict[str, int] = {}
+        """The phase of a group that is on its way to its place."""
         self.due_ns: dict[str, int] = {}
         self.missed = dict.fromkeys(rates, 0)
 
@@ -64,12 +68,14 @@ class PollSchedule:
     def restate(self, rates: Mapping[str, Rate], stated: Collection[str], now_ns: int, *, there: bool) -> None:
         """From now on `rates`, which hold all groups that are read again and again; `stated` are those whose phase counts.
 
-        A group whose rate is as before keeps its place. One that has another period is due that long behind its last
-        place, or now: no interval is shorter than the shorter of both periods, none longer than the longer. With a phase that
-        is stated it goes there instead, by at most half a period sooner or later. What is overdue stays so. A new
-        group is read now if the device is `there`.
+        One that has another period is due that long behind its last place, or now: no interval is shorter than the shorter of
+        both periods, none longer than the longer. From there a group goes to its new place little by little, always sooner:
+        until it is there, an interval is up to an eighth shorter than its period, and none is longer. With a phase that is
+        stated it goes there at once, by at most half a period sooner or later. What is overdue stays so. A new group is
+        read now if the device is `there`.
         """
         kept, self._rates = self._rates, dict(rates)
+        self._goal_ns.clear()
         for group, rate in rates.items():
             self.missed.setdefault(group, 0)
             old, due_ns = kept.get(group), self.due_ns.get(group)
@@ -86,6 +92,8 @@ class PollSchedule:
                     due_ns = due_ns if due_ns <= now_ns else max(now_ns, last_ns + rate.period_ns)
                     self._rates[group] = Rate(rate.period_ns, (due_ns - self._epoch_ns) % rate.period_ns)
                 self.due_ns[group] = due_ns
+            if self._rates[group] != rate:
+                self._goal_ns[group] = rate.phase_ns
         for group in kept.keys() - rates.keys():
             self.due_ns.pop(group, None)
 
@@ -96,6 +104,9 @@ class PollSchedule:
 
     def start(self, now_ns: int) -> None:
         """The device is there: everything is read once now, and then at its places on the grid."""
+        for group, phase_ns in self._goal_ns.items():
+            self._rates[group] = self._rates[group]._replace(phase_ns=phase_ns)
+        self._goal_ns.clear()
         self.due_ns = dict.fromkeys([*self._rates, *self._once], now_ns)
 
     def stop(self) -> None:
@@ -112,6 +123,20 @@ class PollSchedule:
         passed = (now_ns - start_ns) // rate.period_ns
         self.missed[group] += max(0, passed - (due_ns - start_ns) // rate.period_ns)
         self.due_ns[group] = start_ns + (passed + 1) * rate.period_ns
+        if group in self._goal_ns:
+            self._go_sooner(group, rate, now_ns)
+
+    def _go_sooner(self, group: str, rate: Rate, now_ns: int) -> None:
+        """A group on its way to its place, which is read now: the next time it is a step nearer."""
+        step_ns, most_ns = (rate.phase_ns - self._goal_ns[group]) % rate.period_ns, rate.period_ns // SOONER
+        if self.due_ns[group] - now_ns < rate.period_ns - most_ns:
+            return  # it is read late, and the next time would be too close behind
+        if step_ns <= most_ns:
+            del self._goal_ns[group]
+        else:
+            step_ns = most_ns
+        self.due_ns[group] -= step_ns
+        self._rates[group] = Rate(rate.period_ns, (rate.phase_ns - step_ns) % rate.period_ns)
 
     def defer(self, group: str, until_ns: int) -> None:
         """`group` is wanted again at `until_ns`, whatever its grid says: the device asked for time."""

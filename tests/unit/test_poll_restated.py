@@ -1,4 +1,5 @@
-"""Another period for a poll group while it is read: no interval longer than the longer of both, none shorter than the shorter."""
+"""Another period for a poll group while it is read: no interval longer than the longer of both, none shorter than the shorter;
+and then all of a bus are on their way to an even spread, by an eighth of their period at a time."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.core.clock import NS_PER_MS
-from gateway.runtime.poll_schedule import PollSchedule, Rate
+from gateway.runtime.poll_schedule import SOONER, PollSchedule, Rate, spread
 
 PERIODS = st.integers(50, 5000)
 
@@ -39,10 +40,18 @@ def test_no_poll_is_lost_or_doubled(old: int, new: int, phase: int, now_ms: int)
     read += times(schedule, "a", now_ns, end_ns)
     other += times(schedule, "b", now_ns, end_ns)
     gaps = [(b - a) / NS_PER_MS for a, b in pairwise(read)]
-    assert min(gaps[1:]) >= min(old, new)  # the first is read when the device is there, and then at its place
+    first = next(n for n, t in enumerate(read) if t >= now_ns)
+    assert (
+        min(gaps[1:first]) >= min(old, new) if first > 1 else True
+    )  # it is read when the device is there, then at its place
     assert max(gaps) <= max(old, new)
-    assert all(b - a == new * NS_PER_MS for a, b in pairwise([t for t in read if t >= now_ns]))
-    assert all(b - a == old * NS_PER_MS for a, b in pairwise(other[1:]))  # nothing was said of it
+    on_its_way, there = gaps[first : first + SOONER + 1], gaps[first + SOONER + 1 :]
+    assert all(new * 7 / 8 <= gap <= new for gap in on_its_way)
+    assert all(gap == new for gap in there)
+    assert not there or read[-1] % (new * NS_PER_MS) == 0
+    others = [(b - a) / NS_PER_MS for a, b in pairwise(other[1:])]
+    assert all(old * 7 / 8 <= gap <= old for gap in others)  # nothing was said of it but that its place is another one
+    assert len(others) < 300 or other[-1] % (old * NS_PER_MS) == 7 * NS_PER_MS
     assert not any(schedule.missed.values())
 
 
@@ -62,6 +71,42 @@ def test_a_stated_phase_is_gone_to_within_half_a_period(old: int, new: int, phas
         assert due_ns % (new * NS_PER_MS) == phase % new * NS_PER_MS
         assert due_ns - last_ns >= new * NS_PER_MS // 2
         assert due_ns - max(now_ns, last_ns) <= 1.5 * new * NS_PER_MS
+
+
+@settings(max_examples=40)
+@given(before=st.lists(PERIODS, min_size=2, max_size=6), after=PERIODS, now_ms=st.integers(1, 20_000))
+def test_a_bus_is_spread_as_if_it_had_begun_so(before: list[int], after: int, now_ms: int) -> None:
+    """Also those of which nothing changed: there are more, or fewer, to share a period with."""
+    names = [f"g{n}" for n in range(len(before))]
+    schedule = PollSchedule(spread(list(zip(names, before, strict=True))), ())
+    schedule.anchor(0)
+    schedule.start(0)
+    for name in names:
+        times(schedule, name, 0, now_ms * NS_PER_MS)
+    rates = spread(
+        [(name, period if n % 2 else after) for n, (name, period) in enumerate(zip(names, before, strict=True))]
+    )
+    schedule.restate(rates, (), now_ms * NS_PER_MS, there=True)
+    for name, (period_ns, phase_ns) in rates.items():
+        read = times(schedule, name, now_ms * NS_PER_MS, now_ms * NS_PER_MS + (SOONER + 3) * period_ns)
+        assert read[-1] % period_ns == phase_ns
+    assert not any(schedule.missed.values())
+
+
+def test_who_is_late_goes_no_sooner() -> None:
+    schedule = PollSchedule({"a": rate(800)}, ())
+    schedule.anchor(0)
+    schedule.start(0)
+    schedule.took("a", 0)
+    schedule.restate({"a": rate(800, 400)}, (), 1, there=True)
+    schedule.took("a", 1000 * NS_PER_MS)  # it was due at 800 ms
+    assert schedule.due_ns["a"] == 1600 * NS_PER_MS
+    schedule.took("a", 1600 * NS_PER_MS)
+    assert schedule.due_ns["a"] == 2300 * NS_PER_MS
+    schedule.stop()
+    schedule.start(2350 * NS_PER_MS)  # it was away: where it was before is of no account
+    schedule.took("a", 2350 * NS_PER_MS)
+    assert schedule.due_ns["a"] == 2800 * NS_PER_MS
 
 
 def test_what_is_overdue_stays_due_and_what_is_new_is_read_at_once() -> None:

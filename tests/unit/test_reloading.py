@@ -234,10 +234,14 @@ def test_no_poll_is_lost_or_doubled_on_the_line(plant: Path, loop: VirtualLoop) 
         fast, slow, others = p.asked(1, 0, 2.0), p.asked(1, 10, 2.0), p.asked(2, 0, 2.0)
         before = [t for t in fast if t < reloaded_s]
         assert set(gaps(before)) == {1.0}
-        assert gaps(fast)[len(before) :] == [0.25] * len(gaps(fast)[len(before) :])
+        behind = gaps(fast)[len(before) :]
+        assert min(behind[:9]) >= 0.2  # on its way to its place beside the others, an eighth sooner each time
+        assert behind[9:] == [0.25] * len(behind[9:])
         assert 0.25 <= gaps(fast)[len(before) - 1] <= 1.0  # the one interval that begins before and ends behind it
-        assert gaps(slow) == [4.0, 6.0, 6.0, 6.0]
-        assert set(gaps(others)) == {0.5}  # nothing was said of it
+        assert gaps(slow)[:2] == [4.0, 6.0]
+        assert all(5.25 <= gap <= 6.0 for gap in gaps(slow)[1:])
+        assert set(gaps(others)[-20:]) == {0.5}  # nothing was said of it but that its place is another one
+        assert min(gaps(others)) >= 0.4
         assert not any(d.schedule.missed[g] for d in p.run.gateway.buses["line"].devices for g in d.schedule.missed)
 
     running(plant, loop, scenario)

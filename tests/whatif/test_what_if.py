@@ -210,7 +210,7 @@ def test_several_plans_by_command(tmp_path: Path) -> None:
     assert found["outcomes"][1]["requirements"][1]["seen"] == "relay.state: 'STANDBY'"
     shown = CliRunner().invoke(command, words, standalone_mode=False).stdout
     assert "keep: met" in shown
-    assert re.search(r"ctd\.pressure +2[45]\d", shown)
+    assert re.search(r"ctd\.pressure +dbar +2[45]\d", shown)
 
 
 @pytest.mark.parametrize(

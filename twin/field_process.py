@@ -72,7 +72,7 @@ def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
     for bus, url in config.listen.items():
         if bus not in prototype.buses:
             raise UsageError(f"no bus {bus!r}", expected=", ".join(prototype.buses))
-        prototype = prototype.with_listen(bus, Endpoint.parse(url))
+        prototype = prototype.with_listen(system, bus, Endpoint.parse(url))
     return system, prototype
 
 

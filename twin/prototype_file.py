@@ -3,8 +3,10 @@ the plant, and never by gateway or PLC."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from emulators.replay.can_log import SUFFIX
 from gateway.core.endpoint import Endpoint
@@ -57,9 +59,12 @@ class Prototype:
     file: YamlFile
     form: PrototypeForm
 
-    def with_listen(self, bus: str, listen: Endpoint) -> Prototype:
-        """The same, with the emulators of `bus` listening elsewhere."""
-        return replace(self, buses={**self.buses, bus: replace(self.buses[bus], listen=listen)})
+    def with_listen(self, system: System, bus: str, listen: Endpoint) -> Prototype:
+        """The same, with the emulators of `bus` of `system` listening elsewhere. Raises `UsageError` where others are there."""
+        buses = {**self.buses, bus: replace(self.buses[bus], listen=listen)}
+        if (clash := _clash(system, buses)) is not None:
+            raise UsageError(clash.message, expected=clash.expected, got=f"{bus}={listen}")
+        return replace(self, buses=buses)
 
     def with_recording(self, device: str, path: Path, speed: float | None = None) -> Prototype:
         """The same, with `device` playing another recording."""
@@ -109,6 +114,7 @@ def load_prototype(system: System, path: Path | None = None) -> Prototype:
             )
     check_simulations(file, form, system)
     buses = {name: _bus(file, system, form, name) for name in system.buses}
+    _check_wires(file, system, buses)
     devices = {
         name: _device(file, system, name, form)
         for name in system.devices
@@ -143,6 +149,57 @@ def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> Emul
             got=listen.scheme,
         )
     return EmulatedBus(name, listen, entry.pace)
+
+
+def _anywhere(listen: Endpoint) -> bool:
+    """Whether it is on a port that is free then, which nobody else has."""
+    if listen.is_can:
+        return listen.path.endswith(":0")
+    return listen.scheme != "pty" and listen.port == 0
+
+
+class _Clash(NamedTuple):
+    """Two buses of one wire that cannot be there at once: the second and the first, and the nodes that have one id, if any."""
+
+    buses: tuple[str, str]
+    nodes: tuple[str, str] | None
+    message: str
+    expected: str
+
+
+def _clash(system: System, buses: Mapping[str, EmulatedBus]) -> _Clash | None:
+    """Several CAN buses may be one wire here, and then all nodes of it have ids of their own: two with one id are a fault, and
+    to be put in as one (`duplicate-node`). A port or a socket is of one bus."""
+    wires: dict[Endpoint, str] = {}
+    nodes: dict[tuple[Endpoint, int], str] = {}
+    for name, bus in buses.items():
+        if bus.listen is None or _anywhere(bus.listen):
+            continue  # the plant's, or on a port of its own
+        wire = replace(bus.listen, params=())
+        other = wires.setdefault(wire, name)
+        if other != name and not wire.is_can:
+            said = f"{name!r} listens at {wire}, and so does {other!r}"
+            return _Clash((name, other), None, said, "a place of its own for each bus")
+        for device in system.devices_on(name) if wire.is_can else ():
+            first = nodes.setdefault((wire, device.address), device.name)
+            if first != device.name:
+                other = system.devices[first].bus
+                said = f"{device.name!r} of {name!r} has node id {device.address} at {wire}, and so has {first!r} of {other!r}"
+                return _Clash(
+                    (name, other), (device.name, first), said, "a wire of its own for each bus, or other node ids"
+                )
+    return None
+
+
+def _check_wires(file: YamlFile, system: System, buses: Mapping[str, EmulatedBus]) -> None:
+    clash = _clash(system, buses)
+    if clash is None:
+        return
+    hint = f"{clash.buses[1]!r} is in line {file.line(('buses', clash.buses[1]))}"
+    if clash.nodes is not None:
+        lines = [f"{node!r} in line {system.file.line(('devices', node))}" for node in clash.nodes]
+        hint += f"; of {system.path.name}: {' and '.join(lines)}. Two nodes with one id on purpose: the fault duplicate-node"
+    raise file.error(("buses", clash.buses[0], "listen"), clash.message, expected=clash.expected, hint=hint)
 
 
 def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> EmulatedDevice:

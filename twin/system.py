@@ -61,7 +61,7 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
     known: dict[Path, DeviceProfile] = {}  # a profile that a hundred devices have is read once
     devices = {n: _device(file, n, d, buses, path, profiles, known) for n, d in form.devices.items()}
     buses = connect_pauses(buses, form, devices)
-    _check_addresses(file, devices)
+    _check_addresses(file, buses, devices)
     system = System(
         name=form.system,
         path=path,
@@ -187,16 +187,20 @@ def _writable(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, name
     return tag
 
 
-def _check_addresses(file: YamlFile, devices: dict[str, DeviceConfig]) -> None:
+def _check_addresses(file: YamlFile, buses: dict[str, BusConfig], devices: dict[str, DeviceConfig]) -> None:
+    """Each device of a wire has an address of its own. Two buses on one CAN interface are one wire."""
     taken: dict[tuple[str, int], str] = {}
     for name, device in devices.items():
-        key = (device.bus, device.address)
+        endpoint = buses[device.bus].endpoint
+        key = (str(replace(endpoint, params=())) if endpoint.is_can else device.bus, device.address)
         if key in taken:
-            what = "node" if device.profile.protocol == "canopen" else "unit"
+            what, other = "node" if device.profile.protocol == "canopen" else "unit", taken[key]
+            where = "" if devices[other].bus == device.bus else f" on {devices[other].bus!r}"
             raise file.error(
                 ("devices", name, what),
-                f"{name!r} has {what} {device.address} on {device.bus!r}, and so has {taken[key]!r}",
+                f"{name!r} has {what} {device.address} on {device.bus!r}, and so has {other!r}{where}",
                 expected=f"a {what} id of its own",
+                hint=f"{other!r} is in line {file.line(('devices', other, what))}",
             )
         taken[key] = name
 

@@ -61,14 +61,20 @@ class YamlFile:
     data: dict[str, Any]
     positions: dict[tuple[Key, ...], Position]
 
+    def line(self, loc: tuple[Key, ...]) -> int:
+        """Where `loc` stands, or its nearest parent that does."""
+        return self._place(loc)[0]
+
+    def _place(self, loc: tuple[Key, ...]) -> Position:
+        while loc and loc not in self.positions:
+            loc = loc[:-1]
+        return self.positions.get(loc, (1, 1))
+
     def error(
         self, loc: tuple[Key, ...], message: str, *, expected: str = "", got: str = "", hint: str = ""
     ) -> FileInvalid:
         """A `FileInvalid` at the spot of `loc`, or of its nearest parent that stands in the file."""
-        spot = loc
-        while spot and spot not in self.positions:
-            spot = spot[:-1]
-        line, column = self.positions.get(spot, (1, 1))
+        line, column = self._place(loc)
         return FileInvalid(message, path=self.path, line=line, column=column, expected=expected, got=got, hint=hint)
 
 

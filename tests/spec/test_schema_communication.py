@@ -103,8 +103,8 @@ def test_EmulatedCommunication_goes_both_ways_through_an_EmulatedConnection(tmp_
     endpoint; the emulator's device still hangs on RS232."""
 
     async def main() -> None:
-        _, prototype = observatory()
-        prototype = prototype.with_listen("line1", Endpoint.parse("tcp://127.0.0.1:0"))
+        system, prototype = observatory()
+        prototype = prototype.with_listen(system, "line1", Endpoint.parse("tcp://127.0.0.1:0"))
         async with rig(tmp_path / "a", prototype) as far_side:
             link = Link(Endpoint("pty", path=str(tmp_path / "port")), far_side.field.listening["line1"])
             await link.open()

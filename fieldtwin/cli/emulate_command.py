@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from fieldtwin.cli.options import Secret, pairs, profiles_option
+from fieldtwin.cli.template_question import asking, trust_option
 from fieldtwin.running.field_contact import DEFAULT_CONTROL_PORT
 from gateway.core.errors import UsageError
 from twin.data_files import data_root, find
@@ -73,6 +74,7 @@ from twin.data_files import data_root, find
     help="Whoever connects to --control must know it; needed off loopback. Or in FIELDTWIN_EMULATE_TOKEN.",
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -field.")
+@trust_option
 @profiles_option
 def command(
     what: str,
@@ -89,6 +91,7 @@ def command(
     control: str,
     token: str,
     instance: str,
+    trust: bool,
     profiles: tuple[str, ...],
 ) -> int:
     """Emulate WHAT: a system, a device profile, a recording, or an EDS or DCF file; a bare name is a profile, then a system.
@@ -112,20 +115,24 @@ def command(
                 hint="a system's prototype file says where it listens",
             )
         from fieldtwin.running.field_here import FieldOptions, run_field
+        from fieldtwin.running.template_here import system_file
         from gateway.wallclock import run as run_precise
+
+        file, folders = Path(prototype_file) if prototype_file else None, tuple(Path(p) for p in profiles)
+        agreed = system_file(str(path), asking(trust=trust), prototype_file=file, profiles=folders)
 
         return run_precise(
             run_field(
                 FieldOptions(
-                    system=path,
-                    prototype_file=Path(prototype_file) if prototype_file else None,
+                    system=Path(agreed),
+                    prototype_file=file,
                     recordings=pairs(recordings, "--recording"),
                     speed=speed,
                     listen=pairs(listen, "--listen"),
                     control=control,
                     token=token,
                     instance=instance,
-                    profiles=tuple(Path(p) for p in profiles),
+                    profiles=folders,
                 )
             )
         )
@@ -170,7 +177,11 @@ def command(
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
     """What `what` names: ("system" | "device" | "recording" | "log" | "data sheet", file)."""
+    from twin.template_package import is_template
+
     direct = Path(what)
+    if is_template(direct):
+        return "system", direct
     if direct.suffix.lower() in (".eds", ".dcf"):
         return "data sheet", direct
     if direct.suffix == ".log":

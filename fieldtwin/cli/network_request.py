@@ -24,3 +24,4 @@ class NetworkRequest(NamedTuple):
     seeds: str = ""
     jobs: int = 1
     ledger: str | None = None
+    trust: bool = False

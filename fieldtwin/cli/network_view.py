@@ -19,12 +19,14 @@ from emulators.faults.schema import load_faults
 from fieldtwin.cli.live_view import troubles
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.talk import data, talk
+from fieldtwin.cli.template_question import asking
 from fieldtwin.cli.virtual_view import parse_seeds, progress_bar, run_many, shown_time
 from fieldtwin.running.network_session import NetworkOptions, NetworkSession
 from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import Scripted, script
 from fieldtwin.running.summary import summarise
+from fieldtwin.running.template_here import agree
 from fieldtwin.running.virtual_network_run import VirtualNetworkOptions
 from gateway.core.errors import FieldtwinError, UsageError
 from gateway.wallclock import WallClock
@@ -54,6 +56,8 @@ def run_network(request: NetworkRequest) -> int:
     if not request.virtual and (request.seeds or request.faults == "random"):
         raise UsageError("--seeds and random faults go with --virtual")
     network = load_network(request.path, [Path(p) for p in request.profiles])
+    members = [(member.system, member.prototype.path) for member in network.members.values()]
+    agree(asking(trust=request.trust), request.path, members, beside=request.path, virtual=request.virtual)
     if request.virtual and request.seeds:
         return _many(request, network)
     _print_network(network)

@@ -12,7 +12,9 @@ import click
 from fieldtwin.cli.files import write_text
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import talk
+from fieldtwin.cli.template_question import asking, trust_option
 from gateway.core.errors import UsageError
+from twin.system import System, load_system
 
 instance_option = click.option(
     "--instance", default="", metavar="NAME", help="Which one; default: the only one that runs."
@@ -200,6 +202,14 @@ def why(tag: str, instance: str, as_json: bool) -> int:
     return 0
 
 
+def _agreed(system: str, profiles: tuple[str, ...], *, trust: bool) -> System:
+    """The system of which a program is to be looked at: it is imported, and nothing is opened."""
+    from fieldtwin.running.template_here import system_file
+
+    folders = [Path(p) for p in profiles]
+    return load_system(system_file(system, asking(trust=trust), plant=True, profiles=folders), folders)
+
+
 @command.command("diagram")
 @click.argument("system")
 @click.option(
@@ -208,14 +218,14 @@ def why(tag: str, instance: str, as_json: bool) -> int:
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="Write it there; default: stdout."
 )
+@trust_option
 @profiles_option
-def diagram(system: str, program: str, output: Path | None, profiles: tuple[str, ...]) -> int:
+def diagram(system: str, program: str, output: Path | None, trust: bool, profiles: tuple[str, ...]) -> int:
     """Draw the state table of a program of SYSTEM as SVG."""
     from fieldtwin.running.plc_client import chosen, table_of
     from plc.diagram import svg
-    from twin.system import load_system
 
-    loaded = load_system(system, [Path(p) for p in profiles])
+    loaded = _agreed(system, profiles, trust=trust)
     name, table = chosen(loaded, program, table_of, "a state table")
     drawn = svg(table, f"{loaded.name}: {name}")
     if output is None:
@@ -235,10 +245,17 @@ def diagram(system: str, program: str, output: Path | None, profiles: tuple[str,
     type=click.Path(dir_okay=False, path_type=Path),
     help="Write a counterexample there, as a scenario.",
 )
+@trust_option
 @profiles_option
 @json_option
 def prove(
-    system: str, program: str, max_states: int, output: Path | None, profiles: tuple[str, ...], as_json: bool
+    system: str,
+    program: str,
+    max_states: int,
+    output: Path | None,
+    trust: bool,
+    profiles: tuple[str, ...],
+    as_json: bool,
 ) -> int:
     """Look at every state that a program of SYSTEM can get into, against its invariants.
 
@@ -249,9 +266,8 @@ def prove(
     from fieldtwin.running.counterexample import scenario
     from fieldtwin.running.plc_client import chosen, proof_of
     from plc.prove import prove as look
-    from twin.system import load_system
 
-    loaded = load_system(system, [Path(p) for p in profiles])
+    loaded = _agreed(system, profiles, trust=trust)
     name, proof = chosen(loaded, program, proof_of, "a proof")
     result = look(proof, max_states)
     text = scenario(loaded, name, proof, result) if result.broken else ""

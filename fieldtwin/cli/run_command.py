@@ -16,7 +16,7 @@ import click
 
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
-from fieldtwin.cli.template_question import ask_about
+from fieldtwin.cli.template_question import asking, trust_option
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
@@ -127,9 +127,7 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     default=None,
     help="Instead of a live view, events: as text, JSON lines, or to the journal with fields.",
 )
-@click.option(
-    "--trust", is_flag=True, help="Do not ask about a template's control logic in Python and what its prototype opens."
-)
+@trust_option
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
 @json_option
@@ -188,7 +186,7 @@ def command(
             NetworkRequest(
                 network, virtual, duration_s, seed, instance, profiles,
                 parse_periods(commands) if commands is not None else None, trace, cold, as_json, thread,
-                faults, seeds, jobs, ledger,
+                faults, seeds, jobs, ledger, trust,
             ),
             plant,
             [option for option, said in others.items() if said],
@@ -204,10 +202,11 @@ def command(
         raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
     system = system_file(
         system,
-        lambda template: trust or ask_about(template),
+        asking(trust=trust),
         plant=plant,
         virtual=virtual,
         prototype_file=Path(prototype_file) if prototype_file else None,
+        profiles=[Path(p) for p in profiles],
     )
     if (thread_store or thread_every_s is not None) and not thread:
         raise UsageError("--thread-store and --thread-every go with --thread")

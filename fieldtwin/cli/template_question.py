@@ -8,15 +8,24 @@ import click
 from rich.markup import escape
 
 from fieldtwin.cli.talk import talk
-from fieldtwin.running.template_here import Stranger
+from fieldtwin.running.template_here import Ask, Stranger
 
 SHOWN = 5
+
+trust_option = click.option(
+    "--trust", is_flag=True, help="Do not ask about a template's code in Python and what its prototype opens."
+)
 
 
 def shown(what: tuple[str, ...], between: str = ", ") -> str:
     """The first few, and how many more."""
     more = f"{between}and {len(what) - SHOWN} more" if len(what) > SHOWN else ""
     return escape(between.join(what[:SHOWN])) + more
+
+
+def asking(*, trust: bool) -> Ask:
+    """Who is asked: somebody at the terminal, or nobody, since the answer was given beforehand."""
+    return lambda template: trust or ask_about(template)
 
 
 def ask_about(template: Stranger) -> bool:

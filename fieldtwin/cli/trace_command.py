@@ -11,6 +11,7 @@ import click
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.regression_options import tolerance_options
 from fieldtwin.cli.talk import talk
+from fieldtwin.cli.template_question import asking, trust_option
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Decoded, Exchange
 from fieldtwin.decoding.trace_file import read_events
@@ -42,6 +43,7 @@ NS_PER_S = 1_000_000_000
 )
 @tolerance_options
 @click.option("--vcd", type=click.Path(path_type=Path), help="Write waveforms (IEEE 1364) for GTKWave instead.")
+@trust_option
 @json_option
 def command(
     file: Path,
@@ -52,6 +54,7 @@ def command(
     end_s: float | None,
     problems: bool,
     vcd: Path | None,
+    trust: bool,
     against: Path | None,
     as_scenario: Path | None,
     seed: int | None,
@@ -71,9 +74,12 @@ def command(
 
     Another run is compared by what it means: states and their order, values, qualities, latencies; never byte by byte.
     """
+    from fieldtwin.running.template_here import system_file
     from twin.system import load_system
 
-    plant = load_system(system, [Path(p) for p in profiles])
+    folders = [Path(p) for p in profiles]
+    agreed = asking(trust=trust or vcd is None)  # waveforms alone look at what programs are: they are imported for that
+    plant = load_system(system_file(system, agreed, plant=True, profiles=folders), folders)
     if against is not None or as_scenario is not None:
         from fieldtwin.cli import regression_view
 

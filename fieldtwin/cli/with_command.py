@@ -10,6 +10,7 @@ from rich.markup import escape
 
 from fieldtwin.cli.options import pairs, profiles_option
 from fieldtwin.cli.talk import talk
+from fieldtwin.cli.template_question import asking, trust_option
 from gateway.core.errors import UsageError
 
 LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "_CHANNEL")
@@ -28,6 +29,7 @@ LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "
 @click.option("--faults", default="", metavar="FILE", help="Put these faults in (fieldtwin faults).")
 @click.option("--instance", default="", help="Name of a run directory that stays; default: one that is removed.")
 @click.option("--quiet", is_flag=True, help="Do not print the environment.")
+@trust_option
 @profiles_option
 def command(
     system: str,
@@ -39,9 +41,10 @@ def command(
     faults: str,
     instance: str,
     quiet: bool,
+    trust: bool,
     profiles: tuple[str, ...],
 ) -> int:
-    """Run CMD against the emulated field of SYSTEM, and end with CMD's exit status.
+    """Run CMD against the emulated field of SYSTEM, or of a template, and end with CMD's exit status.
 
     No gateway and no PLC of ours: CMD is the control program, or the test suite of one. It finds the field in its environment,
     by the names of the buses: FIELDTWIN_LINE1 is a path, HOST:PORT or a CAN channel; options come before SYSTEM.
@@ -52,6 +55,7 @@ def command(
 
     A signal that ends CMD is 128 and its number, as in a shell. When the field side dies under a CMD that says 0, so does this.
     """
+    from fieldtwin.running.template_here import system_file
     from fieldtwin.running.with_field import run_with
     from gateway.wallclock import run
     from twin.field_process import FieldConfig
@@ -60,7 +64,9 @@ def command(
     words = argv[1:] if argv[:1] == ("--",) else argv
     if not words:
         raise UsageError("with needs a command", expected=f"fieldtwin with {system} -- CMD [ARG]...")
-    loaded = load_system(system, [Path(p) for p in profiles])
+    folders = [Path(p) for p in profiles]
+    file = Path(prototype_file) if prototype_file else None
+    loaded = load_system(system_file(system, asking(trust=trust), prototype_file=file, profiles=folders), folders)
     config = FieldConfig(
         system=str(loaded.path.resolve()),
         run_dir="",

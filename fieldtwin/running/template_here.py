@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from gateway.core.errors import NotAllowed
-from twin.data_files import template_of
+from gateway.core.errors import NotAllowed, UsageError
+from twin.data_files import find, template_of
 from twin.instance import runtime_root
 from twin.system import System, load_system
-from twin.template import is_code
+from twin.template import MANIFEST, MAX_MANIFEST_BYTES, is_code
+from twin.template_pack import OUR_PROGRAMS
 from twin.template_package import FolderPackage, Package, is_template, names_below, open_package, unpack
 
 
@@ -29,41 +30,125 @@ Ask = Callable[[Stranger], bool]
 
 
 def system_file(
-    name: str, ask: Ask, *, plant: bool = False, virtual: bool = False, prototype_file: Path | None = None
+    name: str,
+    ask: Ask,
+    *,
+    plant: bool = False,
+    virtual: bool = False,
+    prototype_file: Path | None = None,
+    profiles: Iterable[Path] = (),
 ) -> str:
     """`name` as it is, unless it is a template: then the system file in it, verified, and in a folder on this computer.
 
     A zip is unpacked once, into the folder where runs live, under its id. A `plant` has no use for the prototype in it, and in
     `virtual` time nothing is opened. A file inside of an unpacked template is asked about as the template is, and not verified:
-    its owner may be at work on it. Raises `NotAllowed` when `ask` says no, `FileInvalid` when it is not what was packed.
+    its owner may be at work on it. So is a prototype file that is inside of one. Raises `NotAllowed` when `ask` says no,
+    `FileInvalid` when it is not what was packed.
     """
-    path = Path(name)
-    if is_template(path):
-        with open_package(path) as package:
-            folder = path if path.is_dir() else _unpacked(package)
-        here = FolderPackage(folder)
-        here.verify()
-        from twin.template_check import examine  # where a template is there to examine, what reads it is installed
-
-        system = examine(folder, here.manifest, plant=plant)
-        code, file = here.code, str(folder / here.manifest.system_file)
-    elif path.is_file() and (inside := template_of(path.resolve())):
-        system = load_system(name)
-        code, file = tuple(found for found in names_below(inside[0]) if is_code(found)), name
-    else:
+    path, profiles = Path(name), tuple(profiles)
+    if not is_template(path):
+        try:
+            found = find("systems", name, extra=profiles)
+        except UsageError:
+            return name  # whoever reads it says what is wrong with it
+        if _templates_above(found, prototype_file):
+            agree(ask, path, [(load_system(name, profiles), prototype_file)], plant=plant, virtual=virtual)
         return name
-    reaches = () if plant or virtual else _reach(system, prototype_file)
-    if (code or reaches) and not ask(Stranger(path, code, reaches)):
-        raise NotAllowed("nothing of this template was run", where=str(path), hint="--trust says yes beforehand")
-    return file
+    with open_package(path) as package:
+        folder = path if path.is_dir() else _unpacked(package)
+    here = FolderPackage(folder)
+    here.verify()
+    from twin.template_check import examine  # where a template is there to examine, what reads it is installed
+
+    system = examine(folder, here.manifest, plant=plant)
+    agree(ask, path, [(system, prototype_file)], plant=plant, virtual=virtual)
+    return str(folder / here.manifest.system_file)
 
 
-def _reach(system: System, prototype_file: Path | None) -> tuple[str, ...]:
-    from twin.prototype_file import load_prototype, prototype_path  # a plant has no emulators installed
+def agree(
+    ask: Ask,
+    shown: Path,
+    systems: Iterable[tuple[System, Path | None]],
+    *,
+    beside: Path | None = None,
+    opens: Iterable[str] = (),
+    plant: bool = False,
+    virtual: bool = False,
+) -> None:
+    """The one place where a stranger's files are agreed to: `ask` once about everything that is inside of unpacked templates.
+
+    Each of `systems` is with its prototype file, None: the one beside it. `beside` is a file that names them, a scenario's or a
+    network's, and `opens` what it opens itself, if it is a stranger's. Nothing is asked where all of it is one's own. Call it
+    before anything of them is run: putting a process image together imports programs. Raises `NotAllowed`.
+    """
+    code: dict[str, None] = {}
+    reaches: dict[str, None] = {}
+    for system, said in systems:
+        file = None if plant else said or _beside(system)
+        folders = _templates_above(system.path, file, beside)
+        for folder in folders:
+            code |= dict.fromkeys(name for name in names_below(folder) if is_code(name))
+        if folders:
+            code |= dict.fromkeys(_elsewhere(system))
+        if folders and file is not None:
+            said_there, uses = _of_prototype(system, file, folders)
+            code |= dict.fromkeys(said_there)
+            reaches |= dict.fromkeys(() if virtual else uses)
+    if beside is not None and _templates_above(beside):
+        reaches |= dict.fromkeys(opens)
+    if (code or reaches) and not ask(Stranger(shown, tuple(code), tuple(reaches))):
+        raise NotAllowed("nothing of this template was run", where=str(shown), hint="--trust says yes beforehand")
+
+
+def _templates_above(*files: Path | None) -> list[Path]:
+    """The folders of the templates that these files are in, however deep."""
+    found: dict[Path, None] = {}
+    for file in files:
+        if file is not None and file.is_file():
+            near = file.resolve()
+            found |= dict.fromkeys([*template_of(near), *(folder for folder in near.parents if _is_unpacked(folder))])
+    return list(found)
+
+
+def _is_unpacked(folder: Path) -> bool:
+    try:
+        with (folder / MANIFEST).open("rb") as file:
+            return b'"fieldtwin_template"' in file.read(MAX_MANIFEST_BYTES)
+    except OSError:
+        return False
+
+
+def _elsewhere(system: System) -> tuple[str, ...]:
+    """Programs in Python that are neither ours nor in the template: what of this computer they are, nobody looked at. A template
+    as it was packed has none."""
+    sources = [form.source.partition(":") for form in system.plc.programs.values()]
+    modules = [rest.strip().partition(":")[0].strip() for kind, _, rest in sources if kind.strip() == "python"]
+    return tuple(
+        f"the module {name}"
+        for name in modules
+        if (top := name.partition(".")[0]) != OUR_PROGRAMS
+        and not (system.path.parent / f"{top}.py").is_file()
+        and not (system.path.parent / top).is_dir()
+    )
+
+
+def _beside(system: System) -> Path | None:
+    from twin.prototype_file import prototype_path  # a plant has no emulators installed
+
+    file = prototype_path(system)
+    return file if file.is_file() else None
+
+
+def _of_prototype(system: System, file: Path, folders: Iterable[Path]) -> tuple[list[str], tuple[str, ...]]:
+    """Simulations in Python from outside of the templates, and what of this computer the prototype uses."""
+    from twin.prototype_file import load_prototype
     from twin.template_reach import reach
 
-    file = prototype_file or prototype_path(system)
-    return reach(system, load_prototype(system, file)) if file.is_file() else ()
+    prototype = load_prototype(system, file)
+    named = [form.python.rpartition(":")[0] for form in prototype.form.simulations.values() if form.python is not None]
+    sources = [(file.parent / name).resolve() for name in named]
+    outside = [str(source) for source in sources if not any(source.is_relative_to(folder) for folder in folders)]
+    return outside, reach(system, prototype)
 
 
 def _unpacked(package: Package) -> Path:

@@ -38,7 +38,7 @@ class ShadowTalk:
             return
         if verdict.finding == "agree":
             self._states[verdict.subject] = verdict.text
-        when = datetime.fromtimestamp(verdict.t_ms / 1000, UTC).strftime("%H:%M:%S.%f")[:-3]
+        when = _clock(datetime.fromtimestamp(verdict.t_ms / 1000, UTC))
         style = STYLE.get(verdict.finding, "")
         word = f"[{style}]{verdict.finding:10}[/]" if style else f"{verdict.finding:10}"
         subject = f"{verdict.subject}: " if not verdict.text.startswith(verdict.subject) else ""
@@ -47,8 +47,16 @@ class ShadowTalk:
     def trouble(self, where: str, text: str) -> None:
         """What is wrong with thread or store, once, and that it is over."""
         if not self._quiet:
-            when = datetime.now(UTC).strftime("%H:%M:%S.%f")[:-3]
-            talk.print(f"{when} [bold yellow]{where:10}[/] {escape(text or 'all is well again')}", soft_wrap=True)
+            self.line(f"[bold yellow]{where:10}[/]", text or "all is well again")
+
+    def line(self, word: str, text: str) -> None:
+        """Something of now, under a word as it is to be shown."""
+        talk.print(f"{_clock(datetime.now(UTC))} {word} {escape(text)}", soft_wrap=True)
+
+
+def _clock(when: datetime) -> str:
+    """The time of day, UTC, to the millisecond."""
+    return when.strftime("%H:%M:%S.%f")[:-3]
 
 
 @click.command("shadow")
@@ -87,7 +95,7 @@ def command(
     else:
         print_shadow(seen)
     if not seen["origins"]:
-        raise Unreachable(f"the plant's thread: {why_nothing(seen)}", where=place)
+        raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
     return 0 if seen["agreed"] == seen["statuses"] else 1
 
 
@@ -106,10 +114,11 @@ async def _run(
     return shadowing.describe()
 
 
-def why_nothing(seen: dict[str, Any]) -> str:
-    """Of a shadow that was told nothing of its plant."""
+def why_nothing(seen: dict[str, Any], place: str) -> str:
+    """Of a shadow that was told nothing of its plant, which is at `place`: that need not be said twice."""
     thread = seen["thread"]
-    return str(thread.get("trouble") or thread.get("silent") or "no word of its log came")
+    why = str(thread.get("trouble") or thread.get("silent") or "no word of its log came")
+    return why.removeprefix(f"{place}: ")
 
 
 def told_of(variables: dict[str, Any], undeclared: int) -> str:

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.shadow_command import ShadowTalk, print_shadow, why_nothing
 from fieldtwin.cli.talk import talk
-from fieldtwin.cli.template_question import ask_about
+from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.running.shadowing import limits_of
 from fieldtwin.running.template_here import system_file
 from fieldtwin.running.twin_rules import Plans, PythonPlanner, load_planner, questions_of
@@ -63,7 +62,7 @@ from twin.system import System, load_system
     "--for", "duration_s", type=Duration(), default=0.0, help="Stop after a time such as 20s; default: run on."
 )
 @click.option("--instance", default="", help="Name of the run directory; default: the system's name and -twin.")
-@click.option("--trust", is_flag=True, help="Do not ask about a template's control logic in Python.")
+@trust_option
 @profiles_option
 @json_option
 def command(
@@ -91,7 +90,8 @@ def command(
     """
     folders = tuple(Path(p) for p in profiles)
     runs_code = bool(horizon_s or planner)  # what a prototype or a planner in Python needs of a template
-    system = system_file(system, lambda template: trust or not runs_code or ask_about(template), virtual=True)
+    agreed = consent(trust=trust or not runs_code)
+    system = system_file(system, agreed, virtual=True, prototype_file=prototype_file, profiles=folders)
     loaded = load_system(system, folders)
     plans = load_planner(planner, loaded) if planner else Plans(RulePlanner(()), limits=limits_of(loaded))
     question = _question(horizon_s, require, finally_) or plans.question
@@ -123,7 +123,7 @@ def command(
         counts = f"{seen['planned']} planned{asked}, {seen['sent']} sent, {seen['refused']} refused{there}"
         talk.print(f"  commands   {counts}", soft_wrap=True)
     if not seen["origins"]:
-        raise Unreachable(f"the plant's thread: {why_nothing(seen)}", where=place)
+        raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
     return 0 if seen["agreed"] == seen["statuses"] else 1
 
 
@@ -141,7 +141,7 @@ class TwinTalk(ShadowTalk):
 
     def _say(self, word: str, text: str) -> None:
         if not self._quiet:
-            talk.print(f"             {word:10} {escape(text)}", soft_wrap=True)
+            self.line(f"{word:10}", text)
 
 
 def _question(horizon_s: float, require: tuple[str, ...], finally_: tuple[str, ...]) -> Question | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from fieldtwin.cli.options import Secret, pairs, profiles_option
-from fieldtwin.cli.template_question import asking, trust_option
+from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.running.field_contact import DEFAULT_CONTROL_PORT
 from gateway.core.errors import UsageError
 from twin.data_files import data_root, find
@@ -119,7 +119,7 @@ def command(
         from gateway.wallclock import run as run_precise
 
         file, folders = Path(prototype_file) if prototype_file else None, tuple(Path(p) for p in profiles)
-        agreed = system_file(str(path), asking(trust=trust), prototype_file=file, profiles=folders)
+        agreed = system_file(str(path), consent(trust=trust), prototype_file=file, profiles=folders)
 
         return run_precise(
             run_field(

@@ -19,7 +19,7 @@ from emulators.faults.schema import load_faults
 from fieldtwin.cli.live_view import troubles
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.talk import data, talk
-from fieldtwin.cli.template_question import asking
+from fieldtwin.cli.template_question import consent
 from fieldtwin.cli.virtual_view import parse_seeds, progress_bar, run_many, shown_time
 from fieldtwin.running.network_session import NetworkOptions, NetworkSession
 from fieldtwin.running.network_summary import summarise_network
@@ -57,7 +57,7 @@ def run_network(request: NetworkRequest) -> int:
         raise UsageError("--seeds and random faults go with --virtual")
     network = load_network(request.path, [Path(p) for p in request.profiles])
     members = [(member.system, member.prototype.path) for member in network.members.values()]
-    agree(asking(trust=request.trust), request.path, members, beside=request.path, virtual=request.virtual)
+    agree(consent(trust=request.trust), request.path, members, beside=request.path, virtual=request.virtual)
     if request.virtual and request.seeds:
         return _many(request, network)
     _print_network(network)

@@ -12,7 +12,7 @@ import click
 from fieldtwin.cli.files import write_text
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import talk
-from fieldtwin.cli.template_question import asking, trust_option
+from fieldtwin.cli.template_question import consent, trust_option
 from gateway.core.errors import UsageError
 from twin.system import System, load_system
 
@@ -207,7 +207,7 @@ def _agreed(system: str, profiles: tuple[str, ...], *, trust: bool) -> System:
     from fieldtwin.running.template_here import system_file
 
     folders = [Path(p) for p in profiles]
-    return load_system(system_file(system, asking(trust=trust), plant=True, profiles=folders), folders)
+    return load_system(system_file(system, consent(trust=trust), plant=True, profiles=folders), folders)
 
 
 @command.command("diagram")

@@ -16,7 +16,7 @@ import click
 
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
-from fieldtwin.cli.template_question import asking, trust_option
+from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
@@ -202,7 +202,7 @@ def command(
         raise UsageError("--allow-writes is for --plant", hint="a prototype's emulators may be written to anyway")
     system = system_file(
         system,
-        asking(trust=trust),
+        consent(trust=trust),
         plant=plant,
         virtual=virtual,
         prototype_file=Path(prototype_file) if prototype_file else None,

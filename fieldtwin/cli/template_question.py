@@ -23,7 +23,7 @@ def shown(what: tuple[str, ...], between: str = ", ") -> str:
     return escape(between.join(what[:SHOWN])) + more
 
 
-def asking(*, trust: bool) -> Ask:
+def consent(*, trust: bool) -> Ask:
     """Who is asked: somebody at the terminal, or nobody, since the answer was given beforehand."""
     return lambda template: trust or ask_about(template)
 

@@ -15,6 +15,7 @@ from rich.table import Table
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import Secret, json_option, profiles_option
 from fieldtwin.cli.talk import data
+from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.conformance.case import Danger
 from gateway.core.errors import UsageError
 
@@ -66,6 +67,7 @@ _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "
 @click.option(
     "--trace", type=click.Path(dir_okay=False), help="Every event of a single scenario to this file (JSON lines)."
 )
+@trust_option
 @profiles_option
 @json_option
 def command(
@@ -83,6 +85,7 @@ def command(
     junit: str | None,
     html: str | None,
     trace: str | None,
+    trust: bool,
     profiles: tuple[str, ...],
     as_json: bool,
 ) -> int:
@@ -98,6 +101,7 @@ def command(
     from fieldtwin.conformance.waivers import Waivers, load_waivers
     from fieldtwin.report.model import Report, ScenarioResult
     from fieldtwin.running.scenario_targets import Target, run_scenario
+    from fieldtwin.running.template_scenarios import agree_to_scenario
     from fieldtwin.scenarios.form import load_scenario
     from fieldtwin.scenarios.waiving import all_well, ids_of, waive
 
@@ -105,7 +109,10 @@ def command(
     if trace and len(paths) != 1:
         raise UsageError("--trace belongs to one scenario", got=f"{len(paths)} of them")
     _check(target, allow, instance, far, capture, can)
-    scenarios = [load_scenario(path, tuple(map(Path, profiles))) for path in paths]
+    folders = tuple(map(Path, profiles))
+    for path in paths:
+        agree_to_scenario(consent(trust=trust), path, folders, plant=target == "real", virtual=target == "virtual")
+    scenarios = [load_scenario(path, folders) for path in paths]
     known = [id for one in scenarios for id in ids_of(one.path, one.form.scenario)]
     waived = load_waivers(Path(waivers), known) if waivers else Waivers()
     where = Target(

@@ -11,7 +11,7 @@ import click
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.regression_options import tolerance_options
 from fieldtwin.cli.talk import talk
-from fieldtwin.cli.template_question import asking, trust_option
+from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Decoded, Exchange
 from fieldtwin.decoding.trace_file import read_events
@@ -78,7 +78,9 @@ def command(
     from twin.system import load_system
 
     folders = [Path(p) for p in profiles]
-    agreed = asking(trust=trust or vcd is None)  # waveforms alone look at what programs are: they are imported for that
+    agreed = consent(
+        trust=trust or vcd is None
+    )  # waveforms alone look at what programs are: they are imported for that
     plant = load_system(system_file(system, agreed, plant=True, profiles=folders), folders)
     if against is not None or as_scenario is not None:
         from fieldtwin.cli import regression_view

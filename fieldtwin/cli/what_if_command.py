@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.talk import data, talk
-from fieldtwin.cli.template_question import ask_about
+from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.cli.what_if_view import show
 from fieldtwin.running.template_here import system_file
 from fieldtwin.whatif.state import KnownState
@@ -38,7 +38,7 @@ from gateway.core.errors import FileInvalid, UsageError
 @click.option("--seed", type=int, help="Instead of the prototype file's.")
 @click.option("--prototype-file", type=click.Path(path_type=Path), help="Instead of the one beside the system file.")
 @click.option("--save-state", type=click.Path(path_type=Path), help="Write what is known to a file, and end.")
-@click.option("--trust", is_flag=True, help="Do not ask about a template's control logic in Python.")
+@trust_option
 @profiles_option
 @json_option
 def command(
@@ -77,8 +77,9 @@ def command(
         system = system or (str(beside) if beside.exists() else named)
     if system is None:
         raise UsageError("which system?", expected="SYSTEM, or --plans FILE which names it")
-    system = system_file(system, lambda template: trust or ask_about(template), virtual=True)
     folders = tuple(Path(p) for p in profiles)
+    agreed = consent(trust=trust)
+    system = system_file(system, agreed, virtual=True, prototype_file=prototype_file, profiles=folders)
     loaded = load_system(system, folders)
     state = _state(source, origin, system, folders)
     if save_state is not None:

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from fieldtwin.cli.options import pairs, profiles_option
 from fieldtwin.cli.talk import talk
-from fieldtwin.cli.template_question import asking, trust_option
+from fieldtwin.cli.template_question import consent, trust_option
 from gateway.core.errors import UsageError
 
 LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "_CHANNEL")
@@ -66,7 +66,7 @@ def command(
         raise UsageError("with needs a command", expected=f"fieldtwin with {system} -- CMD [ARG]...")
     folders = [Path(p) for p in profiles]
     file = Path(prototype_file) if prototype_file else None
-    loaded = load_system(system_file(system, asking(trust=trust), prototype_file=file, profiles=folders), folders)
+    loaded = load_system(system_file(system, consent(trust=trust), prototype_file=file, profiles=folders), folders)
     config = FieldConfig(
         system=str(loaded.path.resolve()),
         run_dir="",

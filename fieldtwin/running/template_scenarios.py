@@ -1,0 +1,53 @@
+"""Scenarios that are a stranger's, or are about a stranger's system: who runs them is asked first, as about a template.
+
+It looks at what a scenario names and no further: reading it whole puts the process image of its system together, and that
+imports programs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.running.template_here import Ask, agree
+from gateway.core.errors import FieldtwinError
+from gateway.core.yaml_file import load
+from twin.data_files import network_file
+from twin.system import System, load_system
+
+
+def agree_to_scenario(
+    ask: Ask, path: Path, profiles: Iterable[Path] = (), *, plant: bool = False, virtual: bool = False
+) -> None:
+    """Ask about the system or network of the scenario in `path`, and its probes, where they are inside of a template.
+
+    `plant`: the run has no prototype; `virtual`: it opens nothing. What cannot be read is left to whoever reads it next. Raises
+    `NotAllowed`.
+    """
+    profiles = tuple(profiles)
+    try:
+        said: Mapping[str, Any] = load(path).data
+        systems = _systems(path, said, profiles)
+    except FieldtwinError:
+        return
+    agree(ask, path, systems, beside=path, opens=() if virtual else _opens(said), plant=plant, virtual=virtual)
+
+
+def _systems(path: Path, said: Mapping[str, Any], profiles: tuple[Path, ...]) -> list[tuple[System, Path | None]]:
+    """As `fieldtwin.scenarios.form` finds them: beside it, or shipped. A network's are all of its members'."""
+    name, prototype = str(said.get("system", "")), said.get("prototype")
+    beside = path.parent / name
+    named = str(beside) if beside.exists() else name.removesuffix(".yaml")
+    if (at := network_file(named, profiles)) is not None:
+        from twin.network import load_network  # takes emulators, as a plant does not
+
+        return [(member.system, member.prototype.path) for member in load_network(at, profiles).members.values()]
+    return [(load_system(named, profiles), path.parent / prototype if isinstance(prototype, str) else None)]
+
+
+def _opens(said: Mapping[str, Any]) -> list[str]:
+    probes = said.get("probes")
+    entries = probes.items() if isinstance(probes, Mapping) else ()
+    asked = [(name, e["endpoint"]) for name, e in entries if isinstance(e, Mapping) and e.get("endpoint")]
+    return [f"it asks {endpoint} (probe {name})" for name, endpoint in asked]

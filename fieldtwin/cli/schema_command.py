@@ -43,7 +43,7 @@ def _faults() -> dict[str, Any]:
 def _scenario() -> dict[str, Any]:
     """The faults of its steps are those of fault files."""
     from emulators.faults.json_schema import fault_defs
-    from fieldtwin.scenarios.form import ScenarioForm
+    from fieldtwin.scenarios.words import ScenarioForm
 
     schema = ScenarioForm.model_json_schema()
     schema["$defs"] |= fault_defs()

@@ -11,7 +11,8 @@ from typing import Any
 
 from fieldtwin.conformance.case import Danger
 from fieldtwin.report.model import ScenarioResult, Verdict
-from fieldtwin.scenarios.form import Scenario, Step, word_of
+from fieldtwin.scenarios.form import Scenario
+from fieldtwin.scenarios.words import Step, word_of
 
 SUFFIX = ".scenario.yaml"
 ROLE = "controller"

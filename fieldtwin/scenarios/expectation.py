@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from emulators.faults.schema import seconds
 from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.scenarios.bench import Bench, Reading
-from fieldtwin.scenarios.form import Bounds, Expect
+from fieldtwin.scenarios.words import Bounds, Expect
 from gateway.devices.codec import decode, decode_little
 from twin.system import System
 

@@ -90,6 +90,11 @@ class Expression:
         """Its value now. What compares with something unknown is False, but `!=`, which is True."""
         return _value(self._tree, look)
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether it looks at nothing, and so is always the same."""
+        return not any(isinstance(node, ast.Name | ast.Attribute | ast.Call) for node in ast.walk(self._tree))
+
     def _column(self, at: int) -> int:
         """Where in `text` stands what is at character `at` of what Python's parser got."""
         grown = 0

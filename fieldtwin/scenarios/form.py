@@ -1,4 +1,4 @@
-"""The scenario file as it is written: strict, every error with file, line, column and the nearest known word."""
+"""A scenario file, read and checked against its system: every error with file, line, column and the nearest known word."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
-
-from pydantic import BaseModel, ConfigDict, Field
 
 from emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.expression import QUALITIES, Expression, NotUnderstood
-from fieldtwin.scenarios.probe_form import Probe, ProbeForm, read_probe
+from fieldtwin.scenarios.probe_form import Probe, read_probe
+from fieldtwin.scenarios.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.data_files import network_file
@@ -21,127 +19,6 @@ from twin.fault_aims import target
 from twin.network import Network, load_network
 from twin.network_faults import check_network_fault
 from twin.system import System, load_system
-
-Time = str | float | int
-Number = float | int
-
-
-class _Form(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, populate_by_name=True)
-
-
-class Send(_Form):
-    """The far end commands a period."""
-
-    from_: str = Field(default="shore", alias="from")
-    period_s: int
-
-
-class Set(_Form):
-    """A device holds a value: DEVICE.TAG; null: what it says by itself again."""
-
-    tag: str
-    value: Number | bool | str | None
-
-
-class Wait(_Form):
-    until: str
-    within: Time = 5
-
-
-class Bounds(_Form):
-    min: Number | None = None
-    max: Number | None = None
-
-
-class WireForm(_Form):
-    """What is seen on a device's wire."""
-
-    wire: str
-    access: Literal["read", "write"] | None = None
-    function: int | None = None
-    register_: str | None = Field(default=None, alias="register")
-    value: Number | None = None
-    unless: str | None = None
-
-
-class Expect(_Form):
-    """One thing that must be so. `tag` and its kin, or `wire` and its kin, or `that`."""
-
-    tag: str | None = None
-    value: Number | bool | str | None = None
-    tolerance: Number = 0
-    quality: str | None = None
-    like: Literal["recording"] | None = None
-    updates_per_s: tuple[Number, Number] | list[Number] | None = None
-    wire: str | None = None
-    access: Literal["read", "write"] | None = None
-    function: int | None = None
-    register_: str | None = Field(default=None, alias="register")
-    times: int | Bounds | None = None
-    requests_per_s: Bounds | None = None
-    that: str | None = None
-    within: Time | None = None
-    during: Time | None = None
-
-
-class Step(_Form):
-    """One of these."""
-
-    send: Send | None = None
-    set: Set | None = None
-    fault: dict[str, Any] | None = None
-    clear: str | None = None
-    wait: Wait | None = None
-    expect: Expect | None = None
-    pause: Time | None = None
-
-
-class Within(_Form):
-    """Each time that `after` becomes true, `then` is so `within` a time."""
-
-    after: str
-    then: str
-    within: Time
-
-
-class Rate(_Form):
-    """How often a tag is published, or a device asked, in any stretch of `over`; `while` says when it counts."""
-
-    tag: str | None = None
-    updates_per_s: Bounds | None = None
-    wire: str | None = None
-    requests_per_s: Bounds | None = None
-    over: Time = 10
-    while_: str | None = Field(default=None, alias="while")
-
-
-class Cycle(_Form):
-    """How far apart the changes of a tag or variable are; or, without one, how late a scan of the PLC may begin."""
-
-    changes_of: str | None = None
-    min: Time | None = None
-    max: Time | None = None
-    late: Time | None = None
-    while_: str | None = Field(default=None, alias="while")
-
-
-class ScenarioForm(_Form):
-    scenario: str = Field(min_length=1, max_length=200)
-    about: str = ""
-    requirements: list[str] = []
-    system: str
-    prototype: str | None = None
-    seed: int | None = None
-    needs: list[str] = []
-    always: list[str] = []
-    never: list[str | WireForm] = []
-    within: list[Within] = []
-    rate: list[Rate] = []
-    cycle: list[Cycle] = []
-    probes: dict[str, ProbeForm] = {}
-    steps: list[Step] = Field(min_length=1, max_length=10_000)
-
 
 _TOGETHER = {
     "tag": ("tag", "value", "tolerance", "quality", "like", "within", "during"),
@@ -151,7 +28,6 @@ _TOGETHER = {
     "that": ("that", "within", "during"),
 }
 """The keys of an expectation, by what it is about."""
-WORDS = ("send", "set", "fault", "clear", "wait", "expect", "pause")
 
 
 @dataclass(frozen=True)
@@ -226,14 +102,10 @@ def names_of(system: System, network: Network | None = None) -> dict[str, tuple[
     return names
 
 
-def word_of(step: Step) -> str:
-    """Which of the words a step is."""
-    return next(word for word in WORDS if getattr(step, word) is not None)
-
-
 def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
     """Read and check. Raises `FileInvalid`, `UsageError`."""
     file = load(path)
+    _check_one_thing(file)
     form = validate(file, ScenarioForm)
     system, network = _system(file, form, profiles)
     served = [one.name for one in system.serving.serve]
@@ -258,16 +130,14 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
         profiles,
         network,
     )
-    always = tuple(scenario.expression(text, "always", n) for n, text in enumerate(form.always))
+    always = tuple(_looks(scenario, text, ("always", n)) for n, text in enumerate(form.always))
     never: list[Expression | WireForm] = []
     for n, one in enumerate(form.never):
         if isinstance(one, str):
-            never.append(scenario.expression(one, "never", n))
+            never.append(_looks(scenario, one, ("never", n)))
         else:
             _known(file, ("never", n, "wire"), "device", one.wire, list(system.devices))
-            if one.register_ is not None:
-                tags = list(system.devices[one.wire].profile.tags)
-                _known(file, ("never", n, "register"), f"tag of {one.wire}", one.register_, tags)
+            _check_register(scenario, one.wire, one.register_, one.value, ("never", n))
             if one.unless is not None:
                 scenario.expression(one.unless, "never", n, "unless")
             never.append(one)
@@ -281,6 +151,15 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
         if step.clear is not None:
             _known(file, ("steps", n, "clear"), "fault of an earlier step", step.clear, faults)
     return scenario
+
+
+def _check_one_thing(file: YamlFile) -> None:
+    """Each step one of the words, before their contents are looked at: two of them are a hyphen forgotten."""
+    steps = file.data.get("steps")
+    for n, step in enumerate(steps if isinstance(steps, list) else ()):
+        said = [word for word in step if word in WORDS] if isinstance(step, dict) else []
+        if len(said) > 1:
+            raise file.error(("steps", n), "a step is one thing", expected=" or ".join(WORDS), got=", ".join(said))
 
 
 def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> tuple[System, Network | None]:
@@ -341,10 +220,10 @@ def _check_step(scenario: Scenario, step: Step, n: int) -> None:
             spec = parse_fault(step.fault, file, (*loc, "fault"), n + 1)
             checked(lambda one: _aim(scenario, one), spec, file, (*loc, "fault"))
         if step.wait is not None:
-            scenario.expression(step.wait.until, *loc, "wait", "until")
-            seconds(step.wait.within)
+            _looks(scenario, step.wait.until, (*loc, "wait", "until"))
+            _time(file, (*loc, "wait", "within"), step.wait.within)
         if step.pause is not None:
-            seconds(step.pause)
+            _time(file, (*loc, "pause"), step.pause)
         if step.set is not None:
             _check_set(scenario, step.set, (*loc, "set"))
         if step.expect is not None:
@@ -394,6 +273,7 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
             )
     if kind in ("rate", "updates") and expect.during is None:
         raise scenario.file.error(loc, "a rate is one of some time", expected="during: 10s")
+    _check_numbers(scenario.file, expect, loc)
     if expect.quality is not None:
         _known(scenario.file, (*loc, "quality"), "quality", expect.quality, QUALITIES)
     if expect.like is not None and (expect.tag or "").rpartition(".")[0] not in scenario.system.devices:
@@ -407,21 +287,58 @@ def _check_expect(scenario: Scenario, expect: Expect, loc: tuple[Key, ...]) -> N
     if expect.wire is not None:
         devices = scenario.system.devices
         _known(scenario.file, (*loc, "wire"), "device", expect.wire, list(devices))
-        if expect.register_ is not None:
-            _known(scenario.file, (*loc, "register"), "tag", expect.register_, list(devices[expect.wire].profile.tags))
+        _check_register(scenario, expect.wire, expect.register_, expect.value, loc)
     if expect.that is not None:
-        scenario.expression(expect.that, *loc, "that")
-    for time in (expect.within, expect.during):
-        if time is not None:
-            seconds(time)
+        _looks(scenario, expect.that, (*loc, "that"))
+
+
+def _check_register(scenario: Scenario, device: str, register: str | None, value: object, loc: tuple[Key, ...]) -> None:
+    """A tag of the device, which a value needs: of no register it is never seen."""
+    if register is not None:
+        tags = list(scenario.system.devices[device].profile.tags)
+        _known(scenario.file, (*loc, "register"), f"tag of {device}", register, tags)
+    elif value is not None:
+        raise scenario.file.error((*loc, "value"), "a value of which register?", expected="register: TAG")
+
+
+def _check_numbers(file: YamlFile, expect: Expect, loc: tuple[Key, ...]) -> None:
+    """Times, and bounds that something can be within, and something not."""
+    if expect.during is not None and _time(file, (*loc, "during"), expect.during) <= 0:
+        raise file.error((*loc, "during"), "what is looked at for no time is not seen", expected="during: 10s")
+    if expect.within is not None:
+        _time(file, (*loc, "within"), expect.within)
+    _check_bounds(file, (*loc, "requests_per_s"), expect.requests_per_s)
+    _check_bounds(file, (*loc, "times"), expect.times if isinstance(expect.times, Bounds) else None)
+    rate = list(expect.updates_per_s or (0, 0))
+    if len(rate) != 2 or rate[0] > rate[1]:
+        raise file.error(
+            (*loc, "updates_per_s"), "a rate is from one number to another", expected="[9, 11]", got=str(rate)
+        )
+
+
+def _looks(scenario: Scenario, text: str, loc: tuple[Key, ...]) -> Expression:
+    """An expression that is about the system, so that it can come out either way."""
+    expression = scenario.expression(text, *loc)
+    if expression.is_constant:
+        raise scenario.file.error(loc, "this looks at nothing", expected="a tag or a variable in it", got=text)
+    return expression
+
+
+def _check_bounds(file: YamlFile, loc: tuple[Key, ...], bounds: Bounds | None) -> None:
+    if bounds is None:
+        return
+    if bounds.min is None and bounds.max is None:
+        raise file.error(loc, "these bounds hold whatever comes", expected="min or max")
+    if bounds.min is not None and bounds.max is not None and bounds.min > bounds.max:
+        raise file.error(loc, "nothing is within these bounds", got=f"min {bounds.min:g}, max {bounds.max:g}")
 
 
 def _check_whole_run(scenario: Scenario) -> None:
     """What holds over the whole run: `within`, `rate`, `cycle`."""
     file, form = scenario.file, scenario.form
     for n, within in enumerate(form.within):
-        scenario.expression(within.after, "within", n, "after")
-        scenario.expression(within.then, "within", n, "then")
+        _looks(scenario, within.after, ("within", n, "after"))
+        _looks(scenario, within.then, ("within", n, "then"))
         _time(file, ("within", n, "within"), within.within)
     for n, rate in enumerate(form.rate):
         loc: tuple[Key, ...] = ("rate", n)
@@ -434,6 +351,8 @@ def _check_whole_run(scenario: Scenario) -> None:
             scenario.used.add(rate.tag)
         if rate.wire is not None:
             _known(file, (*loc, "wire"), "device", rate.wire, list(scenario.system.devices))
+        _check_bounds(file, (*loc, "updates_per_s"), rate.updates_per_s)
+        _check_bounds(file, (*loc, "requests_per_s"), rate.requests_per_s)
         if _time(file, (*loc, "over"), rate.over) <= 0:
             raise file.error((*loc, "over"), "a rate is one of some time", expected="over: 10s")
         if rate.while_ is not None:
@@ -446,9 +365,13 @@ def _check_whole_run(scenario: Scenario) -> None:
         if cycle.changes_of is not None:
             _known(file, (*loc, "changes_of"), "tag or variable", cycle.changes_of, scenario.known)
             scenario.used.add(cycle.changes_of)
-        for key in ("min", "max", "late"):
-            if getattr(cycle, key) is not None:
-                _time(file, (*loc, key), getattr(cycle, key))
+        times = {
+            key: _time(file, (*loc, key), said)
+            for key in ("min", "max", "late")
+            if (said := getattr(cycle, key)) is not None
+        }
+        if times.get("min", 0) > times.get("max", times.get("min", 0)):
+            raise file.error(loc, "nothing is within these bounds", got=f"min {cycle.min}, max {cycle.max}")
         if cycle.while_ is not None:
             scenario.expression(cycle.while_, *loc, "while")
 

@@ -20,9 +20,10 @@ from fieldtwin.scenarios.about import dangers, result_of
 from fieldtwin.scenarios.bench import Bench, Can
 from fieldtwin.scenarios.expectation import Watched, is_secret, judge_tag, judge_wire
 from fieldtwin.scenarios.expression import Expression
-from fieldtwin.scenarios.form import Expect, Scenario, Step, WireForm, needs_of, word_of
+from fieldtwin.scenarios.form import Scenario, needs_of
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.whole_run import WholeRun
+from fieldtwin.scenarios.words import Expect, Step, WireForm, word_of
 from gateway.core.errors import UsageError
 
 TICK_S = 0.02
@@ -348,7 +349,15 @@ class Runner:
             if not known:
                 verdict, reason = found, f"{number}: {text}: nothing was there to judge"
             self.results.append(CheckResult(number, text, found, now_ns, 0, got=seen))
+        if verdict is Verdict.PASSED and not self._judges():
+            return Verdict.INCONCLUSIVE, "it expects nothing: no expect, no wait, nothing that always or never holds"
         return verdict, reason
+
+    def _judges(self) -> bool:
+        """Whether anything in it could have failed."""
+        form = self.scenario.form
+        whole = (form.always, form.never, form.within, form.rate, form.cycle)
+        return any(whole) or any(step.expect is not None or step.wait is not None for step in form.steps)
 
     def _on_event(self, event: Event) -> None:
         self._whole.hear(event)

@@ -15,8 +15,9 @@ from emulators.faults.schema import seconds
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.expectation import bounds_text, inside
 from fieldtwin.scenarios.expression import Expression, Look
-from fieldtwin.scenarios.form import Cycle, Rate, Scenario
+from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.scenarios.words import Cycle, Rate
 
 SAMPLES = 500
 """Looks that a rate remembers: its windows begin that much apart at most."""
@@ -92,8 +93,7 @@ class WholeRun:
     def summary(self) -> Iterator[tuple[str, str, str, bool]]:
         """(number, text, what was seen, whether anything was) of each."""
         for within in self.withins:
-            known = all(self._bench.reading(name) is not None for name in within.after.names + within.then.names)
-            yield within.number, within.text, f"{within.times} times", bool(within.times) or known
+            yield within.number, within.text, f"{within.times} times", within.times > 0
         for rate in self._rates:
             yield rate.number, rate.text, f"{rate.judged} looks", rate.judged > 0
         for cycle in self._cycles:

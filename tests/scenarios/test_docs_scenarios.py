@@ -7,7 +7,8 @@ from pathlib import Path
 
 from fieldtwin.report.model import Verdict
 from fieldtwin.running.virtual_scenario import run_virtual
-from fieldtwin.scenarios.form import WORDS, ScenarioForm, load_scenario
+from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.scenarios.words import WORDS, ScenarioForm
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "scenarios.md").read_text()
 

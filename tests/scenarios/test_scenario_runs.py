@@ -146,6 +146,16 @@ def test_what_a_target_cannot_do_is_skipped_and_has_not_passed(tmp_path: Path) -
         ("  - expect: {tag: relay.state, value: ACTVE}\n", "did you mean 'ACTIVE'", 4),
         ("  - set: {tag: ctd.pressure, value: high}\n", "ctd.pressure is a number; got 'high'", 4),
         ("  []\n", "steps is empty", 3),
+        ("  - {clear: dead, wait: 3s}\n", "one thing; expected send or set", 4),
+        ("  - expect: {tag: ctd.pressure, value: 1, tolerance: -1}\n", "tolerance", 4),
+        ("  - expect: {wire: ctd, requests_per_s: {max: 2}, during: 0s}\n", "for no time", 4),
+        ("  - expect: {wire: ctd, requests_per_s: {}, during: 5s}\n", "hold whatever comes", 4),
+        ("  - expect: {wire: ctd, times: {min: 3, max: 1}}\n", "nothing is within these bounds", 4),
+        ("  - expect: {tag: ctd.pressure, updates_per_s: [11, 9], during: 5s}\n", "from one number to another", 4),
+        ("  - expect: {tag: ctd.pressure, updates_per_s: [9], during: 5s}\n", "from one number to another", 4),
+        ("  - expect: {wire: ctd, value: 7, times: 0}\n", "of which register", 4),
+        ("  - expect: {that: '1 < 2'}\n", "looks at nothing", 4),
+        ("  - wait: {until: '1'}\n", "looks at nothing", 4),
     ],
 )
 def test_a_mistake_is_named_where_it_stands(tmp_path: Path, steps: str, told: str, line: int) -> None:
@@ -170,6 +180,18 @@ def test_a_file_that_is_not_there_is_named_where_it_is_asked_for(tmp_path: Path,
         load_scenario(path)
     assert told in str(e.value)
     assert e.value.line == line.count("\n") + 1
+
+
+def test_what_expects_nothing_has_not_passed(tmp_path: Path) -> None:
+    result = run(tmp_path, "  - send: {period_s: 1}\n  - pause: 1s\n")
+    assert result.verdict is Verdict.INCONCLUSIVE
+    assert "expects nothing" in result.reason
+
+
+def test_a_time_that_is_none_is_named_where_it_stands(tmp_path: Path) -> None:
+    with pytest.raises(FileInvalid, match="a time") as e:
+        load_scenario(written(tmp_path, "  - expect: {tag: ctd.pressure, quality: bad, within: 3 sec}\n"))
+    assert (e.value.line, e.value.column) == (4, 47)
 
 
 def test_reports_are_written(tmp_path: Path) -> None:

@@ -59,6 +59,12 @@ def run(folder: Path, steps: str, head: str) -> ScenarioResult:
         ("cycle: [{changes_of: ctd.sample_count, max: 1.7s}]\n", SILENT, Verdict.FAILED, "none from"),
         ("cycle: [{changes_of: ctd.sample_count, min: 3s}]\n", ACTIVE + "  - pause: 4s\n", Verdict.FAILED, " s, from"),
         ("cycle: [{late: 1ms}]\n", "  - pause: 1s\n", Verdict.PASSED, "looks"),
+        (
+            "within: [{after: \"relay.state == 'OFF'\", then: \"quality(ctd.pressure) == 'bad'\", within: 2s}]\n",
+            "  - pause: 1s\n",
+            Verdict.INCONCLUSIVE,
+            "0 times",
+        ),
     ],
 )  # fmt: skip
 def test_the_whole_run_is_judged(tmp_path: Path, head: str, steps: str, verdict: Verdict, told: str) -> None:
@@ -92,7 +98,15 @@ def test_probes_see_what_is_served_under_their_names(tmp_path: Path) -> None:
         (HMI.replace("serve: hmi", 'endpoint: "tpc://127.0.0.1"'), "did you mean tcp:", 5),
         ("rate: [{tag: ctd.pressure, requests_per_s: {max: 1}}]\n", "of a tag or of a wire", 3),
         ("cycle: [{changes_of: ctd.pressure}]\n", "bounds", 3),
-        ("within: [{after: 'relay.stat == 1', then: 'true', within: 1s}]\n", "did you mean 'relay.state'", 3),
+        ("cycle: [{changes_of: ctd.pressure, min: 2s, max: 1s}]\n", "nothing is within these bounds", 3),
+        ("rate: [{tag: ctd.pressure, updates_per_s: {}}]\n", "hold whatever comes", 3),
+        ("always: ['1 == 1']\n", "looks at nothing", 3),
+        ("never: [{wire: ctd, value: 7}]\n", "of which register", 3),
+        (
+            "within: [{after: 'relay.stat == 1', then: 'ctd.pressure > 1', within: 1s}]\n",
+            "did you mean 'relay.state'",
+            3,
+        ),
     ],
 )
 def test_a_mistake_is_named_where_it_stands(tmp_path: Path, head: str, told: str, line: int) -> None:

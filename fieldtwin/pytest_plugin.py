@@ -41,6 +41,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
     group.addoption("--fieldtwin-target", default="", metavar="TARGET", help="where scenarios run; default: virtual")
     group.addoption("--fieldtwin-seed", type=int, default=None, metavar="N", help="another seed for all that has one")
+    group.addoption("--fieldtwin-trust", action="store_true", help="run what is inside of a stranger's template, too")
     group.addoption(
         "--fieldtwin-html", default="", metavar="FILE", help="one page with verdicts and the requirement matrix"
     )
@@ -112,7 +113,9 @@ def _runner(config: pytest.Config) -> Runner:
     if _RUNNER not in config.stash:
         from fieldtwin.testing.runner import Runner, command_of
 
-        config.stash[_RUNNER] = Runner(command_of(config.getoption("--fieldtwin-command")))
+        config.stash[_RUNNER] = Runner(
+            command_of(config.getoption("--fieldtwin-command")), trust=config.getoption("--fieldtwin-trust")
+        )
     return config.stash[_RUNNER]
 
 
@@ -236,6 +239,7 @@ def scenario(request: pytest.FixtureRequest) -> Callable[..., Outcome]:
             seed=config.getoption("--fieldtwin-seed") if seed is None else seed,
             target=target or config.getoption("--fieldtwin-target"),
             profiles=[str(p) for p in config.getini("fieldtwin_profiles")],
+            trust=config.getoption("--fieldtwin-trust"),
         )
 
     return run

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import click
 
+from fieldtwin.cli.template_question import trust_option
+
 
 @click.command("test-host")
-def command() -> int:
+@trust_option
+def command(trust: bool) -> int:
     """Emulated devices for somebody's tests, made and ended over standard input and output.
 
     Requests are lines of JSON, and so are answers: {"v": 1, "id": 1, "verb": "device", "args": {"device": "ctd-reference"}}.
-    The pytest plugin of fieldtwin starts it; docs/testing.md has the verbs. It ends when its input does.
+    The pytest plugin of fieldtwin starts it; docs/testing.md has the verbs. It ends when its input does. Nobody is
+    there to be asked: without --trust nothing of a stranger's template is run.
     """
     from fieldtwin.testhost.host import Host
     from gateway.wallclock import run
     from twin.child import allow_open_files
 
     allow_open_files()
-    return run(Host().serve())
+    return run(Host(trust=trust).serve())

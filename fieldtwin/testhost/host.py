@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.running.template_here import Stranger, agree
 from fieldtwin.testhost.bench import Bench, new_folder
 from fieldtwin.testhost.one_device import Wanted, write_system
 from fieldtwin.testhost.running_plc import RunningPlc
@@ -34,7 +35,9 @@ MOST = 1_000
 class Host:
     """``await Host().serve()`` until our input ends."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, trust: bool = False) -> None:
+        self._trust = trust
+        """Templates of strangers may run: somebody said so when the tests were started."""
         self._clock = WallClock()
         self._benches: dict[int, Bench] = {}
         self._programs: dict[int, SteppedProgram] = {}
@@ -122,6 +125,7 @@ class Host:
                 listen=dict(args.get("listen") or {}),
             )
             system, prototype = resolve_files(config)
+            agree(self._trusts, path, [(system, prototype.path)])
             prototype = prototype if seed is None else replace(prototype, seed=int(seed))
             return await self._open(folder, system, prototype)
         except BaseException:
@@ -211,10 +215,22 @@ class Host:
         number = self._next()
         folders, source = tuple(map(str, args.get("folders") or ())), str(args.get("source", ""))
         if args.get("system"):
-            source, folders = _of_system(str(args["system"]), source, folders)
+            source, folders = self._of_system(str(args["system"]), source, folders)
         program = SteppedProgram(source, folders, float(args.get("cycle_ms") or 10.0))
         self._programs[number] = program
         return {"id": number, "values": program.values()}
+
+    def _of_system(self, name: str, program: str, folders: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
+        """The source of a system's program, and where it is."""
+        own = next((path for folder in folders if (path := Path(folder) / name).is_file()), None)
+        system = load_system(str(own or name))
+        if program not in system.plc.programs:
+            raise UsageError(f"{system.name} has no program {program!r}", expected=", ".join(system.plc.programs))
+        agree(self._trusts, system.path, [(system, None)], plant=True)
+        return system.plc.programs[program].source, (str(system.path.parent),)
+
+    def _trusts(self, template: Stranger) -> bool:
+        return self._trust
 
     def _stepped(self, args: dict[str, Any]) -> SteppedProgram:
         program = self._programs.get(args.get("id", 0))
@@ -244,15 +260,6 @@ class Host:
 
         write_report(args)
         return {}
-
-
-def _of_system(name: str, program: str, folders: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
-    """The source of a system's program, and where it is."""
-    own = next((path for folder in folders if (path := Path(folder) / name).is_file()), None)
-    system = load_system(str(own or name))
-    if program not in system.plc.programs:
-        raise UsageError(f"{system.name} has no program {program!r}", expected=", ".join(system.plc.programs))
-    return system.plc.programs[program].source, (str(system.path.parent),)
 
 
 def _wanted(args: dict[str, Any]) -> Wanted:

@@ -67,11 +67,13 @@ def run_scenario(
     seed: int | None = None,
     target: str = "",
     profiles: Sequence[str] = (),
+    trust: bool = False,
 ) -> Outcome:
     """Run one. Raises `FieldtwinRefused` for a file that is no scenario, `FieldtwinUnavailable` where nothing runs it."""
     argv = [*command, "test", str(path), "--json"]
     argv += ["--seed", str(seed)] if seed is not None else []
     argv += ["--target", target] if target else []
+    argv += ["--trust"] if trust else []
     for folder in profiles:
         argv += ["--profiles", folder]
     try:

@@ -43,8 +43,10 @@ def command_of(said: str = "") -> list[str]:
 class Runner:
     """One process ``COMMAND test-host``; starts at the first `call`. Calls may come from any thread, one at a time."""
 
-    def __init__(self, command: Sequence[str] = ()) -> None:
+    def __init__(self, command: Sequence[str] = (), *, trust: bool = False) -> None:
         self.command = list(command) or command_of()
+        self.trust = trust
+        """Templates of strangers may run."""
         self._process: subprocess.Popen[str] | None = None
         self._answers: Queue[str | None] = Queue()
         self._said: IO[str] | None = None
@@ -91,7 +93,7 @@ class Runner:
         self._said = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed with the process
         try:
             process = subprocess.Popen(
-                [*self.command, "test-host"],
+                [*self.command, "test-host", *(["--trust"] if self.trust else [])],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._said,

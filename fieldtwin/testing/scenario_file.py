@@ -46,6 +46,7 @@ class ScenarioItem(pytest.Item):
             seed=config.getoption("--fieldtwin-seed"),
             target=config.getoption("--fieldtwin-target"),
             profiles=[str(p) for p in config.getini("fieldtwin_profiles")],
+            trust=config.getoption("--fieldtwin-trust"),
         )
         self.user_properties += [(name, value) for name in ABOUT if (value := getattr(outcome, name))]
         self.user_properties += [("requirement", id) for id in outcome.requirements]

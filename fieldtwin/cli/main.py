@@ -17,6 +17,7 @@ from typing import Any, NoReturn
 import click
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.cli.unheard import VERDICTS, talk_unheard, to_nowhere, verdict_unheard
 
 COMMANDS = {
     "run": ("fieldtwin.cli.run_command", "Run a system: the plant, or its prototype."),
@@ -90,14 +91,13 @@ class LazyGroup(click.Group):
     """Loads a command's module when the command is asked for."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Click's own answer to a closed pipe is exit code 1. `fieldtwin ... | head`: the reader has what it wanted."""
+        """Click's own answer to a closed pipe is exit code 1. `fieldtwin ... | head`: the reader has what it wanted. What
+        judges does so to its end all the same, and what it found is its exit code."""
         try:
             result = super().invoke(ctx)
             sys.stdout.flush()
         except BrokenPipeError:
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            for stream in (sys.stdout, sys.stderr):
-                os.dup2(nowhere, stream.fileno())
+            to_nowhere(sys.stdout.fileno())
             return 0
         return result
 
@@ -118,6 +118,8 @@ class LazyGroup(click.Group):
         near = difflib.get_close_matches(args[0], COMMANDS, n=1)
         if args[0] not in COMMANDS and near:
             raise click.UsageError(f"No such command {args[0]!r}. Did you mean {near[0]!r}?", ctx)
+        if args[0] in VERDICTS:
+            verdict_unheard()
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -149,6 +151,7 @@ def main() -> None:
     from gateway.core.errors import FieldtwinError, FileInvalid
 
     write_plainly()
+    talk_unheard()
     signal.signal(signal.SIGTERM, _told_to_end)
     try:
         code = cli.main(prog_name="fieldtwin", standalone_mode=False)

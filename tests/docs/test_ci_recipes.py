@@ -59,7 +59,9 @@ def test_scenarios_leave_junit_and_html_on_both_services():
 
 def test_the_first_recipe_leaves_its_artefacts_in_a_fresh_checkout(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.scenario.yaml").write_text("scenario: a\nsystem: observatory\nsteps:\n  - pause: 100ms\n")
+    (tmp_path / "a.scenario.yaml").write_text(
+        'scenario: a\nsystem: observatory\nsteps:\n  - wait: {until: "plc.late < 1 s"}\n'
+    )
     line = next(line for line in commands_of(*RECIPES[0]) if line.startswith("fieldtwin test"))
     done = CliRunner().invoke(cli, shlex.split(line)[1:], standalone_mode=False)
     assert (done.exception, done.return_value) == (None, 0)

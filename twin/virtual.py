@@ -7,7 +7,6 @@ same seed, configuration, version, Python minor and architecture give the same e
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from gateway.core.connection import Connector, Tap
 from gateway.core.endpoint import Endpoint
 from gateway.core.image import Image
 from gateway.core.nursery import Nursery
+from gateway.core.started import Started
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.gateway import Gateway
 from gateway.store.exchange_log import ExchangeLog
@@ -40,7 +40,7 @@ STARTING_NS = NS_PER_S // 20
 _IN_MEMORY = Path(":memory:")
 
 
-class VirtualPrototype:
+class VirtualPrototype(Started):
     """``async with VirtualPrototype(system, prototype, loop, run_dir) as run`` inside `loop`. `run_dir` takes the audit log and
     what is retained; the exchange log is in memory.
 
@@ -62,6 +62,7 @@ class VirtualPrototype:
         prepare: Callable[[VirtualPrototype], None] | None = None,
         water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
+        super().__init__()
         self.system = system
         self.prototype = prototype if seed is None else replace(prototype, seed=seed)
         self.loop = loop
@@ -80,15 +81,6 @@ class VirtualPrototype:
         self._taps = taps
         self._on_change = on_change
         self._prepare = prepare
-        self._stack = AsyncExitStack()
-
-    async def __aenter__(self) -> VirtualPrototype:
-        try:
-            await self._start()
-        except BaseException:
-            await self._stack.aclose()
-            raise
-        return self
 
     async def _start(self) -> None:
         await self.field.open()
@@ -153,6 +145,3 @@ class VirtualPrototype:
     def failure(self) -> BaseException | None:
         """Why a part of it ended by itself: a bug of ours."""
         return self._nursery.failure()
-
-    async def __aexit__(self, *exc: object) -> None:
-        await self._stack.aclose()

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,6 +30,7 @@ from gateway.core.errors import FieldtwinError, Unreachable, UsageError
 from gateway.core.image import OUTPUTS
 from gateway.core.image_region import RegionReader
 from gateway.core.nursery import Nursery
+from gateway.core.started import Started
 from gateway.wallclock import WallClock
 from twin.physical import attached, image_layout
 from twin.system import System
@@ -58,7 +58,7 @@ class Where:
     allowed: Danger = Danger.DISRUPT
 
 
-class ControlBench:
+class ControlBench(Started):
     """``async with ControlBench(system, where, trace, target="local", names=[...]) as bench``. `names` is what readings are asked
     for. `gone` tells why the system is not there any more, or None."""
 
@@ -73,6 +73,7 @@ class ControlBench:
         probes: Sequence[Probe] = (),
         gone: Callable[[], FieldtwinError | None] = lambda: None,
     ) -> None:
+        super().__init__()
         self.system = system
         self.trace = trace
         self.target = target
@@ -83,7 +84,6 @@ class ControlBench:
         self._gone = gone
         self._clock = WallClock()
         self._start_ns = self._clock.monotonic_ns()
-        self._stack = AsyncExitStack()
         self._gateway: ControlClient | None = None
         self._plc: ControlClient | None = None
         self._field: ControlClient | None = None
@@ -107,18 +107,7 @@ class ControlBench:
         self._held: dict[str, deque[tuple[float, bytes]]] = {}
         self._held_since: dict[str, int] = {}
 
-    async def __aenter__(self) -> ControlBench:
-        try:
-            await self._open()
-        except BaseException:
-            await self._stack.aclose()
-            raise
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        await self._stack.aclose()
-
-    async def _open(self) -> None:
+    async def _start(self) -> None:
         where = self._where
         if not self._foreign():
             await self._open_controller()

@@ -6,7 +6,6 @@ Start order: the water, the ship, then the systems, all at once. A system that d
 from __future__ import annotations
 
 import asyncio
-from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import Scripted, Shore
 from gateway.core.endpoint import Endpoint
 from gateway.core.nursery import Nursery
+from gateway.core.started import Started
 from gateway.wallclock import WallClock
 from twin.instance import Instance
 from twin.network import WATER, Network
@@ -44,10 +44,11 @@ class NetworkOptions:
     """Where each system's thread listens: on a free port. Empty for none."""
 
 
-class NetworkSession:
+class NetworkSession(Started):
     """``async with NetworkSession(network, options) as it: await it.wait()``. `sessions` by the names of the members."""
 
     def __init__(self, network: Network, options: NetworkOptions) -> None:
+        super().__init__()
         self.network = network
         self.options = options
         self.seed = network.seed if options.seed is None else options.seed
@@ -61,21 +62,7 @@ class NetworkSession:
         self.stopped = asyncio.Event()
         self.started_ns = 0
         self._faults = placed_all(network, options.faults)
-        self._stack = AsyncExitStack()
         self._nursery = Nursery()
-
-    async def __aenter__(self) -> NetworkSession:
-        try:
-            await self._start()
-        except BaseException:
-            await self._stack.aclose()
-            raise
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        if self.shore is not None:
-            await self.shore.halt()
-        await self._stack.aclose()
 
     async def _start(self) -> None:
         self._stack.enter_context(self.instance)
@@ -96,6 +83,10 @@ class NetworkSession:
             like = next(iter(self.network.members.values()))
             self.shore = Shore(like.system, like.modem, self.ship, self.clock)
             self._nursery.start(self.shore.run(list(self.options.commands)), "ship")
+
+    async def _stop(self) -> None:
+        if self.shore is not None:
+            await self.shore.halt()
 
     async def _start_systems(self, socket: Path) -> None:
         """All at once. What did start is ended with the rest, also where another one did not."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +26,7 @@ from gateway.core.control import ControlClient
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, Unreachable, UsageError
 from gateway.core.nursery import Nursery
+from gateway.core.started import Started
 from gateway.wallclock import WallClock
 from twin.controller import ControllerConfig
 from twin.instance import Instance
@@ -50,13 +50,14 @@ FIELD_LINGER_S = 1.5
 """Should we be killed, the emulators stay for so long: the gateway makes its outputs safe meanwhile."""
 
 
-class RunSession:
+class RunSession(Started):
     """One run. ``async with RunSession(options) as run: await run.wait()``, then `summary`.
 
     `gateway_status`, `plc_status` and `field_status` hold the latest of each, `None` while a process does not answer.
     """
 
     def __init__(self, options: RunOptions) -> None:
+        super().__init__()
         self.options = options
         self.clock = WallClock()
         self.system: System = load_system(options.system, options.profiles)
@@ -85,7 +86,6 @@ class RunSession:
         self.started_ns = 0
         self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
         self.stopped = asyncio.Event()
-        self._stack = AsyncExitStack()
         self._nursery = Nursery()
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
@@ -118,14 +118,6 @@ class RunSession:
         return not self.options.faults
 
     # -- starting -------------------------------------------------------------------------------------------------------
-
-    async def __aenter__(self) -> RunSession:
-        try:
-            await self._start()
-        except BaseException:
-            await self._stack.aclose()
-            raise
-        return self
 
     async def _start(self) -> None:
         self._stack.enter_context(self.instance)
@@ -370,12 +362,11 @@ class RunSession:
 
     # -- stopping -------------------------------------------------------------------------------------------------------
 
-    async def __aexit__(self, *exc: object) -> None:
+    async def _stop(self) -> None:
         try:
             await self._stop_in_order()
         finally:
             await self._nursery.__aexit__(None, None, None)
-            await self._stack.aclose()
 
     async def _stop_in_order(self) -> None:
         self._notice_deaths()

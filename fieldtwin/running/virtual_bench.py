@@ -6,7 +6,6 @@ A `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `Virtua
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import Unreachable, UsageError
 from gateway.core.nursery import Nursery
+from gateway.core.started import Started
 from gateway.core.values import Quality, Reason, TagValue
 from plc.publishing import Change
 from twin.prototype_file import Prototype
@@ -35,7 +35,7 @@ _QUALITIES = {quality: quality.name.lower() for quality in Quality}
 _REASONS = {reason: reason.name.lower() for reason in Reason}
 
 
-class VirtualBench:
+class VirtualBench(Started):
     """``async with VirtualBench(system, prototype, loop, run_dir, trace, seed=7) as bench``, inside `loop`.
 
     `commands` is what the far end commands by itself; a scenario does that with `send`. `far_end` False leaves it out.
@@ -56,6 +56,7 @@ class VirtualBench:
         probes: Sequence[Probe] = (),
         water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
+        super().__init__()
         self.system = system
         self.trace = trace
         self.loop = loop
@@ -80,7 +81,6 @@ class VirtualBench:
         self._words = {
             f"{p}.state": words for p, words in state_words(self.run.twin.ecs.layout, system.plc.programs).items()
         }
-        self._stack = AsyncExitStack()
 
     target = "virtual"
     allowed = Danger.DISRUPT
@@ -95,7 +95,7 @@ class VirtualBench:
         }
     )
 
-    async def __aenter__(self) -> VirtualBench:
+    async def _start(self) -> None:
         await self._stack.enter_async_context(self.run)
         self.run.gateway.tags.on_put = self._put
         device = next(iter(self.run.field.far), None)
@@ -110,7 +110,6 @@ class VirtualBench:
             self._probes.on_change = self.note
             nursery = await self._stack.enter_async_context(Nursery())
             nursery.start(self._probes.run(), "probes")
-        return self
 
     async def _all_served(self) -> None:
         """Until the gateway serves what probes ask for, at most a second."""
@@ -124,9 +123,6 @@ class VirtualBench:
             if server.config.name == name and server.front.bound is not None:
                 return server.front.bound
         raise Unreachable(f"the gateway does not serve {name!r}")
-
-    async def __aexit__(self, *exc: object) -> None:
-        await self._stack.aclose()
 
     # -- what happens ---------------------------------------------------------------------------------------------------
 

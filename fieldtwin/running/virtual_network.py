@@ -6,7 +6,6 @@ Each system is as it is alone (`VirtualBench`); what they hear of each other com
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AsyncExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from fieldtwin.running.shore import Scripted, Shore
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
 from gateway.core.nursery import Nursery
+from gateway.core.started import Started
 from twin.network import Network
 from twin.ship import Ship
 from twin.water_faults import WaterFaults
@@ -27,7 +27,7 @@ SEEDS_APART = 1_000_003
 """Between the systems of a run: none plays another one's chances."""
 
 
-class VirtualNetwork:
+class VirtualNetwork(Started):
     """``async with VirtualNetwork(network, loop, folder, trace, seed=7) as it``, inside `loop`; `it.bench` is a scenario's.
 
     `folder` takes each system's audit log. `commands` is what the ship commands by itself; a scenario does that with `send`.
@@ -43,6 +43,7 @@ class VirtualNetwork:
         seed: int,
         commands: list[Scripted] | None = None,
     ) -> None:
+        super().__init__()
         self.network = network
         self.trace = trace
         self.faults = WaterFaults(network, seed)
@@ -53,18 +54,6 @@ class VirtualNetwork:
         self._folder = folder
         self._seed = seed
         self._commands = commands or []
-        self._stack = AsyncExitStack()
-
-    async def __aenter__(self) -> VirtualNetwork:
-        try:
-            await self._start()
-        except BaseException:
-            await self._stack.aclose()
-            raise
-        return self
-
-    async def __aexit__(self, *exc: object) -> None:
-        await self._stack.aclose()
 
     async def _start(self) -> None:
         for number, (name, member) in enumerate(self.network.members.items()):

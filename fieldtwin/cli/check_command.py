@@ -59,6 +59,30 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
         click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
         json_option,
     ]  # fmt: skip
+    return _with(options, function)
+
+
+def _seen(what: str, timeout: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Options of what a master sees and shows: `what` it reads, and what its own `timeout` is called."""
+    options = [
+        click.option(
+            "--probe", default="", metavar="WHERE",
+            help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], or output.",
+        ),
+        click.option(
+            "--timeout", "timeout_s", type=Duration(), default="0", help=f"The master's {timeout}, where you know it."
+        ),
+        click.option(
+            "--values", default="1111,2222,3333", show_default=True, metavar="A,B,BAD",
+            help=f"What {what} hold: two good ones and a poison.",
+        ),
+        click.option("--none", "none", multiple=True, metavar="VALUE", help="What the probe shows for no value; repeatable."),
+    ]  # fmt: skip
+    return lambda function: _with(options, function)
+
+
+def _with(options: Sequence[Callable[..., Any]], function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function` with all of them, shown in this order."""
     for option in reversed(options):
         function = option(function)
     return function
@@ -70,23 +94,7 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
     metavar="ENDPOINT",
     help="tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:PORT; port 0 takes a free one.",
 )
-@click.option(
-    "--probe",
-    default="",
-    metavar="WHERE",
-    help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], or output.",
-)
-@click.option(
-    "--timeout", "timeout_s", type=Duration(), default="0", help="The master's response timeout, where you know it."
-)
-@click.option(
-    "--values",
-    default="1111,2222,3333",
-    show_default=True,
-    metavar="A,B,BAD",
-    help="What registers hold: two good ones and a poison.",
-)
-@click.option("--none", "none", multiple=True, metavar="VALUE", help="What the probe shows for no value; repeatable.")
+@_seen("registers", "response timeout")
 @click.option(
     "--hold", multiple=True, metavar="TABLE:ADDRESS=VALUE", help="A cell that always holds the same; repeatable."
 )
@@ -167,23 +175,7 @@ def modbus_master(
     metavar="INDEX:SUB=HEX",
     help="An object's bytes as sent, such as 6041:00=3702; repeatable.",
 )
-@click.option(
-    "--probe",
-    default="",
-    metavar="WHERE",
-    help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], or output.",
-)
-@click.option(
-    "--timeout", "timeout_s", type=Duration(), default="0", help="The master's SDO timeout, where you know it."
-)
-@click.option(
-    "--values",
-    default="1111,2222,3333",
-    show_default=True,
-    metavar="A,B,BAD",
-    help="What objects hold: two good ones and a poison.",
-)
-@click.option("--none", "none", multiple=True, metavar="VALUE", help="What the probe shows for no value; repeatable.")
+@_seen("objects", "SDO timeout")
 @_shared
 @click.argument("argv", nargs=-1, type=click.UNPROCESSED)
 def canopen_master(

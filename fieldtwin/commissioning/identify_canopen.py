@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from fieldtwin.commissioning.live import canopen_at
-from fieldtwin.commissioning.matching import CanClues, Candidate, Sureness, judge_canopen, rank, summary
+from fieldtwin.commissioning.matching import CanClues, Candidate, certain, judge_canopen, rank, summary
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Connector, Tap
 from gateway.core.errors import Desync, ReplyTimeout, SdoAborted
@@ -40,8 +40,7 @@ class CanIdentity:
     @property
     def certain(self) -> str | None:
         """The one profile that is certain, if there is one."""
-        found = [c.profile for c in self.candidates if c.sureness is Sureness.CERTAIN]
-        return found[0] if len(found) == 1 else None
+        return certain(self.candidates)
 
 
 async def identify_canopen(

@@ -14,6 +14,7 @@ from fieldtwin.commissioning.matching import (
     Reading,
     SunSpec,
     Sureness,
+    certain,
     contradicted,
     judge_modbus,
     rank,
@@ -63,8 +64,7 @@ class ModbusIdentity:
     @property
     def certain(self) -> str | None:
         """The one profile that is certain, if there is one."""
-        found = [c.profile for c in self.candidates if c.sureness is Sureness.CERTAIN]
-        return found[0] if len(found) == 1 else None
+        return certain(self.candidates)
 
 
 async def identify_modbus(

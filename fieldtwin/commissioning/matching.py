@@ -96,6 +96,12 @@ def rank(candidates: Iterable[Candidate]) -> list[Candidate]:
     return sorted(candidates, key=lambda c: (-c.sureness, -c.signs, c.profile))
 
 
+def certain(ranked: Sequence[Candidate]) -> str | None:
+    """The one profile that is certain, if there is one."""
+    found = [c.profile for c in ranked if c.sureness is Sureness.CERTAIN]
+    return found[0] if len(found) == 1 else None
+
+
 def summary(ranked: Sequence[Candidate]) -> str:
     """One sentence, careful: several that fit equally well are no answer."""
     best = [c for c in ranked if c.sureness is not Sureness.RULED_OUT and c.sureness == ranked[0].sureness]

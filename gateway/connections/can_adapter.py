@@ -16,6 +16,7 @@ from typing import Any
 
 import can
 
+from gateway.connections.can_message import message_of
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import CANConnection, CanConnection, closed_here
 from gateway.core.endpoint import Endpoint
@@ -72,15 +73,7 @@ class AdapterConnection(CanConnection):
     async def send(self, frame: CanFrame) -> None:
         """Give `frame` to the driver. Raises `ConnectionLost` when the adapter is gone, `WireError` when its queue stays
         full for `SEND_TIMEOUT_S`."""
-        if frame.error:
-            raise UsageError("an error frame cannot be sent", got=str(frame), where=str(self.endpoint))
-        message = can.Message(
-            arbitration_id=frame.can_id,
-            is_extended_id=frame.extended,
-            is_remote_frame=frame.remote,
-            dlc=frame.dlc,
-            data=frame.data,
-        )
+        message = message_of(frame, self.endpoint)
         async with self._turn:
             if self._lost is not None:
                 raise self._loss()

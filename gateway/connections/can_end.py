@@ -14,6 +14,7 @@ import socket
 import can
 
 from gateway.connections.can_link import query_link
+from gateway.connections.can_message import message_of
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CANConnection, CanConnection, closed_here
@@ -71,15 +72,7 @@ class SocketCanConnection(CanConnection):
 
         Raises `ConnectionLost` when the interface is gone, `WireError` when the queue stays full for `SEND_TIMEOUT_S`.
         """
-        if frame.error:
-            raise UsageError("an error frame cannot be sent", got=str(frame), where=str(self.endpoint))
-        message = can.Message(
-            arbitration_id=frame.can_id,
-            is_extended_id=frame.extended,
-            is_remote_frame=frame.remote,
-            dlc=frame.dlc,
-            data=frame.data,
-        )
+        message = message_of(frame, self.endpoint)
         async with self._turn:
             deadline = self._loop.time() + SEND_TIMEOUT_S
             backoff_s = FIRST_BACKOFF_S

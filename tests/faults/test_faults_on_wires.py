@@ -151,6 +151,27 @@ def test_a_pty_hears_what_the_fault_makes_of_it(tmp_path: Path) -> None:
     run(main())
 
 
+@contextlib.asynccontextmanager
+async def linked(stranger: Any, faults: Any) -> Any:
+    """A client of `stranger`'s server, through a link with `faults`."""
+    server = await asyncio.start_server(stranger, "127.0.0.1", 0)
+    far = Endpoint.parse(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
+    link = Link(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
+    await link.open()
+    serving = asyncio.create_task(link.serve())
+    try:
+        reader, writer = await asyncio.open_connection(*link.ends[0].address)
+        yield reader, writer
+        writer.close()
+        await eventually(lambda: not link.connected)
+    finally:
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        await link.aclose()
+        server.close()
+        await server.wait_closed()
+
+
 def test_a_link_puts_faults_between_strangers() -> None:
     async def main() -> None:
         async def stranger(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -158,26 +179,12 @@ def test_a_link_puts_faults_between_strangers() -> None:
                 writer.write(REPLY)
             writer.close()
 
-        server = await asyncio.start_server(stranger, "127.0.0.1", 0)
-        far = Endpoint.parse(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
         faults = at_once({"name": "exception", "code": 6, "function": 3, "every": 2})
-        link = Link(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
-        await link.open()
-        serving = asyncio.create_task(link.serve())
-        try:
-            reader, writer = await asyncio.open_connection(*link.ends[0].address)
+        async with linked(stranger, faults) as (reader, writer):
             for expected in (REPLY, bytes.fromhex("0001 0000 0003 01 83 06"), REPLY):
                 writer.write(REQUEST)
                 assert await reader.readexactly(len(expected)) == expected
             assert [active.struck for active in faults.active.values()] == [1]
-            writer.close()
-            await eventually(lambda: not link.connected)
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            await link.aclose()
-            server.close()
-            await server.wait_closed()
 
     run(main())
 
@@ -197,15 +204,9 @@ def test_a_link_strikes_whole_frames_of_a_stream_in_whatever_pieces_they_come() 
             await reader.read()
             writer.close()
 
-        server = await asyncio.start_server(stranger, "127.0.0.1", 0)
-        far = Endpoint.parse(f"tcp://127.0.0.1:{server.sockets[0].getsockname()[1]}")
         said = [{"name": "drop", "direction": "reply", "every": 4}, {"name": "duplicate", "every": 3}]
         faults = wire_faults(said, Framing.THREAD, 1, 0)
-        link = Link(Endpoint.parse("tcp://127.0.0.1:0?listen=1"), far, faults=faults)
-        await link.open()
-        serving = asyncio.create_task(link.serve())
-        try:
-            reader, writer = await asyncio.open_connection(*link.ends[0].address)
+        async with linked(stranger, faults) as (reader, _):
             got: list[int] = []
             while not got or got[-1] != 38:  # 39 is the fortieth, and lost
                 data = await reader.readexactly(int.from_bytes(await reader.readexactly(2)))
@@ -213,14 +214,6 @@ def test_a_link_strikes_whole_frames_of_a_stream_in_whatever_pieces_they_come() 
                 got.append(data[0])
             assert {n for n in range(39) if n not in got} == {n for n in range(39) if n % 4 == 3}
             assert len(got) > len(set(got)), "some came twice"
-            writer.close()
-            await eventually(lambda: not link.connected)
-        finally:
-            serving.cancel()
-            await asyncio.gather(serving, return_exceptions=True)
-            await link.aclose()
-            server.close()
-            await server.wait_closed()
 
     run(main())
 

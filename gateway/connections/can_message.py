@@ -1,0 +1,22 @@
+"""Our frames as python-can's messages, for whoever sends through it."""
+
+from __future__ import annotations
+
+import can
+
+from gateway.core.canframe import CanFrame
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import UsageError
+
+
+def message_of(frame: CanFrame, endpoint: Endpoint) -> can.Message:
+    """`frame` to be sent at `endpoint`. Raises `UsageError` for an error frame: those are the bus's own."""
+    if frame.error:
+        raise UsageError("an error frame cannot be sent", got=str(frame), where=str(endpoint))
+    return can.Message(
+        arbitration_id=frame.can_id,
+        is_extended_id=frame.extended,
+        is_remote_frame=frame.remote,
+        dlc=frame.dlc,
+        data=frame.data,
+    )

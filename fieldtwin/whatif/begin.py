@@ -10,6 +10,7 @@ from emulators.distorted_registers import DistortedRegisters
 from emulators.models.register_device import StatedRegisters
 from fieldtwin.whatif.state import KnownState, Number
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.statemachine import encode_period
 from twin.virtual import VirtualPrototype
 
 
@@ -24,7 +25,8 @@ def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
 
     A recording is sought through for its nearest row, a simulation by formulas goes on from the values, registers hold them.
     A device that has its state to itself (a drive's motor, a model in Python) begins as it always does. What the
-    programs command is written by the gateway anew. Raises `FileInvalid` for a variable that cannot hold its value.
+    programs command is written by the gateway anew. A program that keeps its period to itself is commanded what is
+    known. Raises `FileInvalid` for a variable that cannot hold its value.
     """
     for bound in run.plc.programs:
         known = state.programs.get(bound.name)
@@ -35,11 +37,26 @@ def begin(run: VirtualPrototype, state: KnownState) -> list[str]:
                 raise FileInvalid(
                     f"{bound.name}: {e.message}", path=state.source, expected=e.expected, got=e.got
                 ) from e
+            if "period" in known and "period" not in bound.program.variables:
+                _command(run, known["period"])
     by_device: dict[str, dict[str, Number]] = {}
     for name, value in state.values.items():
         device, _, tag = name.partition(".")
         by_device.setdefault(device, {})[tag] = value
     return [device for device, values in by_device.items() if not _begin_device(run, device, values)]
+
+
+def _command(run: VirtualPrototype, period_s: Number) -> None:
+    """Let the transmitter have brought this command, where the plant has one and listens to it."""
+    if len(run.gateway.pumps) == 1 and isinstance(period_s, int):
+        run.gateway.pumps[0].command(encode_period(period_s).data, "what is known")
+
+
+def otherwise(run: VirtualPrototype, state: KnownState) -> list[str]:
+    """Programs whose state is not the one that is known of them."""
+    outputs = run.plc.outputs.last()
+    known = {name: variables["state"] for name, variables in state.programs.items() if "state" in variables}
+    return [name for name, is_so in known.items() if outputs.get(f"{name}.state", is_so) != is_so]
 
 
 def _begin_device(run: VirtualPrototype, name: str, values: Mapping[str, Number]) -> bool:

@@ -18,7 +18,7 @@ from emulators.virtual.seal import sealed
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import state_words
 from fieldtwin.scenarios.expression import Expression
-from fieldtwin.whatif.begin import begin, retain_for
+from fieldtwin.whatif.begin import begin, otherwise, retain_for
 from fieldtwin.whatif.outcome import Outcome, Requirement
 from fieldtwin.whatif.plan import Plan
 from fieldtwin.whatif.state import KnownState
@@ -33,6 +33,8 @@ from twin.virtual import VirtualPrototype
 
 LOOK_S = 1.0
 """How often the requirements are looked at, besides each change of a program's variables."""
+BEGUN_S = 2.0
+"""Until then a plan that says nothing has not moved a program from where it began."""
 MAX_TRANSITIONS = 10_000
 MAX_HORIZON_S = 30 * 86_400.0
 
@@ -151,11 +153,16 @@ class _ForkRun:
     async def _watch(self, run: VirtualPrototype, loop: VirtualLoop) -> None:
         end_ns = run.started_ns + round(self.fork.horizon_s * NS_PER_S)
         settled_ns = run.started_ns + round(min(self.fork.settle_s, self.fork.horizon_s) * NS_PER_S)
+        begun = False
         while loop.now_ns < end_ns:
             await run.clock.sleep_until_ns(min(loop.now_ns + round(LOOK_S * NS_PER_S), end_ns))
             failure = run.failure()
             if failure is not None:
                 raise failure
+            if not begun:
+                begun = True
+                if all(c.at_s > BEGUN_S for c in self.plan.commands):
+                    self.outcome.not_taken.extend(otherwise(run, self.fork.state))
             if loop.now_ns >= settled_ns:
                 for requirement, expression in self._requirements:
                     self._judge(requirement, expression)

@@ -31,12 +31,14 @@ async def known_state(place: str, system: System, origin: str = "") -> KnownStat
             await recall(store, name, known.take)
             if known.utc_ms or origin:
                 found[name] = known
+        if not found and not origin:
+            raise UsageError(f"{place} knows nothing of {system.name}", expected="the last that was known of a plant")
         if len(found) != 1:
             raise UsageError(
                 "which origin of the knowledge?",
-                expected=", ".join(found or origins) or "one with events",
+                expected=", ".join(found),
                 got="none",
-                hint="--origin NAME" if found else "",
+                hint="--origin NAME",
             )
         [(name, known)] = found.items()
         return known.state(f"{place}: {name}")

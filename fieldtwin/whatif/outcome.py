@@ -86,7 +86,8 @@ class Requirement:
 
 @dataclass
 class Outcome:
-    """Of one plan. `error`: why there is none. `not_taken`: devices that could not begin with what was known of them."""
+    """Of one plan. `error`: why there is none. `not_taken`: devices and programs that could not begin with what was known of
+    them."""
 
     plan: str
     horizon_s: float = 0.0

@@ -68,6 +68,25 @@ def test_a_mean_is_one_over_time_however_often_somebody_looked() -> None:
     assert "mean" not in words.described()
 
 
+def test_a_program_that_keeps_its_period_to_itself_is_commanded_what_is_known() -> None:
+    """Of `adapt.st` a store knows state and period; the period that it was ordered stands in none of these."""
+    known = KnownState({}, {"adapt": of_period(10)})
+    outcome = answer(Fork("ocean_west", known, 30.0), Plan("go on", require=("adapt.state == 'ACTIVE'",)))
+    assert (outcome.error, outcome.met, outcome.not_taken) == ("", True, [])
+    assert outcome.variables["ctd.sample_period_s"].last == 10
+
+
+@pytest.mark.parametrize(("system", "program"), [("ocean_west", "adapt"), ("observatory", "relay")])
+def test_a_state_that_a_fork_could_not_begin_with_is_named_unless_a_command_came_first(
+    system: str, program: str
+) -> None:
+    known = KnownState(
+        {}, {program: {**of_period(10), "state": 2}}
+    )  # OFF with a period of 10 s: the state follows from it
+    told = [answer(Fork(system, known, 3.0), plan).not_taken for plan in (Plan("go on"), Plan("", (Scripted(0, 5),)))]
+    assert told == [[program], []]
+
+
 def test_without_knowledge_it_begins_as_any_prototype() -> None:
     outcome = answer(
         Fork("observatory", KnownState(), 2.0, settle_s=1.0), Plan("nothing", require=("relay.state == 'ACTIVE'",))

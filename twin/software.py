@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import re
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from gateway.core.errors import FileInvalid
 PACKAGES = ("emulators", "fieldtwin", "gateway", "plc", "twin")
 HERE = Path(__file__).resolve().parent.parent
 MAX_MODULE_BYTES = 16 << 20
+MAX_MODULES = 10_000
+MAX_WHEEL_BYTES = 16 << 20
+"""Packed; and sixteen times that unpacked. Ours is a tenth of it, and a stranger's may be a bomb."""
 _LEFT_OUT = re.compile(r"(^|/)__pycache__/|\.pyc$|^fieldtwin/_data/|(^|/)\.")
 
 
@@ -39,18 +43,25 @@ def wheel_hash(wheel: Path) -> tuple[str, str]:
     if match is None:
         raise FileInvalid("no wheel of fieldtwin", path=str(wheel), expected="fieldtwin-VERSION-py3-none-any.whl")
     try:
+        if wheel.stat().st_size > MAX_WHEEL_BYTES:
+            raise FileInvalid("too large for a wheel of ours", path=str(wheel), expected=f"{MAX_WHEEL_BYTES} bytes")
         with zipfile.ZipFile(wheel) as archive:
             return match[1], _hash(_modules_in(archive))
-    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError) as e:
+    except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as e:
         raise FileInvalid(f"cannot read the wheel: {e}", path=str(wheel)) from e
 
 
 def _modules_in(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:
-    for entry in archive.infolist():
+    entries = archive.infolist()
+    if len(entries) > MAX_MODULES:
+        raise FileInvalid("too many files for a wheel of ours", path=str(archive.filename), expected=f"{MAX_MODULES}")
+    room = 16 * MAX_WHEEL_BYTES
+    for entry in entries:
         if entry.filename.split("/")[0] in PACKAGES and not entry.is_dir() and not _LEFT_OUT.search(entry.filename):
             with archive.open(entry) as file:
                 data = file.read(MAX_MODULE_BYTES + 1)
-            if len(data) > MAX_MODULE_BYTES:
+            room -= len(data)
+            if len(data) > MAX_MODULE_BYTES or room < 0:
                 raise FileInvalid("too large for a module", path=entry.filename, expected=f"{MAX_MODULE_BYTES} bytes")
             yield entry.filename, data
 

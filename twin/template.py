@@ -163,7 +163,8 @@ def check_path(path: str, where: str) -> None:
     """Refuse a path that could be written or read outside the package's folder, on any system. Raises `FileInvalid`."""
     parts = path.split("/")
     wrong = (
-        "it is empty, or has an empty part" if not all(parts)
+        "it is absolute" if path.startswith("/")
+        else "it is empty, or has an empty part" if not all(parts)
         else "it leads outside" if any(part in (".", "..") for part in parts)
         else "it is too long" if len(path.encode()) > MAX_PATH or max(len(p.encode()) for p in parts) > MAX_NAME
         else "it has characters that not every system takes" if _BAD_CHARACTER.search(path)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from gateway.core.clock import Clock
 from gateway.core.errors import FileInvalid
+from twin.software import wheel_hash
 from twin.system import System, load_system
 from twin.template import DigitalTemplate, Manifest, describe_model
 from twin.template_pack import MODEL, collect
@@ -22,13 +23,13 @@ TEXT = (".yaml", ".yml", ".st", ".xml", ".py", ".eds", ".dcf", ".json", ".md", "
 MAX_SHOWN_BYTES = 256 * 1024
 
 
-def examine(folder: Path, manifest: Manifest, *, plant: bool = False) -> System:
+def examine(folder: Path, manifest: Manifest, *, plant: bool = False, shown: Path | None = None) -> System:
     """Load the template's system and see that nothing it names is missing from the template. Runs no control logic.
 
     With `plant` the prototype's file and what it names are not looked at: they take emulators, which a plant need not have.
-    Raises `FileInvalid` for the first thing wrong.
+    `shown` is the template as its user knows it, where that is not `folder`. Raises `FileInvalid` for the first thing wrong.
     """
-    where = str(folder)
+    where = str(shown or folder)
     system = load_system(str(folder / manifest.system_file))
     if system.name != manifest.system:
         raise FileInvalid(
@@ -47,7 +48,19 @@ def examine(folder: Path, manifest: Manifest, *, plant: bool = False) -> System:
             path=where,
             hint="pack the template again with this version",
         )
+    if manifest.software.wheel:
+        _check_wheel(folder, manifest, where)
     return system
+
+
+def _check_wheel(folder: Path, manifest: Manifest, where: str) -> None:
+    """The wheel holds the software that the manifest names. Nothing of it is run."""
+    said, (version, modules) = manifest.software, wheel_hash(folder / manifest.software.wheel)
+    if (version, modules) != (said.version, said.modules_sha256):
+        raise FileInvalid(
+            f"{said.wheel} is other software than the manifest says", path=where,
+            expected=f"{said.version}, modules {said.modules_sha256[:12]}", got=f"{version}, modules {modules[:12]}",
+        )  # fmt: skip
 
 
 def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock) -> DigitalTemplate:

@@ -138,7 +138,7 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
             unpack(package, folder)
         here = FolderPackage(folder)
         manifest = here.manifest
-        system = examine(folder, manifest)
+        system = examine(folder, manifest, shown=package.path)
         may_run = not here.code or trust or (not as_json and ask_about(Stranger(package.path, package.code)))
         if may_run:
             put_together(manifest, system, folder, WallClock())
@@ -162,8 +162,10 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
 @click.option("--names", is_flag=True, help="Only which files differ.")
 @json_option
 def diff_command(before: Path, after: Path, names: bool, as_json: bool) -> int:
-    """Compare two templates. Exit code 1 when they differ."""
+    """Compare two templates, each as it was packed. Exit code 1 when they differ."""
     with open_package(before) as a, open_package(after) as b:
+        a.verify()  # what was damaged since says what it said before: it would differ in nothing
+        b.verify()
         found = differences(a.manifest, b.manifest)
         if as_json:
             _print_json(

@@ -60,7 +60,7 @@ def system_file(
     here.verify()
     from twin.template_check import examine  # where a template is there to examine, what reads it is installed
 
-    system = examine(folder, here.manifest, plant=plant)
+    system = examine(folder, here.manifest, plant=plant, shown=path)
     agree(ask, path, [(system, prototype_file)], plant=plant, virtual=virtual)
     return str(folder / here.manifest.system_file)
 

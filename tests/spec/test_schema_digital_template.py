@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from pathlib import Path
 
 import pytest
 from spec_rig import CLOCK, observatory
 
+from gateway.core.errors import FileInvalid
+from twin.declared import declared_variables
 from twin.model import DigitalModel
 from twin.physical import EmbeddedControlSystem
 from twin.prototype import DigitalTwinPrototype
@@ -50,6 +54,32 @@ def test_DigitalTemplate_is_documents_and_the_embedded_control_system_and_the_di
     assert {type(document) for document in made.documents} == {BluePrint, TechnicalManual, BillOfMaterials, Generic}
     assert type(made.ecs) is EmbeddedControlSystem
     assert type(made.digital_model) is DigitalModel
+    assert list(made.digital_model.variables) == list(DigitalModel(declared_variables(made.ecs.system)).variables)
+    for document in made.documents:
+        path = tmp_path / "T" / document.path
+        assert path.read_text() == f"a {document.kind}"
+        assert document.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_DigitalTemplate_every_part_has_its_hash_and_a_wrong_one_is_named(tmp_path: Path) -> None:
+    """System, prototype, profiles, EDS, recordings, the model, documents of each kind: one byte of each."""
+    manifest = template(tmp_path).manifest
+    kinds = {file.kind for file in manifest.files}
+    assert kinds == {"system", "prototype", "profile", "eds", "recording", "model", "document"}
+    for file in manifest.files:
+        path = tmp_path / "T" / file.path
+        whole = path.read_bytes()
+        path.write_bytes(bytes([whole[0] ^ 1]) + whole[1:])
+        with pytest.raises(
+            FileInvalid, match=f"{re.escape(file.path)}: not what was packed; expected SHA-256 {file.sha256}"
+        ):
+            FolderPackage(tmp_path / "T").verify()
+        path.write_bytes(whole)
+        path.rename(tmp_path / "away")
+        with pytest.raises(FileInvalid, match=f"'{re.escape(file.path)}' is missing"):
+            FolderPackage(tmp_path / "T")
+        (tmp_path / "away").rename(path)
+    FolderPackage(tmp_path / "T").verify()
 
 
 def test_DigitalTemplate_holds_the_physical_twins_own_configuration_and_a_model_of_its_own(tmp_path: Path) -> None:

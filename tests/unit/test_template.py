@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 from fieldtwin.running.template_here import Stranger, system_file
 from gateway.core.errors import FileInvalid, NotAllowed, Unreachable, UsageError
+from twin import software
 from twin.prototype_file import load_prototype
 from twin.software import modules_hash, wheel_hash
 from twin.system import System, load_system
@@ -609,3 +610,60 @@ def test_two_templates_are_compared_file_by_file(dam: Path, tmp_path: Path) -> N
 def test_the_zip_says_what_it_is_made_of(good: Path) -> None:
     with ZipPackage(good) as package:
         assert json.loads(package.text("model.json"))["initial"] == {"state": "STANDBY", "period_s": 0}
+
+
+# -- what is in it is what it says ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_damaged_template_is_not_equal_to_a_whole_one(dam: Path, tmp_path: Path, first: bool) -> None:
+    """Its manifest is the same: only its bytes say so."""
+    packed(dam, tmp_path / "T.zip")
+
+    def change(files: dict[str, bytes]) -> None:
+        files["devices/tilt.yaml"] = files["devices/tilt.yaml"].replace(b"slope", b"slopf", 1)
+
+    bad = reworked(tmp_path / "T.zip", tmp_path / "bad.zip", change)
+    both = [str(bad), str(tmp_path / "T.zip")]
+    done = fieldtwin(tmp_path, "template", "diff", *(both if first else both[::-1]))
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "bad.zip: devices/tilt.yaml: not what was packed" in done.stderr
+
+
+def test_the_wheel_in_a_template_is_the_software_that_its_manifest_names(dam: Path, tmp_path: Path) -> None:
+    """Of a stranger's: the hash of the file says that it is the file that was packed, and no more."""
+    wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name in ("emulators", "fieldtwin", "gateway", "plc", "twin"):
+            for path in (CHECKOUT / name).rglob("*.py"):
+                archive.write(path, path.relative_to(CHECKOUT).as_posix())
+            for path in (CHECKOUT / name).rglob("*.*"):
+                if path.suffix not in (".py", ".pyc"):
+                    archive.write(path, path.relative_to(CHECKOUT).as_posix())
+    packed(dam, tmp_path / "T", Extras(wheel=wheel))
+    manifest = FolderPackage(tmp_path / "T").manifest
+    assert examine(tmp_path / "T", manifest).name == "dam"
+    inside = tmp_path / "T" / manifest.software.wheel
+    with zipfile.ZipFile(inside, "a") as archive:
+        archive.writestr("plc/backdoor.py", "open('/tmp/x', 'w')\n")
+    with pytest.raises(FileInvalid, match=r"other software than the manifest says.*expected 9\.9, modules"):
+        examine(tmp_path / "T", manifest, shown=Path("T.zip"))
+    inside.write_bytes(b"no wheel")
+    with pytest.raises(FileInvalid, match="cannot read the wheel"):
+        examine(tmp_path / "T", manifest)
+
+
+def test_a_wheel_that_is_a_bomb_is_refused_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(software, "MAX_WHEEL_BYTES", 1 << 20)
+    wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+        for n in range(17):
+            archive.writestr(f"plc/{n}.py", bytes(1 << 20))
+    with pytest.raises(FileInvalid, match="too large for a module"):
+        wheel_hash(wheel)
+    with wheel.open("ab") as file:
+        file.truncate((1 << 20) + 1)
+    with pytest.raises(FileInvalid, match="too large for a wheel of ours"):
+        wheel_hash(wheel)

@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from gateway.core.clock import NS_PER_MS, Clock
 from gateway.core.connection import Connector
 from gateway.core.errors import ConnectionLost, FieldtwinError
-from gateway.core.events import Consumer
 from gateway.core.nursery import Nursery
 from gateway.core.values import DATA
 from gateway.devices.config import BusConfig, DeviceConfig
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.bus_turns import DeviceState
-from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.mailboxes import Inbox, Mailboxes
+from gateway.runtime.modbus_bus import ModbusBus
 from gateway.runtime.tags import TagTable
 from twin.thread_frames import Schema
 from twin.thread_link import Carrier, DatagramLink
@@ -29,18 +29,6 @@ ACK_DELAY_NS = 1000 * NS_PER_MS
 LINGER_NS = 500 * NS_PER_MS
 HALT_S = 0.5
 NOT_ASKED = DeviceState.error
-
-
-class _Inbox(Consumer[DATA]):
-    """What the modem received; says so."""
-
-    def __init__(self, event: str, news: asyncio.Event) -> None:
-        super().__init__(event, capacity=256)
-        self._news = news
-
-    def observe(self, item: DATA) -> None:
-        super().observe(item)
-        self._news.set()
 
 
 class ModemLink(DatagramLink):
@@ -57,9 +45,8 @@ class ModemLink(DatagramLink):
         self._clock = clock
         self._news = asyncio.Event()
         self._room = asyncio.Event()
-        self._inbox = _Inbox(driver.emitter.event, self._news)
-        driver.emitter.subscribe(self._inbox)
-        self._busy = False
+        self._inbox = Inbox(driver, self._news)
+        self._boxes = Mailboxes(driver, bus, self._ended)
         self._nursery = Nursery()
         self._nursery.start(bus.run(), "transmitter")
         self._nursery.start(self._pump(), "mailboxes")
@@ -92,26 +79,11 @@ class ModemLink(DatagramLink):
     async def _pump(self) -> None:
         """Every so often the next exchange with the modem's mailboxes, one at a time."""
         while True:
-            if not self._busy and self._bus.online(self._driver):
-                self._exchange()
-            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + TICK_NS)
+            now_ns = self._clock.monotonic_ns()
+            self._boxes.next(now_ns, taken=not self._inbox.queue)
+            await self._clock.sleep_until_ns(now_ns + TICK_NS)
 
-    def _exchange(self) -> None:
-        driver = self._driver
-        if driver.to_acknowledge and not self._inbox.queue:
-            self._submit(Job(driver, driver.acknowledge, self._done))
-        elif driver.consumer.queue:
-            self._submit(Job(driver, driver.send if driver.outbox_free else self._ask, self._done))
-
-    async def _ask(self) -> None:
-        await self._driver.check_outbox()
-
-    def _submit(self, job: Job) -> None:
-        self._busy = True
-        self._bus.submit(job)
-
-    def _done(self, error: FieldtwinError | None) -> None:
-        self._busy = False
+    def _ended(self, error: FieldtwinError | None) -> None:
         if not self._driver.consumer.queue:
             self._room.set()
 

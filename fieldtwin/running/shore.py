@@ -18,13 +18,13 @@ from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import Connector
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, UsageError
-from gateway.core.events import Consumer
 from gateway.core.nursery import Nursery
 from gateway.core.statemachine import encode_period
-from gateway.core.values import DATA, RESPONSE
+from gateway.core.values import RESPONSE
 from gateway.devices.config import BusConfig, DeviceConfig
 from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.mailboxes import Inbox, Mailboxes
+from gateway.runtime.modbus_bus import ModbusBus
 from gateway.runtime.tags import TagTable
 from twin.system import System
 
@@ -67,18 +67,6 @@ def parse_periods(text: str) -> tuple[int, ...]:
     return periods
 
 
-class _Inbox(Consumer[DATA]):
-    """What the far modem received; says so."""
-
-    def __init__(self, event: str, news: asyncio.Event) -> None:
-        super().__init__(event, capacity=256)
-        self._news = news
-
-    def observe(self, item: DATA) -> None:
-        super().observe(item)
-        self._news.set()
-
-
 class Shore:
     """The far end of one transmitter of `system`, reached at `endpoint`."""
 
@@ -96,11 +84,10 @@ class Shore:
         self._clock = clock
         self._driver = TransmitterDriver(far, TagTable(clock), incoming=RESPONSE)
         self._news = asyncio.Event()
-        self._inbox = _Inbox(self._driver.emitter.event, self._news)
-        self._driver.emitter.subscribe(self._inbox)
+        self._inbox = Inbox(self._driver, self._news)
         bus = BusConfig("far", endpoint, system.buses[config.bus].timeout_s, 1)
         self._bus = ModbusBus(bus, [self._driver], connector or OsConnector(), clock, TagTable(clock), lambda d: None)
-        self._busy = False
+        self._boxes = Mailboxes(self._driver, self._bus)
         self._halted = False
         self.commands_sent: list[int] = []
         self.responses: deque[bytes] = deque(maxlen=KEPT_RESPONSES)
@@ -131,9 +118,8 @@ class Shore:
             for response in self._inbox.drain():
                 self.responses_received += 1
                 self.responses.append(response.data)
-            if not self._busy and self._bus.online(self._driver):
-                self._exchange()
-            if self._busy or self._driver.to_acknowledge or self._driver.consumer.queue:
+            self._boxes.next(now_ns, taken=True)
+            if self._boxes.busy or self._driver.to_acknowledge or self._driver.consumer.queue:
                 await self._clock.sleep_until_ns(now_ns + TICK_NS)
             else:
                 await self._wait_for_news(commands[0].at_s - (now_ns - start_ns) / NS_PER_S if commands else IDLE_S)
@@ -153,23 +139,6 @@ class Shore:
         self.commands_sent.append(period_s)
         if self.on_send is not None:
             self.on_send(period_s)
-
-    def _exchange(self) -> None:
-        driver = self._driver
-        if driver.to_acknowledge:
-            self._submit(Job(driver, driver.acknowledge, self._done))
-        elif driver.consumer.queue:
-            self._submit(Job(driver, driver.send if driver.outbox_free else self._ask, self._done))
-
-    async def _ask(self) -> None:
-        await self._driver.check_outbox()
-
-    def _submit(self, job: Job) -> None:
-        self._busy = True
-        self._bus.submit(job)
-
-    def _done(self, error: FieldtwinError | None) -> None:
-        self._busy = False
 
     def describe(self) -> dict[str, Any]:
         """What the far end did and saw, for a summary."""

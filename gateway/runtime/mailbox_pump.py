@@ -7,7 +7,6 @@ digital thread are its own: here nothing is read from them, and nothing written.
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
 from gateway.core.clock import NS_PER_MS
@@ -16,13 +15,10 @@ from gateway.core.events import Consumer
 from gateway.core.values import COMMAND, DATA, RESPONSE
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.audit import AuditLog
-from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.mailboxes import Mailboxes
+from gateway.runtime.modbus_bus import ModbusBus
 
 RETRY_NS = 1000 * NS_PER_MS
-ASK_EVERY_NS = 50 * NS_PER_MS
-"""How often a full outbox is looked at again."""
-MOST_PATIENCE_NS = 2000 * NS_PER_MS
-"""How long a full outbox is not looked at, at most, because the message before took that long to leave it."""
 
 
 class MailboxPump:
@@ -45,15 +41,12 @@ class MailboxPump:
         self.commands_refused = 0
         self.remote = remote
         """The plant's switch; it may be thrown at any time."""
-        self._bus = bus
+        self._boxes = Mailboxes(driver, bus, self._ended)
         self._audit = audit
         self._allow_writes = allow_writes
         self._lent = lent
-        self._busy = False
         self._sending = 0
         self._next_ns = 0
-        self._sent_ns: int | None = None
-        self._patience_ns = 0
         self._recorded: tuple[str, object] | None = None
 
     def command(self, payload: bytes, by: str) -> bool:
@@ -96,27 +89,17 @@ class MailboxPump:
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
         """Start the next exchange. `all_consumed` says that the PLC has consumed everything that it was given."""
-        if self._busy or now_ns < self._next_ns or not self._allow_writes or not self._bus.online(self.driver):
+        if now_ns < self._next_ns or not self._allow_writes or not self._boxes.ready:
             return
         if self.driver.to_acknowledge and all_consumed and not self.inbox.queue:
             if self._on_record("inbox_ack", self.driver.to_acknowledge, now_ns):
-                self._submit(self.driver.acknowledge)
+                self._boxes.acknowledge()
         elif self.driver.consumer.queue:
-            if self.driver.outbox_free:
-                self._learn(now_ns)
-                if self._on_record("outbox", self.driver.consumer.queue[0].data.hex(), now_ns):
-                    self._sending, self._sent_ns = 1, now_ns
-                    self._submit(self.driver.send)
-            elif self._sent_ns is None or now_ns >= self._sent_ns + self._patience_ns:
-                self._next_ns = now_ns + ASK_EVERY_NS
-                self._submit(self._ask)
-
-    def _learn(self, now_ns: int) -> None:
-        """The outbox is free again. The next message will take about as long to leave it: there is no use in asking a slow
-        modem every 50 ms meanwhile. Three quarters, so that a modem that got faster is noticed."""
-        if self._sent_ns is not None:
-            self._patience_ns = min((now_ns - self._sent_ns) * 3 // 4, MOST_PATIENCE_NS)
-            self._sent_ns = None
+            if not self.driver.outbox_free:
+                self._boxes.look(now_ns)
+            elif self._on_record("outbox", self.driver.consumer.queue[0].data.hex(), now_ns):
+                self._sending = 1
+                self._boxes.send(now_ns)
 
     def _on_record(self, tag: str, new: object, now_ns: int) -> bool:
         """Note the write before it happens; without a record it waits and is tried again."""
@@ -129,15 +112,7 @@ class MailboxPump:
         self._recorded = (f"{name}.{tag}", new)
         return True
 
-    async def _ask(self) -> None:
-        await self.driver.check_outbox()
-
-    def _submit(self, run: Callable[[], Awaitable[None]]) -> None:
-        self._busy = True
-        self._bus.submit(Job(self.driver, run, self._done))
-
-    def _done(self, error: FieldtwinError | None) -> None:
-        self._busy = False
+    def _ended(self, error: FieldtwinError | None) -> None:
         self._sending = 0
         if self._recorded is not None:
             (tag, new), self._recorded = self._recorded, None

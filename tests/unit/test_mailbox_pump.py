@@ -1,4 +1,4 @@
-"""The gateway's side of a transmitter's mailboxes, in virtual time."""
+"""A transmitter's mailboxes, the gateway's side and the far end's, in virtual time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ from pathlib import Path
 
 from emulators.virtual.loop import VirtualLoop
 from fieldtwin.running.shore import Shore
+from gateway.core.clock import NS_PER_MS
 from gateway.core.nursery import Nursery
+from gateway.core.values import COMMAND
+from gateway.runtime.mailboxes import Patience
 from twin.prototype_file import load_prototype
 from twin.system import load_system
 from twin.virtual import VirtualPrototype
@@ -40,3 +43,67 @@ def test_a_slow_modem_is_not_asked_all_the_time(tmp_path: Path) -> None:
 
     loop.run_until_complete(main())
     loop.close()
+
+
+def test_nor_is_the_far_ends(tmp_path: Path) -> None:
+    loop = VirtualLoop()
+
+    async def main() -> None:
+        system = load_system("observatory")
+        async with VirtualPrototype(system, load_prototype(system), loop, tmp_path) as run, Nursery() as nursery:
+            shore = Shore(system, "modem", run.field.far["modem"], run.clock, run.net)
+            nursery.start(shore.run([]), "far end")
+            await asyncio.sleep(3.0)
+            far = shore._driver
+            for _ in range(15):
+                far.consumer.observe(COMMAND(bytes(64)))
+            while far.consumer.queue:
+                await asyncio.sleep(0.5)
+            looks, sent = far.mailbox_waits, far.sent
+            for _ in range(MESSAGES):
+                far.consumer.observe(COMMAND(bytes(64)))
+            while far.consumer.queue:
+                await asyncio.sleep(0.05)
+            assert far.sent - sent == MESSAGES
+            assert (far.mailbox_waits - looks) / MESSAGES < 2
+
+    loop.run_until_complete(main())
+    loop.close()
+
+
+def looks(patience: Patience, begin_ms: int, free_ms: int) -> list[int]:
+    """When the outbox is looked at, each 20 ms from `begin_ms` on, until it is found free."""
+    found = []
+    for now_ms in range(begin_ms, begin_ms + 100_000, 20):
+        if patience.asks(now_ms * NS_PER_MS):
+            found.append(now_ms)
+            if now_ms >= free_ms:
+                return found
+            patience.full()
+    raise AssertionError("nobody looks any more")
+
+
+def test_patience_grows_with_the_modem_and_shrinks_with_it() -> None:
+    patience = Patience()
+    patience.sent(0)
+    first = looks(patience, 0, 1000)
+    assert first == list(range(0, 1021, 60))  # nothing is known: every 50 ms, at a tick
+    patience.sent(1020 * NS_PER_MS)
+    assert looks(patience, 1040, 2020)[0] == 1020 + 780  # three quarters of 1020 ms, at a tick
+    patience.sent(2040 * NS_PER_MS)
+    assert looks(patience, 2060, 2060) == [2820]  # it was free long before; nobody looked
+    patience.sent(2820 * NS_PER_MS)
+    assert looks(patience, 2840, 2840) == [3420]
+    patience.sent(3420 * NS_PER_MS)
+    assert looks(patience, 3440, 99_000)[-1] <= 99_060
+    patience.sent(99_060 * NS_PER_MS)
+    assert looks(patience, 99_080, 99_080) == [101_060]  # no longer than two seconds
+
+
+def test_a_message_now_and_then_says_nothing_of_the_modems_pace() -> None:
+    patience = Patience()
+    for at_ms in range(0, 60_000, 10_000):
+        patience.sent(at_ms * NS_PER_MS)
+        assert looks(patience, at_ms + 5000, at_ms) == [at_ms + 5000]
+    patience.sent(60_000 * NS_PER_MS)
+    assert patience.asks(60_020 * NS_PER_MS), "the next one need not wait for that"

@@ -1,0 +1,122 @@
+"""A transmitter's mailboxes, one exchange at a time: acknowledge what came, send when there is room, and look no more often than
+the modem's own pace makes sense. At either end of a link, under whoever decides what is said."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+from gateway.core.clock import NS_PER_MS
+from gateway.core.errors import FieldtwinError
+from gateway.core.events import Consumer
+from gateway.core.values import DATA
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.modbus_bus import Job, ModbusBus
+
+ASK_EVERY_NS = 50 * NS_PER_MS
+"""How often a full outbox is looked at again."""
+MOST_PATIENCE_NS = 2000 * NS_PER_MS
+"""How long a full outbox is not looked at, at most, because the message before took that long to leave it."""
+INBOX_KEPT = 256
+
+
+class Patience:
+    """When a full outbox is worth a look: the next message will take about as long to leave it as the one before. Three quarters
+    of that, so that a modem that got faster is noticed. Pure; times are monotonic nanoseconds."""
+
+    def __init__(self) -> None:
+        self._sent_ns: int | None = None
+        self._next_ns = 0
+        self._wait_ns = 0
+        self._was_full = False
+
+    def asks(self, now_ns: int) -> bool:
+        """Whether to look now. It is taken as done."""
+        if now_ns < self._next_ns or (self._sent_ns is not None and now_ns < self._sent_ns + self._wait_ns):
+            return False
+        self._next_ns = now_ns + ASK_EVERY_NS
+        return True
+
+    def full(self) -> None:
+        """It was looked at, and the message is still there."""
+        self._was_full = True
+
+    def sent(self, now_ns: int) -> None:
+        """There was room, and a message was put into it."""
+        if self._sent_ns is not None:
+            took_ns = (now_ns - self._sent_ns) * 3 // 4
+            # Where nobody looked while it was full, it was free before by nobody knows how much.
+            self._wait_ns = min(took_ns, MOST_PATIENCE_NS if self._was_full else self._wait_ns)
+        self._sent_ns, self._was_full = now_ns, False
+
+
+class Inbox(Consumer[DATA]):
+    """What a transmitter received; says so."""
+
+    def __init__(self, driver: TransmitterDriver, news: asyncio.Event) -> None:
+        super().__init__(driver.emitter.event, INBOX_KEPT)
+        self._news = news
+        driver.emitter.subscribe(self)
+
+    def observe(self, item: DATA) -> None:
+        super().observe(item)
+        self._news.set()
+
+
+class Mailboxes:
+    """The exchanges of `driver` on `bus`. `ended` is called with each one's error, or None, `busy` is over by then."""
+
+    def __init__(
+        self,
+        driver: TransmitterDriver,
+        bus: ModbusBus,
+        ended: Callable[[FieldtwinError | None], None] = lambda error: None,
+    ) -> None:
+        self.driver = driver
+        self.busy = False
+        self._bus = bus
+        self._ended = ended
+        self._patience = Patience()
+
+    @property
+    def ready(self) -> bool:
+        """Whether another exchange may begin."""
+        return not self.busy and self._bus.online(self.driver)
+
+    def acknowledge(self) -> None:
+        """What came was taken: the next may come."""
+        self._submit(self.driver.acknowledge)
+
+    def send(self, now_ns: int) -> None:
+        """The first message in line, into an outbox that is free."""
+        self._patience.sent(now_ns)
+        self._submit(self.driver.send)
+
+    def look(self, now_ns: int) -> None:
+        """See whether the outbox is free, where that makes sense already."""
+        if self._patience.asks(now_ns):
+            self._submit(self._check)
+
+    def next(self, now_ns: int, *, taken: bool) -> None:
+        """The exchange that is due, if any; `taken`: all that came may be acknowledged."""
+        if not self.ready:
+            return
+        if self.driver.to_acknowledge and taken:
+            self.acknowledge()
+        elif self.driver.consumer.queue:
+            if self.driver.outbox_free:
+                self.send(now_ns)
+            else:
+                self.look(now_ns)
+
+    async def _check(self) -> None:
+        if not await self.driver.check_outbox():
+            self._patience.full()
+
+    def _submit(self, run: Callable[[], Awaitable[None]]) -> None:
+        self.busy = True
+        self._bus.submit(Job(self.driver, run, self._done))
+
+    def _done(self, error: FieldtwinError | None) -> None:
+        self.busy = False
+        self._ended(error)

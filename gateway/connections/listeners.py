@@ -170,7 +170,7 @@ class TcpListener:
                 continue
             self.accepted += 1
             self._make_room()
-            client = ClientConnection(self._endpoint, address[0], address[1])
+            client = ClientConnection(self.bound, address[0], address[1])
             self._clients.append(client)
             task = loop.create_task(self._serve(client, sock), name=f"client {address[0]}:{address[1]}")
             self._tasks.add(task)

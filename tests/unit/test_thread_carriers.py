@@ -247,9 +247,11 @@ def test_an_hour_without_a_carrier_costs_nothing(tmp_path: Path) -> None:
     virtually(main)
 
 
-def test_a_schema_that_the_other_side_does_not_have_is_said_on_both(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "other", [Schema(("something.else",)), Schema(SCHEMA.names, "another plant, built alike")], ids=["tags", "system"]
+)
+def test_a_schema_that_the_other_side_does_not_have_is_said_on_both(tmp_path: Path, other: Schema) -> None:
     async def main(loop: VirtualLoop, clock: VirtualClock, net: MemoryNet) -> None:
-        other = Schema(("something.else",))
         plant = Twin("plant", tmp_path, clock, lambda: LateListening(net))
         shore = Twin("shore", tmp_path, clock, lambda: TcpDialler(ADDRESS, net, [other]), other)
         await plant.start()
@@ -327,6 +329,7 @@ def test_over_a_real_socket(tmp_path: Path) -> None:
         await eventually(lambda: equal(plant, shore))
         assert plant.arrived[0].value == b"\0\1"
         await shore.kill()
+        await eventually(lambda: plant.end.trouble.startswith(f"{listening.bound}: "))  # the port that was taken
         await plant.log(value(5000))
         await shore.start()
         await eventually(lambda: equal(plant, shore))

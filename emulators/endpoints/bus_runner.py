@@ -110,14 +110,15 @@ class BusRunner:
             self._bus.leave(node, self.now_ns())
             self._schedule()
 
-    def submit(self, node: int, frame: CanFrame, *, more: bool = False) -> bool:
-        """Queue a frame; False while the node's transmit queue is full: try again after `on_confirmed`.
+    def submit(self, node: int, frame: CanFrame, *, more: bool = False, counted: bool = True) -> bool:
+        """Queue a frame; False while the node's transmit queue is full: try again after `on_confirmed`. `counted` as in `CanBus`.
 
         With `more` the caller has further ones, and calls `settle` after the last.
         """
-        taken = self._bus.submit(node, frame, self.now_ns())
+        now_ns = self.now_ns()
+        taken = self._bus.submit(node, frame, now_ns, counted=counted)
         if not more:
-            self._schedule()
+            self._schedule(now_ns)
         return taken
 
     def withdraw(self, node: int, can_ids: Collection[int]) -> list[CanFrame]:
@@ -160,8 +161,10 @@ class BusRunner:
         for port in ports.values():
             port.on_bus_closed(error)
 
-    def _schedule(self) -> None:
-        due_ns = self.now_ns() if self._bus.has_news else self._bus.next_event_ns()
+    def _schedule(self, now_ns: int | None = None) -> None:
+        if now_ns is None:
+            now_ns = self.now_ns()
+        due_ns = now_ns if self._bus.has_news else self._bus.next_event_ns()
         if due_ns is None or self._closed is not None:
             return
         if self._timer is not None:
@@ -169,7 +172,7 @@ class BusRunner:
                 return  # it will look again then
             self._timer.cancel()
         self._due_ns = due_ns
-        if due_ns <= self.now_ns():
+        if due_ns <= now_ns:
             # Not at once: whoever submits in this turn of the loop takes part in the arbitration.
             self._timer = self._loop.call_soon(self._pump)
         else:
@@ -187,7 +190,7 @@ class BusRunner:
     def _hand_out(self) -> None:
         # The loop may fire a timer one clock resolution early; the frame's end is reached then all the same.
         deliveries = self._bus.advance(max(self.now_ns(), self._due_ns))
-        told = self._told()
+        told = self._told() if self._bus.has_news else None
         touched: dict[int, BusPort] = {}
         for delivery in deliveries:
             while told and told[0].t_ns < delivery.frame.t_ns:
@@ -208,8 +211,6 @@ class BusRunner:
 
     def _told(self) -> deque[_Told]:
         """What controllers have to tell since the last time, in its order."""
-        if not self._bus.has_news:
-            return deque()
         states = (
             _Told(
                 n.t_ns, 1, n.node, state_frame(n.state, n.tec, n.rec, restarted=restarted, t_ns=n.t_ns), violation=False
@@ -244,6 +245,12 @@ class AttachedConnection(TellsOverrun):
         self._held_back = 0
         self._room = asyncio.Event()
         self._node = runner.join(self, name)
+
+    def send_at_once(self, frame: CanFrame) -> bool:
+        """Queue `frame` where nobody waits for room and there is some. Else False, and nothing is done nor counted."""
+        if self._lost is not None:
+            raise self._loss()
+        return not self._held_back and self._runner.submit(self._node, frame, counted=False)
 
     async def send(self, frame: CanFrame) -> None:
         if self._lost is not None:
@@ -289,7 +296,8 @@ class AttachedConnection(TellsOverrun):
         return self.overruns == before
 
     def on_confirmed(self, frame: CanFrame) -> None:
-        self._room.set()
+        if self._held_back:
+            self._room.set()
 
     def on_error(self, frame: CanFrame, *, violation: bool) -> None:
         if not violation:

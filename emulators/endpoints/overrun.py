@@ -15,12 +15,8 @@ class TellsOverrun(CanConnection):
 
     _untold = 0
 
-    def feed(self, item: CanFrame) -> bool:
-        before = self.overruns
-        room = super().feed(item)
-        if self.overruns > before:
-            self._untold = item.t_ns or 1
-        return room
+    def on_overrun(self, item: CanFrame) -> None:
+        self._untold = item.t_ns or 1
 
     def on_room(self) -> None:
         if self._untold and self._lost is None:

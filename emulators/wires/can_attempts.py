@@ -7,7 +7,7 @@ is due and who takes part in its arbitration. Pure, and without any time but tha
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from emulators.wires import can_verdict
@@ -15,11 +15,13 @@ from emulators.wires.can_events import Delivery, Notice, WireFault
 from emulators.wires.can_faults import SUSPEND_BITS, Disturbance, Rule
 from emulators.wires.can_load import BusLoad
 from emulators.wires.can_nodes import BusOff, Node, Start
-from emulators.wires.can_timing import bits_on_wire, bits_to_end
+from emulators.wires.can_timing import INTERFRAME_BITS, bits_on_wire, bits_to_end
 from emulators.wires.can_verdict import Verdict
 from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
+
+_ACTIVE = CanErrorState.ACTIVE
 
 MAX_NOTICES = 4096
 """Notices and errors kept until somebody takes them; older ones go first."""
@@ -47,6 +49,21 @@ class Attempts:
         self.done: list[Delivery] = []
         self.notices: deque[Notice] = deque(maxlen=MAX_NOTICES)
         self.faults: deque[WireFault] = deque(maxlen=MAX_NOTICES)
+        self._others: dict[int, tuple[int, ...]] = {}
+        """Who receives what a node sends alone, while nobody joins, leaves or is in bus-off."""
+        self._joined_ns = 0
+        """When the newest of the nodes came."""
+
+    def join(self, number: int, node: Node) -> None:
+        """One more node, from `node.joined_ns` on; they come in the order of time."""
+        self.nodes[number] = node
+        self._joined_ns = node.joined_ns
+        self._others.clear()
+
+    def leave(self, number: int) -> None:
+        """The node receives nothing more."""
+        self.nodes[number].left = True
+        self._others.clear()
 
     def duration_ns(self, bits: int) -> int:
         """How long so many bits take: nothing where frames are instant."""
@@ -57,15 +74,17 @@ class Attempts:
         self._judge(start)
         for number in start.rivals:
             node = self.nodes.get(number)
-            if node is not None and node.faults.state is CanErrorState.BUS_OFF:
+            if node is None or node.faults.state is _ACTIVE:
+                continue  # as a rule
+            if node.faults.state is CanErrorState.BUS_OFF:
                 self._go_off(number)
-            elif node is not None and node.faults.state is CanErrorState.PASSIVE:
+            elif node.faults.state is CanErrorState.PASSIVE:
                 node.hold_ns = self.free_ns + self.duration_ns(SUSPEND_BITS)
 
     def _judge(self, start: Start) -> None:
-        if len(start.rivals) == 1:
-            frame, senders = start.winner.frame, start.rivals
-        else:
+        frame: CanFrame = start.winner.frame
+        senders: Sequence[int] = start.rivals
+        if len(senders) > 1:
             resolved = self._contend(start)
             if resolved is None:
                 return
@@ -80,9 +99,16 @@ class Attempts:
         else:
             self._unacknowledged(frame, start, senders)
 
-    def _receivers(self, start: Start, but: Collection[int]) -> list[int]:
+    def _receivers(self, start: Start, but: Sequence[int]) -> Sequence[int]:
         since_ns = start.start_ns
-        there = [n for n, node in self.nodes.items() if n not in but and not node.left and node.joined_ns <= since_ns]
+        usual = len(but) == 1 and not self.off and since_ns >= self._joined_ns
+        if usual and (known := self._others.get(but[0])) is not None:
+            return known
+        there = tuple(
+            n for n, node in self.nodes.items() if n not in but and not node.left and node.joined_ns <= since_ns
+        )
+        if usual:
+            self._others[but[0]] = there
         return [number for number in there if number not in self.off] if self.off else there
 
     def _contend(self, start: Start) -> tuple[CanFrame, list[int]] | None:
@@ -119,7 +145,7 @@ class Attempts:
         return None
 
     def _spoilt(
-        self, what: Disturbance, frame: CanFrame, start: Start, senders: list[int], receivers: list[int]
+        self, what: Disturbance, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
     ) -> bool:
         """Whether the disturbance destroyed the frame; if not, some error-passive receivers went without it."""
         victims = what.seen_by & set(receivers)
@@ -134,7 +160,7 @@ class Attempts:
         self._fail(verdict, frame, start, senders, receivers)
         return True
 
-    def _unacknowledged(self, frame: CanFrame, start: Start, senders: list[int]) -> None:
+    def _unacknowledged(self, frame: CanFrame, start: Start, senders: Sequence[int]) -> None:
         self._fail(can_verdict.unacknowledged(frame), frame, start, senders, [])
         for number in senders:
             if self.nodes[number].left:  # its process is gone: nobody tries for ever on its behalf
@@ -165,13 +191,15 @@ class Attempts:
             WireFault(at_ns, verdict.kind, frame, start.start_ns, verdict.bits, tuple(senders), tuple(counters))
         )
 
-    def _deliver(self, frame: CanFrame, start: Start, senders: list[int], receivers: list[int]) -> None:
-        bits = bits_on_wire(frame)
-        end_ns = start.start_ns + self.duration_ns(bits_to_end(frame))
+    def _deliver(self, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]) -> None:
+        if len(start.rivals) == 1:  # then its length is known already
+            bits, end_ns = start.bits + INTERFRAME_BITS, start.end_ns
+        else:
+            bits, end_ns = bits_on_wire(frame), start.start_ns + self.duration_ns(bits_to_end(frame))
         self._pass(start.start_ns, bits)
-        self.load.count(frame, bits, end_ns, tuple(senders), whole=True)
-        ended = CanFrame(frame.can_id, frame.data, frame.extended, frame.remote, dlc=frame.dlc, t_ns=end_ns)
-        self.done.append(Delivery(ended, start.start_ns, bits, tuple(senders), tuple(receivers)))
+        sent_by = tuple(senders)
+        self.load.count(frame, bits, end_ns, sent_by, whole=True)
+        self.done.append(Delivery(frame.at(end_ns), start.start_ns, bits, sent_by, tuple(receivers)))
         for number in receivers:
             node = self.nodes[number]
             node.received += 1
@@ -218,4 +246,5 @@ class Attempts:
         """A node that left is kept until its queue is empty."""
         if self.nodes[number].left and not self.nodes[number].queue:
             del self.nodes[number]
+            self._others.clear()
             self.off.forget(number)

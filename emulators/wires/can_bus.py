@@ -77,19 +77,21 @@ class CanBus:
         self._run(now_ns)
         node = self._next_node
         self._next_node += 1
-        self._wire.nodes[node] = Node(name or f"node {node}", now_ns, listen_only=listen_only)
+        self._wire.join(node, Node(name or f"node {node}", now_ns, listen_only=listen_only))
         return node
 
     def leave(self, node: int, now_ns: int) -> None:
         """The node receives nothing more. What it queued still goes out, as a kernel sends what a closed socket left."""
         self._run(now_ns)
-        self._node(node).left = True
+        leaving = self._node(node)
+        self._wire.leave(node)
         if node in self._wire.off:
-            self._node(node).queue.clear()
+            leaving.queue.clear()
         self._wire.forget_if_done(node)
 
-    def submit(self, node: int, frame: CanFrame, now_ns: int) -> bool:
-        """Queue `frame` for transmission; False (and nothing queued) while the node's transmit queue is full.
+    def submit(self, node: int, frame: CanFrame, now_ns: int, *, counted: bool = True) -> bool:
+        """Queue `frame` for transmission; False (and nothing queued) while the node's transmit queue is full. A refusal is
+        `counted` unless whoever asks comes again with this frame.
 
         Frames of one node keep their order. In bus-off they wait. Error frames are the bus's own: `UsageError`.
         """
@@ -101,7 +103,7 @@ class CanBus:
         if len(sender.queue) >= self.queue_frames:
             self._run(now_ns)  # what ended by now no longer takes a place
             if len(sender.queue) >= self.queue_frames:
-                sender.refused += 1
+                sender.refused += counted
                 return False
         self._sequence += 1
         sender.queue.append(Pending(frame, now_ns, self._sequence, arbitration_key(frame)))
@@ -185,21 +187,21 @@ class CanBus:
         """
         if self._wire.done:
             return self._wire.done[0].frame.t_ns
-        recovery = self._recovery_ns()
-        start = self._upcoming()
-        if start is None or self._idles(start):
+        start = self._next or (self._upcoming() if self._wire.waiting else None)
+        recovery = self._recovery_ns() if self._wire.off else None
+        if start is None or (not self.monitored and self._idles(start)):
             return recovery
         return start.end_ns if recovery is None else min(start.end_ns, recovery)
 
     def _run(self, now_ns: int) -> None:
         while True:
-            start = self._upcoming()
+            start = self._next or (self._upcoming() if self._wire.waiting else None)
             recovery_ns = self._recovery_ns() if self._wire.off else None
             if recovery_ns is not None and recovery_ns <= now_ns and (start is None or recovery_ns <= start.start_ns):
                 self._recover(recovery_ns)
             elif start is None or start.end_ns > now_ns:
                 return
-            elif not (self._idles(start) and self._skip(start, now_ns, recovery_ns)):
+            elif self.monitored or not (self._idles(start) and self._skip(start, now_ns, recovery_ns)):
                 self._next = None
                 self._wire.attempt(start)
 
@@ -208,19 +210,19 @@ class CanBus:
             ((number, node),) = self._wire.waiting.items()
             winner = node.queue[0]
             start_ns = max(self._wire.free_ns, winner.ready_ns, node.hold_ns)
-            end_ns = start_ns + self._wire.duration_ns(bits_to_end(winner.frame))
-            self._next = Start(start_ns, end_ns, winner, [number])
+            bits = bits_to_end(winner.frame)
+            self._next = Start(start_ns, start_ns + self._wire.duration_ns(bits), bits, winner, (number,))
         elif self._next is None and self._wire.waiting:
             heads = [(max(node.queue[0].ready_ns, node.hold_ns), number) for number, node in self._wire.waiting.items()]
             start_ns = max(self._wire.free_ns, min(heads)[0])
             contenders = [number for ready_ns, number in heads if ready_ns <= start_ns]
             winner = min((self._wire.waiting[n].queue[0] for n in contenders), key=lambda p: (p.key, p.sequence))
-            rivals = [n for n in contenders if self._wire.waiting[n].queue[0].key == winner.key]
+            rivals = tuple(n for n in contenders if self._wire.waiting[n].queue[0].key == winner.key)
             longest = bits_to_end(winner.frame)
             if len(rivals) > 1:  # of a collision, any may stay
                 longest = max(bits_to_end(self._wire.waiting[n].queue[0].frame) for n in rivals)
             end_ns = start_ns + self._wire.duration_ns(longest)
-            self._next = Start(start_ns, end_ns, winner, rivals)
+            self._next = Start(start_ns, end_ns, longest, winner, rivals)
         return self._next
 
     # -- bus-off, and attempts that change nothing ----------------------------------------------------------------

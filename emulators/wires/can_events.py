@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+
+import msgspec
 
 from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame
 
 
-class Delivery(NamedTuple):
+class Delivery(msgspec.Struct, frozen=True, gc=False):
     """One frame that went over the bus. `frame.t_ns` is its end of frame.
 
     `senders` have more than one node only where identical frames overlapped. `receivers` were on the bus at its start.

@@ -17,61 +17,74 @@ _SLOT_NS = 100 * NS_PER_MS
 _SLOTS = 10  # the load is that of the last second
 
 
-class _Slot:
-    __slots__ = ("bits", "by_id", "by_node", "number")
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-        self.bits = 0
-        self.by_id: Counter[str] = Counter()
-        self.by_node: Counter[int] = Counter()
+_EXTENDED = 1 << 29
+_OTHER = -1
 
 
 class BusLoad:
-    """Counts attempts of any outcome. `by_id` counts whole frames, named as candump writes identifiers."""
+    """Counts attempts of any outcome. An identifier is a number here, with a bit above it where it is extended; names and sums
+    are made when somebody asks."""
 
     def __init__(self, bitrate: int) -> None:
-        self.frames = 0
         self.bits = 0
-        self.by_id: Counter[str] = Counter()
+        self._by_id: dict[int, int] = {}
         self._one_s_bits = bitrate * _SLOTS * _SLOT_NS / NS_PER_S
-        self._slots: deque[_Slot] = deque(maxlen=_SLOTS)
+        self._slots: deque[tuple[int, dict[tuple[int, tuple[int, ...]], int]]] = deque(maxlen=_SLOTS)
+        """Of the last slots in which something was sent, the slot's number, and bits by identifier and senders."""
+        self._number = -1
+        self._slot: dict[tuple[int, tuple[int, ...]], int] = {}
+        """The newest of them."""
+
+    @property
+    def frames(self) -> int:
+        """Whole frames."""
+        return sum(self._by_id.values())
+
+    @property
+    def by_id(self) -> dict[str, int]:
+        """Whole frames by identifier, named as candump writes it."""
+        return {_name(key): frames for key, frames in self._by_id.items()}
 
     def count(self, frame: CanFrame, bits: int, end_ns: int, senders: tuple[int, ...], *, whole: bool) -> None:
         """`bits` were on the wire until `end_ns`; `whole`: they were a frame, not an error."""
-        name = f"{frame.can_id:08X}" if frame.extended else f"{frame.can_id:03X}"
-        if name not in self.by_id and len(self.by_id) >= MAX_IDS_COUNTED:
-            name = "other"
+        key = frame.can_id | _EXTENDED if frame.extended else frame.can_id
+        by_id = self._by_id
+        if key not in by_id and len(by_id) >= MAX_IDS_COUNTED:
+            key = _OTHER
         self.bits += bits
-        self.by_id[name] += whole  # an identifier that never got through is listed with 0
-        self.frames += whole
+        by_id[key] = by_id.get(key, 0) + whole  # an identifier that never got through is listed with 0
         number = end_ns // _SLOT_NS
-        if not self._slots or self._slots[-1].number != number:
-            self._slots.append(_Slot(number))
-        slot = self._slots[-1]
-        slot.bits += bits
-        slot.by_id[name] += bits
-        for node in senders:
-            slot.by_node[node] += bits
+        if self._number != number:
+            self._number, self._slot = number, {}
+            self._slots.append((number, self._slot))
+        by_sender, slot = (key, senders), self._slot
+        slot[by_sender] = slot.get(by_sender, 0) + bits
 
     def total(self, now_ns: int) -> float:
         """Share of the last second's bits that carried something, 0 to 1 (more is possible where frames are instant)."""
-        return sum(slot.bits for slot in self._last_second(now_ns)) / self._one_s_bits
+        return sum(bits for _, bits in self._last_second(now_ns)) / self._one_s_bits
 
     def by_identifier(self, now_ns: int) -> dict[str, float]:
         """The same, by identifier."""
         summed: Counter[str] = Counter()
-        for slot in self._last_second(now_ns):
-            summed.update(slot.by_id)
+        for (key, _), bits in self._last_second(now_ns):
+            summed[_name(key)] += bits
         return {name: bits / self._one_s_bits for name, bits in summed.items()}
 
     def by_node(self, now_ns: int) -> dict[int, float]:
         """The same, by node. Where nodes sent one frame together, it counts for each."""
         summed: Counter[int] = Counter()
-        for slot in self._last_second(now_ns):
-            summed.update(slot.by_node)
+        for (_, senders), bits in self._last_second(now_ns):
+            for node in senders:
+                summed[node] += bits
         return {node: bits / self._one_s_bits for node, bits in summed.items()}
 
-    def _last_second(self, now_ns: int) -> list[_Slot]:
+    def _last_second(self, now_ns: int) -> list[tuple[tuple[int, tuple[int, ...]], int]]:
         newest = now_ns // _SLOT_NS
-        return [slot for slot in self._slots if newest - slot.number < _SLOTS]
+        return [carried for number, slot in self._slots if newest - number < _SLOTS for carried in slot.items()]
+
+
+def _name(key: int) -> str:
+    if key == _OTHER:
+        return "other"
+    return f"{key ^ _EXTENDED:08X}" if key & _EXTENDED else f"{key:03X}"

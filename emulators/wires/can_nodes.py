@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
+
+import msgspec
 
 from emulators.wires.can_faults import RECOVERY_BITS, RECOVERY_SEQUENCES, Confinement
 from gateway.core.canframe import CanFrame
 
 
-class Pending(NamedTuple):
+class Pending(msgspec.Struct, frozen=True, gc=False):
     """A frame in a transmit queue. `sequence` is its age among all that were submitted, `key` its priority."""
 
     frame: CanFrame
@@ -22,16 +24,17 @@ class Pending(NamedTuple):
     key: int
 
 
-class Start(NamedTuple):
+class Start(msgspec.Struct, frozen=True, gc=False):
     """The next attempt, if nobody else submits anything before its start. `rivals` have one arbitration field, the winning one.
 
-    `end_ns` is the end of the longest of their frames: the attempt can be judged then.
+    `bits` go from its start to the end of the longest of their frames, `end_ns`: the attempt can be judged then.
     """
 
     start_ns: int
     end_ns: int
+    bits: int
     winner: Pending
-    rivals: list[int]
+    rivals: tuple[int, ...]
 
 
 @dataclass(slots=True)
@@ -74,37 +77,28 @@ class Node:
         }
 
 
-class BusOff:
+class BusOff(dict[int, int]):
     """The nodes in bus-off, each with the recessive sequences that it still waits for."""
-
-    def __init__(self) -> None:
-        self._left: dict[int, int] = {}
-
-    def __contains__(self, number: int) -> bool:
-        return number in self._left
-
-    def __bool__(self) -> bool:
-        return bool(self._left)
 
     def enter(self, number: int) -> None:
         """The count begins when the error frame that took it off has passed."""
-        self._left[number] = RECOVERY_SEQUENCES
+        self[number] = RECOVERY_SEQUENCES
 
     def attempt_passed(self, idle_bits: int) -> None:
         """An attempt of any outcome ended, after `idle_bits` of idle bus: its end is one more recessive sequence."""
-        for number in self._left:
-            self._left[number] = max(0, self._left[number] - idle_bits // RECOVERY_BITS - 1)
+        for number in self:
+            self[number] = max(0, self[number] - idle_bits // RECOVERY_BITS - 1)
 
     def bits_to_recovery(self) -> int:
         """Bits of idle bus until the first of them is back."""
-        return min(self._left.values()) * RECOVERY_BITS
+        return min(self.values()) * RECOVERY_BITS
 
     def take_recovered(self) -> int:
         """The first of them; it is no longer here."""
-        number = min(self._left, key=lambda n: (self._left[n], n))
-        del self._left[number]
+        number = min(self, key=lambda n: (self[n], n))
+        del self[number]
         return number
 
     def forget(self, number: int) -> None:
         """It left for good."""
-        self._left.pop(number, None)
+        self.pop(number, None)

@@ -23,6 +23,9 @@ FLAG_TX_CONFIRMED = 0x08
 """The bus tells the sender that this very frame was on the wire (record only; never on a received frame)."""
 
 
+_set = msgspec.structs.force_setattr
+
+
 class CanFrame(msgspec.Struct, frozen=True, gc=False):
     """A classic CAN frame. `can_id` is 11 bits, 29 with `extended`; `data` is 0 to 8 bytes.
 
@@ -39,8 +42,11 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
     t_ns: int = 0
 
     def __post_init__(self) -> None:
+        length = len(self.data)
         if self.dlc < 0:
-            msgspec.structs.force_setattr(self, "dlc", len(self.data))
+            _set(self, "dlc", length)
+        if 0 <= self.can_id <= 0x7FF and length <= 8 and self.dlc <= 8:
+            return  # whatever its flags
         limit = 0x1FFFFFFF if self.extended or self.error else 0x7FF
         if not 0 <= self.can_id <= limit or len(self.data) > 8 or self.dlc > 8:
             raise Desync(
@@ -48,6 +54,12 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
                 expected=f"an identifier up to {limit:X}h and at most 8 bytes",
                 got=f"{self.can_id:X}h with {len(self.data)} bytes",
             )
+
+    def at(self, t_ns: int) -> CanFrame:
+        """The same frame, received at `t_ns`."""
+        frame: CanFrame = self.__copy__()  # type: ignore[attr-defined]  # each Struct's: what is a frame is not checked again
+        _set(frame, "t_ns", t_ns)
+        return frame
 
     def key(self) -> tuple[int, bytes, bool, bool, bool, int]:
         """All that is on the wire: equal for frames that look the same to a bus analyser."""

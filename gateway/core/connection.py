@@ -267,8 +267,12 @@ class CanConnection(_End[CanFrame], ABC):
             return True
         if len(self.inbound.data_stream) >= self.max_pending:
             self.overruns += 1
+            self.on_overrun(item)
             return False
         return super().feed(item)
+
+    def on_overrun(self, item: CanFrame) -> None:
+        """Called with a frame that was dropped because the reader was too slow."""
 
     async def recv(self) -> CanFrame:
         """The next frame. Raises `ConnectionLost` once the bus is gone and all is read."""

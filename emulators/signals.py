@@ -47,6 +47,10 @@ class SignalTrack:
                 column.append(value)
         if not self._times:
             raise FileInvalid("the recording holds no rows", path=path, expected="at least one")
+        self.first_s = self._times[0]
+        """Time of the first row."""
+        self.last_s = self._times[-1]
+        """Time of the last row."""
 
     @classmethod
     def load(cls, path: Path) -> SignalTrack:
@@ -58,16 +62,6 @@ class SignalTrack:
 
     def __len__(self) -> int:
         return len(self._times)
-
-    @property
-    def first_s(self) -> float:
-        """Time of the first row."""
-        return self._times[0]
-
-    @property
-    def last_s(self) -> float:
-        """Time of the last row."""
-        return self._times[-1]
 
     @property
     def nbytes(self) -> int:
@@ -98,8 +92,13 @@ class SignalTrack:
 
     def values(self, t_s: float) -> dict[str, float]:
         """All signals at `t_s`, of one and the same instant."""
-        place = self._locate(t_s)
-        return {name: self._interpolate(column, *place) for name, column in zip(self.names, self._columns, strict=True)}
+        row, fraction = self._locate(t_s)
+        columns = self._columns
+        if fraction == 0.0:
+            numbers = [column[row] for column in columns]
+        else:
+            numbers = [column[row] + (column[row + 1] - column[row]) * fraction for column in columns]
+        return dict(zip(self.names, numbers, strict=True))
 
     def _column(self, name: str) -> int:
         try:

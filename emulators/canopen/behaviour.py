@@ -9,7 +9,6 @@ device gives with the live ones; an object that the model does not speak of pass
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping
 
@@ -20,7 +19,7 @@ from emulators.canopen.aborts import Abort, abort
 from emulators.canopen.dictionary import Key
 from emulators.canopen.emcy import Emergency
 from emulators.canopen.node_data import NodeData
-from emulators.canopen.service import Core, NmtState, Service, Source
+from emulators.canopen.service import NEVER, Core, NmtState, Service, Source
 
 Number = int | float
 
@@ -36,8 +35,8 @@ class Objects:
 
     def number(self, index: int, subindex: int = 0, default: Number = 0) -> Number:
         """The live value; `default` where the node has no such object."""
-        data_type = self._data.types.get((index, subindex))
-        return default if data_type is None else codec.decode(data_type, self._data.get(index, subindex))
+        number = self._data.decoded((index, subindex))
+        return default if number is None else number
 
     def whole(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """The live value of an integer object."""
@@ -110,7 +109,11 @@ class Behaviour(Service):
         self._source = source
         self._data = data
         self._objects = Objects(data)
-        self._wake_at_ns: int | None = None
+        self.asks_at_ns = NEVER
+        """When the model wants to be asked next."""
+        self._numeric = {key: data_type for key, data_type in data.types.items() if codec.is_number(data_type)}
+        self._encoders: dict[Key, Callable[[Number], bytes] | None] = {}
+        """By object, of those that the model spoke of; None for one that the node does not have."""
         self._seen: tuple[int, ...] = ()
 
     def connect(self, core: Core, emergency: Emergency, changed: Callable[[Iterable[Key], int], None]) -> None:
@@ -150,43 +153,38 @@ class Behaviour(Service):
     def state_changed(self, now_ns: int) -> None:
         self._step(now_ns)
 
-    def tick(self, now_ns: int) -> None:
-        due = self._wake_at_ns is not None and now_ns >= self._wake_at_ns
-        if due or self._emergency.active != self._seen:
-            self._step(now_ns)
+    @property
+    def due_ns(self) -> int:
+        """As `asks_at_ns`; at once when errors came or went since the last step, though nobody wakes the node for that."""
+        return self.asks_at_ns if self._emergency.active == self._seen else 0
 
-    def wake_at_ns(self) -> int | None:
-        return self._wake_at_ns
+    def tick(self, now_ns: int) -> None:
+        self._step(now_ns)
 
     # -- inside ---------------------------------------------------------------------------------------------------------
 
     def _step(self, now_ns: int, written: Collection[Key] = ()) -> dict[Key, bytes]:
         played = self._played(now_ns)
         outcome = self._model.step(self._situation(now_ns, written, played))
-        self._wake_at_ns = outcome.wake_at_ns
+        self.asks_at_ns = NEVER if outcome.wake_at_ns is None else outcome.wake_at_ns
         for code in outcome.clears:
             self._emergency.clear_error(code, now_ns)
         self._seen = self._emergency.active
-        values = dict(played)
-        quiet = self._encoded(outcome.readings)
         told = self._encoded(outcome.states)
+        values = {**played, **self._encoded(outcome.readings), **told}
         if self._distort is not None:
-            values = self._distort(values | quiet | told, now_ns)
+            values = self._distort(values, now_ns)
             told = {key: values[key] for key in told}
         events = [key for key, raw in told.items() if self._data.put(*key, raw)]
         for key in events:
             self._core.note(now_ns, "set", *key, told[key])
         if events:
             self._changed(events, now_ns)
-        return values if self._distort is not None else values | quiet | told
+        return values
 
     def _situation(self, now_ns: int, written: Collection[Key], played: Mapping[Key, bytes]) -> Situation:
-        types = self._data.types
-        numbers = {
-            key: codec.decode(data_type, raw)
-            for key, raw in played.items()
-            if (data_type := types.get(key)) is not None and codec.is_number(data_type)
-        }
+        numeric = self._numeric
+        numbers = {key: codec.decode(numeric[key], raw) for key, raw in played.items() if key in numeric}
         return Situation(now_ns, self._objects, numbers, written, self._emergency.active, self._core.state)
 
     def _played(self, now_ns: int) -> dict[Key, bytes]:
@@ -194,18 +192,12 @@ class Behaviour(Service):
 
     def _encoded(self, numbers: Mapping[Key, Number]) -> dict[Key, bytes]:
         out: dict[Key, bytes] = {}
+        encoders = self._encoders
         for key, number in numbers.items():
-            data_type = self._data.types.get(key)
-            if data_type is not None:
-                out[key] = codec.encode(data_type, _held(data_type, number))
+            if key not in encoders:
+                data_type = self._data.types.get(key)
+                encoders[key] = None if data_type is None else codec.held_encoder(data_type)
+            encode = encoders[key]
+            if encode is not None:
+                out[key] = encode(number)
         return out
-
-
-def _held(data_type: int, number: Number) -> Number:
-    """The number within its type; a device's registers saturate. What is no number is 0 in an integer."""
-    bounds = codec.integer_range(data_type)
-    if bounds is None:
-        return number
-    if isinstance(number, float) and not math.isfinite(number):
-        return 0 if math.isnan(number) else bounds[number > 0]
-    return min(max(round(number), bounds[0]), bounds[1])

@@ -5,7 +5,10 @@ It must never be shared with a driver: a mistake made on both sides of a wire wo
 
 from __future__ import annotations
 
+import math
 import struct
+from collections.abc import Callable
+from functools import partial
 
 BOOLEAN = 0x01
 REAL32 = 0x08
@@ -69,6 +72,27 @@ def encode(data_type: int, value: int | float) -> bytes:
         return whole.to_bytes(size, "little", signed=data_type in _SIGNED and whole < 0)
     except (OverflowError, struct.error) as e:
         raise ValueError("the number does not fit the type") from e
+
+
+def held_encoder(data_type: int) -> Callable[[int | float], bytes]:
+    """A function that makes bytes of numbers as a device does, whose registers saturate: rounded, and held within the type.
+
+    What is no number is 0 in an integer. Real types take what `encode` takes.
+    """
+    bounds = integer_range(data_type)
+    if bounds is None:
+        return partial(encode, data_type)
+    (low, high), size, signed = bounds, _INTEGER_BYTES[data_type], data_type in _SIGNED
+
+    def encode_held(number: int | float) -> bytes:
+        if number.__class__ is not int:
+            if not math.isfinite(number):
+                return encode(data_type, 0 if math.isnan(number) else bounds[number > 0])
+            number = round(number)
+        whole = low if number < low else high if number > high else number
+        return whole.to_bytes(size, "little", signed=signed)
+
+    return encode_held
 
 
 def parse_number(text: str) -> int:

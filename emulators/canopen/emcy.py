@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 
 from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import Core, Service
+from emulators.canopen.service import NEVER, Core, Service
 
 COMMUNICATION_ERROR = 0x8100
 HEARTBEAT_LOST = 0x8130
@@ -35,12 +35,10 @@ class Emergency(Service):
         self._core = core
         self._active: dict[tuple[int, str], int] = {}
         self._waiting: deque[bytes] = deque()
-        self._free_at_ns: int | None = None
-
-    @property
-    def active(self) -> tuple[int, ...]:
+        self._free_at_ns = 0
+        """End of the inhibit time."""
+        self.active: tuple[int, ...] = ()
         """Codes of the errors that are present, oldest first."""
-        return tuple(dict.fromkeys(code for code, _ in self._active))
 
     def raise_error(
         self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"", source: str = ""
@@ -51,6 +49,7 @@ class Emergency(Service):
         """
         if (code, source) not in self._active:
             self._active[code, source] = register | GENERIC
+            self._tell_active()
             self.report(code, now_ns, register=register, info=info)
 
     def report(self, code: int, now_ns: int, *, register: int = GENERIC, info: bytes = b"") -> None:
@@ -63,6 +62,7 @@ class Emergency(Service):
     def clear_error(self, code: int, now_ns: int, *, source: str = "") -> None:
         """The error is repaired: 0000h with what remains in the register. Does nothing when it was not active."""
         if self._active.pop((code, source), None) is not None:
+            self._tell_active()
             self._emit(bytes([0, 0, self._update_register(), 0, 0, 0, 0, 0]), now_ns)
 
     def owns(self, index: int) -> bool:
@@ -89,8 +89,9 @@ class Emergency(Service):
 
     def reset(self, now_ns: int) -> None:
         self._active.clear()
+        self._tell_active()
         self._waiting.clear()
-        self._free_at_ns = None
+        self._free_at_ns = 0
         self._core.data.put_number(0x1001, 0, 0)
         self._core.data.put_number(0x1003, 0, 0)
 
@@ -100,11 +101,16 @@ class Emergency(Service):
             self._waiting.clear()
 
     def tick(self, now_ns: int) -> None:
-        while not self._core.mutes and self._waiting and (self._free_at_ns is None or now_ns >= self._free_at_ns):
+        while now_ns >= self.due_ns:
             self._transmit(self._waiting.popleft(), now_ns)
 
-    def wake_at_ns(self) -> int | None:
-        return self._free_at_ns if self._waiting and not self._core.mutes else None
+    @property
+    def due_ns(self) -> int:
+        """When the next message may be sent."""
+        return self._free_at_ns if self._waiting and not self._core.mutes else NEVER
+
+    def _tell_active(self) -> None:
+        self.active = tuple(dict.fromkeys(code for code, _ in self._active))
 
     def _emit(self, message: bytes, now_ns: int) -> None:
         self._core.note(now_ns, "emcy", 0, 0, message)
@@ -121,7 +127,7 @@ class Emergency(Service):
             self._core.counters.emcys_dropped += 1
             return
         inhibit_ns = self._core.data.number(0x1015) * _UNIT_NS
-        self._free_at_ns = now_ns + inhibit_ns if inhibit_ns else None
+        self._free_at_ns = now_ns + inhibit_ns
         self._core.counters.emcys += 1
         self._core.send(cob_id & 0x7FF, message, now_ns)
 

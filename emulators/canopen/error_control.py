@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from emulators.canopen import emcy
 from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import Core, NmtState, Service
+from emulators.canopen.service import NEVER, Core, NmtState, Service
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS
 
@@ -36,33 +36,32 @@ class ErrorReaction:
 class HeartbeatProducer(Service):
     """Sends the state every 1017h milliseconds; a written period counts from that moment, its first beat at once."""
 
+    due_ns: int = NEVER
+    """When the next heartbeat is to be sent."""
+
     def __init__(self, core: Core) -> None:
         self._core = core
-        self._next_ns: int | None = None
 
     def owns(self, index: int) -> bool:
         return index == 0x1017
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
-        self._next_ns = now_ns if self._period_ns() else None
+        self.due_ns = now_ns if self._period_ns() else NEVER
 
     def reset(self, now_ns: int) -> None:
         """The boot-up message counts as the first heartbeat."""
         period_ns = self._period_ns()
-        self._next_ns = now_ns + period_ns if period_ns else None
+        self.due_ns = now_ns + period_ns if period_ns else NEVER
 
     def tick(self, now_ns: int) -> None:
-        if self._next_ns is None or now_ns < self._next_ns:
+        if now_ns < self.due_ns:
             return
         self._core.counters.heartbeats += 1
         self._core.send(ERROR_CONTROL + self._core.node_id, bytes([self._core.state]), now_ns)
         period_ns = self._period_ns()
-        self._next_ns += period_ns
-        if self._next_ns <= now_ns:  # late by more than a period: skip, never burst
-            self._next_ns = now_ns + period_ns
-
-    def wake_at_ns(self) -> int | None:
-        return self._next_ns
+        self.due_ns += period_ns
+        if self.due_ns <= now_ns:  # late by more than a period: skip, never burst
+            self.due_ns = now_ns + period_ns
 
     def _period_ns(self) -> int:
         return self._core.data.number(0x1017) * NS_PER_MS
@@ -71,12 +70,15 @@ class HeartbeatProducer(Service):
 @dataclass(slots=True)
 class _Watched:
     period_ns: int
-    deadline_ns: int | None = None
+    deadline_ns: int = NEVER
     lost: bool = False
 
 
 class HeartbeatConsumer(Service):
     """Watches the nodes of 1016h, each from its first heartbeat on; a loss is EMCY 8130h and the reaction of 1029h."""
+
+    due_ns: int = NEVER
+    """When the first of them is missing."""
 
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core
@@ -114,22 +116,24 @@ class HeartbeatConsumer(Service):
         if len(frame.data) != 1 or frame.data[0] not in set(NmtState):
             self._core.counters.ignored += 1
         elif frame.data[0] == NmtState.INITIALISING:
-            watched.deadline_ns = None  # a boot-up is no heartbeat: watching starts anew with the first one
+            watched.deadline_ns = NEVER  # a boot-up is no heartbeat: watching starts anew with the first one
         else:
             watched.deadline_ns = now_ns + watched.period_ns
             watched.lost = False
             self._clear_if_all_heard(now_ns)
+        self._find_due()
 
     def tick(self, now_ns: int) -> None:
         for watched in self._watched.values():
-            if watched.deadline_ns is not None and now_ns >= watched.deadline_ns:
-                watched.deadline_ns = None
+            if now_ns >= watched.deadline_ns:
+                watched.deadline_ns = NEVER
                 watched.lost = True
                 self._emergency.raise_error(emcy.HEARTBEAT_LOST, now_ns, register=emcy.COMMUNICATION)
                 self._react(now_ns)
+        self._find_due()
 
-    def wake_at_ns(self) -> int | None:
-        return min((w.deadline_ns for w in self._watched.values() if w.deadline_ns is not None), default=None)
+    def _find_due(self) -> None:
+        self.due_ns = min((watched.deadline_ns for watched in self._watched.values()), default=NEVER)
 
     def _clear_if_all_heard(self, now_ns: int) -> None:
         if not self.lost:
@@ -148,6 +152,7 @@ class HeartbeatConsumer(Service):
                 kept = before.get(node)
                 same = kept is not None and kept.period_ns == period_ms * NS_PER_MS
                 self._watched[node] = kept if kept is not None and same else _Watched(period_ms * NS_PER_MS)
+        self._find_due()
 
 
 def _split(value: int) -> tuple[int, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from emulators.canopen import emcy
 from emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
-from emulators.canopen.service import Core, Service
+from emulators.canopen.service import NEVER, Core, Service
 from gateway.core.clock import NS_PER_MS
 
 _SOURCE = "life guarding"
@@ -17,24 +17,26 @@ _SOURCE = "life guarding"
 class NodeGuarding(Service):
     """Answers guarding requests and watches that they come."""
 
+    due_ns: int = NEVER
+    """When the life time ends."""
+
     def __init__(self, core: Core, emergency: emcy.Emergency, react: ErrorReaction) -> None:
         self._core = core
         self._emergency = emergency
         self._react = react
         self._toggle = 0
-        self._life_ends_ns: int | None = None
         self._guarded = False
 
     def owns(self, index: int) -> bool:
         return index in (0x100C, 0x100D, 0x1017)
 
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
-        self._life_ends_ns = self._next_end(now_ns) if self._guarded else None
+        self.due_ns = self._next_end(now_ns) if self._guarded else NEVER
 
     def reset(self, now_ns: int) -> None:
         self._toggle = 0
         self._guarded = False
-        self._life_ends_ns = None
+        self.due_ns = NEVER
 
     def requested(self, now_ns: int) -> None:
         """A remote frame asked for the state."""
@@ -44,20 +46,17 @@ class NodeGuarding(Service):
         self._core.send(ERROR_CONTROL + self._core.node_id, bytes([self._toggle << 7 | self._core.state]), now_ns)
         self._toggle ^= 1
         self._guarded = True
-        self._life_ends_ns = self._next_end(now_ns)
+        self.due_ns = self._next_end(now_ns)
         self._emergency.clear_error(emcy.HEARTBEAT_LOST, now_ns, source=_SOURCE)
 
     def tick(self, now_ns: int) -> None:
-        if self._life_ends_ns is not None and now_ns >= self._life_ends_ns:
-            self._life_ends_ns = None
+        if now_ns >= self.due_ns:
+            self.due_ns = NEVER
             self._guarded = False  # watching starts anew with the next request
             self._emergency.raise_error(emcy.HEARTBEAT_LOST, now_ns, register=emcy.COMMUNICATION, source=_SOURCE)
             self._react(now_ns)
 
-    def wake_at_ns(self) -> int | None:
-        return self._life_ends_ns
-
-    def _next_end(self, now_ns: int) -> int | None:
+    def _next_end(self, now_ns: int) -> int:
         data = self._core.data
         life_ms = 0 if data.number(0x1017) else data.number(0x100C) * data.number(0x100D)
-        return now_ns + life_ms * NS_PER_MS if life_ms else None
+        return now_ns + life_ms * NS_PER_MS if life_ms else NEVER

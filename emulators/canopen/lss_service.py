@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from emulators.canopen.lss import BIT_RATES, FROM_SLAVE, UNCONFIGURED, Identity, LssSlave, LssStore
-from emulators.canopen.service import Core, Service
+from emulators.canopen.service import NEVER, Core, Service
 from gateway.core.clock import NS_PER_MS
 
 _MUTE = "bit timing"
@@ -18,19 +18,21 @@ _MUTE = "bit timing"
 class LssService(Service):
     """One node's LSS slave. `boot` is called with the time when a node that had no id has one pending."""
 
+    due_ns: int = NEVER
+    """When it talks again, at the new bit rate."""
+
     def __init__(self, core: Core, store: LssStore, boot: Callable[[int], None]) -> None:
         self._core = core
         self._boot = boot
         rates = core.data.dictionary.bit_rates or frozenset(BIT_RATES.values())
         self._slave = LssSlave(self._identity, core.node_id, rates, store)
-        self._talks_at_ns: int | None = None
         self.bit_rate: int | None = None
 
     def power_on(self) -> None:
         """What was stored is what the node has."""
         self._slave.pending_id = self._slave.stored_id
         self.bit_rate = self._slave.stored_rate
-        self._talks_at_ns = None
+        self.due_ns = NEVER
         self._core.mutes.discard(_MUTE)
 
     def adopt(self, now_ns: int) -> None:
@@ -51,20 +53,17 @@ class LssService(Service):
             self._core.send(FROM_SLAVE, reply, now_ns)
         if self._slave.activate_ms is not None:
             delay_ns, self._slave.activate_ms = self._slave.activate_ms * NS_PER_MS, None
-            self._talks_at_ns = now_ns + 2 * delay_ns
+            self.due_ns = now_ns + 2 * delay_ns
             self._core.mutes.add(_MUTE)
         unconfigured = self._core.node_id == UNCONFIGURED
         if unconfigured and not self._slave.configuring and self._slave.pending_id != UNCONFIGURED:
             self._boot(now_ns)
 
     def tick(self, now_ns: int) -> None:
-        if self._talks_at_ns is not None and now_ns >= self._talks_at_ns:
-            self._talks_at_ns = None
+        if now_ns >= self.due_ns:
+            self.due_ns = NEVER
             self._core.mutes.discard(_MUTE)
             self.bit_rate = self._slave.pending_rate or self.bit_rate
-
-    def wake_at_ns(self) -> int | None:
-        return self._talks_at_ns
 
     def _identity(self) -> Identity:
         number = self._core.data.number

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from operator import attrgetter
 
 from emulators.canopen.aborts import Abort
 from emulators.canopen.acceptance import Acceptance
@@ -33,7 +34,18 @@ from emulators.canopen.lss_service import LssService
 from emulators.canopen.node_data import NodeData
 from emulators.canopen.rpdo import Rpdos
 from emulators.canopen.sdo_channels import SdoChannels
-from emulators.canopen.service import AnswersReads, Change, Core, Held, NmtState, NodeCounters, SentPdo, Service, Source
+from emulators.canopen.service import (
+    NEVER,
+    AnswersReads,
+    Change,
+    Core,
+    Held,
+    NmtState,
+    NodeCounters,
+    SentPdo,
+    Service,
+    Source,
+)
 from emulators.canopen.storage import Storage
 from emulators.canopen.sync import Sync
 from emulators.canopen.time_of_day import TimeOfDay, TimeService
@@ -44,6 +56,9 @@ from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import UsageError
 
 NMT_COMMAND = 0x000
+
+_INITIALISING = NmtState.INITIALISING
+_DUE_NS = attrgetter("due_ns")
 
 _START, _STOP, _PRE_OPERATIONAL, _RESET_NODE, _RESET_COMMUNICATION = 1, 2, 128, 129, 130
 _TARGET = {
@@ -125,8 +140,8 @@ class CanopenNode:
         view.add(self._sdo)
         self._services = (self._sdo, *services)
         # Most services never wait for a time; those that do are asked with every frame and every tick.
-        self._tickers = [s.tick for s in self._services if type(s).tick is not Service.tick]
-        self._wakers = [s.wake_at_ns for s in self._services if type(s).wake_at_ns is not Service.wake_at_ns]
+        self._timed = tuple(s for s in self._services if type(s).tick is not Service.tick)
+        self._wakers = tuple(s for s in self._timed if s is not self._behaviour)
         if self._behaviour is not None:
             self._behaviour.connect(core, self._emergency, self._tpdos.changed)
 
@@ -176,9 +191,13 @@ class CanopenNode:
 
     def wake_at_ns(self) -> int | None:
         """When `tick` is due next; None when only a frame can make the node do something."""
-        if self.state is NmtState.INITIALISING:
-            return self._lss.wake_at_ns() if self._lss else None
-        return min([t for wake_at_ns in self._wakers if (t := wake_at_ns()) is not None], default=None)
+        if self._core.state is _INITIALISING:
+            wake_ns = self._lss.due_ns if self._lss else NEVER
+        else:
+            wake_ns = min(map(_DUE_NS, self._wakers))
+            if self._behaviour is not None and self._behaviour.asks_at_ns < wake_ns:
+                wake_ns = self._behaviour.asks_at_ns
+        return None if wake_ns == NEVER else wake_ns
 
     # -- what can happen to it ------------------------------------------------------------------------------------
 
@@ -271,9 +290,10 @@ class CanopenNode:
     # -- inside ---------------------------------------------------------------------------------------------------
 
     def _run_due(self, now_ns: int) -> None:
-        if self.state is not NmtState.INITIALISING:
-            for tick in self._tickers:
-                tick(now_ns)
+        if self._core.state is not _INITIALISING:
+            for service in self._timed:  # what one does may make the next ones due
+                if service.due_ns <= now_ns:
+                    service.tick(now_ns)
         elif self._lss is not None:
             self._lss.tick(now_ns)
 

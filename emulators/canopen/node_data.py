@@ -6,7 +6,7 @@ module must never know the bus nor the time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 
 from emulators.canopen import codec
@@ -46,6 +46,7 @@ class NodeData:
         self.rebase(node_id)
         self._stored: dict[Key, bytes] = {}
         self._live: dict[Key, bytes] = dict(self._factory)
+        self._decoded: dict[Key, int | float] = {}
         self.version = 0
         """Counts what happened to communication objects, so that others can keep what they made of them."""
 
@@ -73,10 +74,28 @@ class NodeData:
         """The value that the device left the factory with. The entry must exist."""
         return self._factory[index, subindex]
 
+    def size(self, key: Key) -> int | None:
+        """Bytes that the entry's values have; None where that varies, or there is no such entry."""
+        return self._sizes.get(key)
+
+    def joined(self, keys: Iterable[Key]) -> bytes:
+        """The live values of these entries in a row. They must exist."""
+        return b"".join(map(self._live.__getitem__, keys))
+
     def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """The live value as an unsigned integer, or `default` when the node has no such entry."""
         raw = self._live.get((index, subindex))
         return default if raw is None else int.from_bytes(raw, "little")
+
+    def decoded(self, key: Key) -> int | float | None:
+        """The live value as its type's number; None when the node has no such entry. Kept until the value changes.
+
+        Raises as `codec.decode` for a value that is none.
+        """
+        number = self._decoded.get(key)
+        if number is None and key in self.types:
+            number = self._decoded[key] = codec.decode(self.types[key], self._live[key])
+        return number
 
     def put(self, index: int, subindex: int, raw: bytes) -> bool:
         """Set a value from inside the device, whatever its access. Returns whether it changed.
@@ -84,12 +103,14 @@ class NodeData:
         Raises `UsageError` when there is no such entry or the length is not its type's.
         """
         key = (index, subindex)
+        if self._live.get(key) == raw:
+            return False
         if self._sizes.get(key, -1) != len(raw):
             self._sized(key, raw)
-        changed = self._live[key] != raw
         self._live[key] = bytes(raw)
-        self.version += changed and index < 0x2000
-        return changed
+        self._decoded.pop(key, None)
+        self.version += index < 0x2000
+        return True
 
     def put_number(self, index: int, subindex: int, value: int) -> None:
         """`put` for an unsigned value; does nothing when the node has no such entry."""
@@ -119,6 +140,7 @@ class NodeData:
     def reset(self, *, communication_only: bool) -> None:
         """Power-on values: what was stored, else the factory's (CiA 301, 7.3.2.2.1)."""
         self.version += 1
+        self._decoded.clear()
         for key, raw in self._factory.items():
             if not communication_only or key[0] in COMMUNICATION:
                 self._live[key] = self._stored.get(key, raw)

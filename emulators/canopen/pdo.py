@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
+
 from emulators.canopen.aborts import Abort, abort
 from emulators.canopen.dictionary import Key
 from emulators.canopen.node_data import NodeData
@@ -51,6 +53,26 @@ class Mapped:
         return self.index, self.subindex
 
 
+class PdoSettings(msgspec.Struct, frozen=True):
+    """One PDO's parameters, read. `valid`: it exists, on an 11-bit identifier (29-bit ones are not supported).
+
+    `mapping` are the entries in use, `length` the bytes that they fill. `whole`: each is a whole object, so that a PDO is nothing
+    but their bytes in a row.
+    """
+
+    can_id: int
+    valid: bool
+    remote_allowed: bool
+    type: int
+    inhibit_ns: int
+    event_ns: int
+    sync_start: int
+    mapping: tuple[Mapped, ...]
+    keys: tuple[Key, ...]
+    length: int
+    whole: bool
+
+
 class PdoParameters:
     """A view of one PDO's parameters in the live values. `index` is that of its communication parameter record."""
 
@@ -59,9 +81,16 @@ class PdoParameters:
         self.index = index
         self.map_index = index + MAPPING_OFFSET
         self.transmit = index >= 0x1800
-        self._mapping: list[Mapped] = []
-        self._mapping_of = -1
-        """The version of the values that `_mapping` was made of."""
+        self._settings: PdoSettings | None = None
+        self._settings_of = -1
+        """The version of the values that `_settings` were read from."""
+
+    @property
+    def settings(self) -> PdoSettings:
+        """The parameters as they are now; read again only when a communication object changed since."""
+        if self._settings is None or self._settings_of != self._data.version:
+            self._settings, self._settings_of = self._read(), self._data.version
+        return self._settings
 
     @property
     def cob(self) -> int:
@@ -69,44 +98,32 @@ class PdoParameters:
         return self._data.number(self.index, COB_ID, INVALID)
 
     @property
-    def can_id(self) -> int:
-        return self.cob & 0x7FF
-
-    @property
     def valid(self) -> bool:
-        """Exists, on an 11-bit identifier (29-bit ones are not supported)."""
+        """As in `PdoSettings`."""
         return not self.cob & (INVALID | EXTENDED)
 
-    @property
-    def remote_allowed(self) -> bool:
-        return not self.cob & NO_REMOTE
+    def _read(self) -> PdoSettings:
+        number, cob, mapping = self._data.number, self.cob, self._read_mapping()
+        sizes = [self._data.size(mapped.key) for mapped in mapping]
+        return PdoSettings(
+            can_id=cob & 0x7FF,
+            valid=self.valid,
+            remote_allowed=not cob & NO_REMOTE,
+            type=number(self.index, TYPE, 255),
+            inhibit_ns=number(self.index, INHIBIT) * INHIBIT_UNIT_NS,
+            event_ns=number(self.index, EVENT) * NS_PER_MS,
+            sync_start=number(self.index, SYNC_START),
+            mapping=mapping,
+            keys=tuple(mapped.key for mapped in mapping),
+            length=(sum(mapped.bits for mapped in mapping) + 7) // 8,
+            whole=all(size is not None and 8 * size == m.bits for m, size in zip(mapping, sizes, strict=True)),
+        )
 
-    @property
-    def type(self) -> int:
-        return self._data.number(self.index, TYPE, 255)
-
-    @property
-    def inhibit_ns(self) -> int:
-        return self._data.number(self.index, INHIBIT) * INHIBIT_UNIT_NS
-
-    @property
-    def event_ns(self) -> int:
-        return self._data.number(self.index, EVENT) * NS_PER_MS
-
-    @property
-    def sync_start(self) -> int:
-        return self._data.number(self.index, SYNC_START)
-
-    def mapping(self) -> list[Mapped]:
-        """The entries in use; a count beyond what fits is not followed (a data sheet can default to nonsense)."""
-        if self._mapping_of != self._data.version:
-            self._mapping, self._mapping_of = self._read_mapping(), self._data.version
-        return self._mapping
-
-    def _read_mapping(self) -> list[Mapped]:
+    def _read_mapping(self) -> tuple[Mapped, ...]:
+        """A count beyond what fits is not followed (a data sheet can default to nonsense)."""
         count = self._data.number(self.map_index)
-        entries = [Mapped.from_value(self._data.number(self.map_index, sub)) for sub in range(1, count + 1)]
-        return entries if sum(entry.bits for entry in entries) <= MAX_BITS else []
+        entries = tuple(Mapped.from_value(self._data.number(self.map_index, sub)) for sub in range(1, count + 1))
+        return entries if sum(entry.bits for entry in entries) <= MAX_BITS else ()
 
     def check_communication(self, subindex: int, raw: bytes) -> None:
         """Whether a communication parameter may take this value. Raises `SdoAborted`."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from emulators.canopen import emcy
 from emulators.canopen.dictionary import Key
 from emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, PdoParameters, pdo_indices
-from emulators.canopen.service import Core, Service
+from emulators.canopen.service import NEVER, Core, Service
 from gateway.core.errors import SdoAborted
 
 _FIRST = 0x1400
@@ -24,8 +24,8 @@ class _Rpdo:
     parameters: PdoParameters
     waiting: bytes | None = None
     """Received, to be applied at the next SYNC; a newer one replaces it."""
-    deadline_ns: int | None = None
-    """When the next one must be here; None before the first."""
+    deadline_ns: int = NEVER
+    """When the next one must be here; never before the first."""
 
     @property
     def source(self) -> str:
@@ -35,6 +35,9 @@ class _Rpdo:
 
 class Rpdos(Service):
     """All RPDOs of a node. `changed` is told which values a PDO changed, `wrote` after it which ones it brought."""
+
+    due_ns: int = NEVER
+    """When the first of them is missing."""
 
     def __init__(
         self,
@@ -67,6 +70,7 @@ class Rpdos(Service):
                 rpdo.waiting = None
             if rpdo.parameters.index == index and subindex in (COB_ID, EVENT):
                 self._stop_watching(rpdo, now_ns)
+        self._find_due()
 
     def reset(self, now_ns: int) -> None:
         self._forget(now_ns)
@@ -76,29 +80,30 @@ class Rpdos(Service):
 
     def tick(self, now_ns: int) -> None:
         for rpdo in self._rpdos:
-            if rpdo.deadline_ns is not None and now_ns >= rpdo.deadline_ns:
-                rpdo.deadline_ns = None
+            if now_ns >= rpdo.deadline_ns:
+                rpdo.deadline_ns = NEVER
                 self._emergency.raise_error(emcy.RPDO_TIMEOUT, now_ns, register=emcy.COMMUNICATION, source=rpdo.source)
+        self._find_due()
 
-    def wake_at_ns(self) -> int | None:
-        return min((r.deadline_ns for r in self._rpdos if r.deadline_ns is not None), default=None)
+    def _find_due(self) -> None:
+        self.due_ns = min((rpdo.deadline_ns for rpdo in self._rpdos), default=NEVER)
 
     def receive(self, can_id: int, payload: bytes, now_ns: int) -> bool:
         """A data frame. Returns whether it is an RPDO of ours, applied or not."""
-        mine = [r for r in self._rpdos if r.parameters.valid and r.parameters.can_id == can_id]
+        mine = [r for r in self._rpdos if (s := r.parameters.settings).valid and s.can_id == can_id]
         for rpdo in mine:
             if not self._core.operational:
                 self._core.counters.ignored += 1
                 continue
-            needed = (sum(mapped.bits for mapped in rpdo.parameters.mapping()) + 7) // 8
-            if len(payload) < needed:
+            settings = rpdo.parameters.settings
+            if len(payload) < settings.length:
                 self._core.counters.rpdos_refused += 1
                 self._emergency.report(emcy.PDO_TOO_SHORT, now_ns, register=emcy.COMMUNICATION)
                 continue
-            event_ns = rpdo.parameters.event_ns
-            rpdo.deadline_ns = now_ns + event_ns if event_ns else None
+            rpdo.deadline_ns = now_ns + settings.event_ns if settings.event_ns else NEVER
+            self._find_due()
             self._emergency.clear_error(emcy.RPDO_TIMEOUT, now_ns, source=rpdo.source)
-            if rpdo.parameters.type > 240:
+            if settings.type > 240:
                 self._apply(rpdo, payload, now_ns)
             elif self._in_window(now_ns):
                 rpdo.waiting = payload
@@ -117,9 +122,10 @@ class Rpdos(Service):
         for rpdo in self._rpdos:
             rpdo.waiting = None
             self._stop_watching(rpdo, now_ns)
+        self._find_due()
 
     def _stop_watching(self, rpdo: _Rpdo, now_ns: int) -> None:
-        rpdo.deadline_ns = None
+        rpdo.deadline_ns = NEVER
         self._emergency.clear_error(emcy.RPDO_TIMEOUT, now_ns, source=rpdo.source)
 
     def _apply(self, rpdo: _Rpdo, payload: bytes, now_ns: int) -> None:
@@ -127,7 +133,7 @@ class Rpdos(Service):
         data = self._core.data
         packed, position = int.from_bytes(payload, "little"), 0
         values: list[tuple[Key, bytes]] = []
-        for mapped in rpdo.parameters.mapping():
+        for mapped in rpdo.parameters.settings.mapping:
             value = packed >> position & ((1 << mapped.bits) - 1)
             position += mapped.bits
             entry = data.dictionary.entry(*mapped.key)

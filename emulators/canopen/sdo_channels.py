@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from emulators.canopen.aborts import Abort, abort
 from emulators.canopen.sdo_server import ObjectAccess, SdoServer
-from emulators.canopen.service import Core, Service
+from emulators.canopen.service import NEVER, Core, Service
 
 REQUEST, RESPONSE = 0x600, 0x580
 DEFAULT = 0x1200
@@ -20,6 +20,9 @@ _RESERVED = 0x3FFFF800
 
 class SdoChannels(Service):
     """All SDO servers of a node, each with its own transfer. `tolerate_short` takes requests of fewer than 8 bytes."""
+
+    due_ns: int = NEVER
+    """When the first of the transfers wants something."""
 
     def __init__(self, core: Core, access: ObjectAccess, timeout_ns: int, block: int, *, tolerate_short: bool) -> None:
         self._core = core
@@ -44,10 +47,12 @@ class SdoChannels(Service):
     def wrote(self, index: int, subindex: int, now_ns: int) -> None:
         if subindex in (_TO_SERVER, _TO_CLIENT):
             self._servers[index].reset()
+            self._find_due()
 
     def reset(self, now_ns: int) -> None:
         for server in self._servers.values():
             server.reset()
+        self.due_ns = NEVER
 
     def state_changed(self, now_ns: int) -> None:
         if not self._core.communicating:
@@ -59,6 +64,7 @@ class SdoChannels(Service):
             ids = self._ids(index)
             if ids is not None and ids[0] == can_id:
                 self._request(server, ids[1], data, now_ns)
+                self._find_due()
                 return True
         return False
 
@@ -68,9 +74,14 @@ class SdoChannels(Service):
                 ids = self._ids(index)
                 for reply in server.tick(now_ns) if ids else ():
                     self._send(ids[1] if ids else 0, reply, now_ns)
+        self._find_due()
 
-    def wake_at_ns(self) -> int | None:
-        return min((s.deadline_ns for s in self._servers.values() if s.deadline_ns is not None), default=None)
+    def _find_due(self) -> None:
+        due_ns = NEVER
+        for server in self._servers.values():
+            if server.deadline_ns is not None and server.deadline_ns < due_ns:
+                due_ns = server.deadline_ns
+        self.due_ns = due_ns
 
     def _ids(self, index: int) -> tuple[int, int] | None:
         """Identifiers of requests and responses; None where the server is not valid."""

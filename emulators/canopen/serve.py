@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 from emulators.canopen.node import CanopenNode
@@ -25,6 +26,15 @@ class TakesBack(Protocol):
 
     def withdraw(self, can_ids: Collection[int], /) -> list[CanFrame]:
         """The frames that were taken back, in order."""
+        ...
+
+
+@runtime_checkable
+class SendsAtOnce(Protocol):
+    """A connection of this process, whose queue as a rule has room. A socket's is the kernel's."""
+
+    def send_at_once(self, frame: CanFrame, /) -> bool:
+        """Queue `frame` now. False where that would take longer: nothing happened, and `send` waits. Raises `ConnectionLost`."""
         ...
 
 
@@ -47,13 +57,22 @@ async def serve_node(
 
 
 class _Shell:
-    """A node between frames and time. One thing at a time: what follows from it is sent before the next is looked at."""
+    """A node between frames and time. One thing at a time: what follows from it is sent before the next is looked at.
+
+    Where the connection can send at once and nobody is in the midst of something, all is done on the spot, by the timer's
+    callback itself; else by a task that holds the turn.
+    """
 
     def __init__(self, connection: CanConnection, node: CanopenNode, clock: Clock) -> None:
         self._connection = connection
+        self._send_at_once = connection.send_at_once if isinstance(connection, SendsAtOnce) else None
         self._node = node
         self._clock = clock
         self._turn = asyncio.Lock()
+        self._left: list[CanFrame] = []
+        """What was begun on the spot and found no room: whoever has the turn next sends it before anything else."""
+        self._overdue: Collection[int] = ()
+        self._failed: Exception | None = None
         self._woken = asyncio.Event()
         self._timer: asyncio.TimerHandle | None = None
         self._timer_ns: int | None = None
@@ -62,14 +81,20 @@ class _Shell:
         await self._do(self._node.start)
         while True:
             frame = await self._connection.recv()
-            await self._do(lambda now_ns, frame=frame: self._node.feed(frame, now_ns))  # type: ignore[misc]
+            if self._may_do_at_once():
+                self._do_at_once(self._node.feed(frame, self._clock.monotonic_ns()))
+            else:
+                await self._do(partial(self._node.feed, frame))
 
     async def tick(self) -> None:
         try:
             while True:
                 await self._woken.wait()
                 self._woken.clear()
-                self._timer = self._timer_ns = None
+                if self._failed is not None:
+                    raise self._failed
+                if self._timer is None:
+                    self._timer_ns = None
                 await self._do(self._node.tick)
         finally:
             if self._timer is not None:
@@ -79,16 +104,60 @@ class _Shell:
         while True:
             await self._do(await pokes.get())
 
-    async def _do(self, what: Poke) -> None:
-        async with self._turn:
-            await self._send(what(self._clock.monotonic_ns()))
-            overdue = self._node.take_overdue()
-            if overdue and isinstance(self._connection, TakesBack):
-                dropped = self._connection.withdraw(overdue)
-                await self._send(self._node.dropped(dropped, self._clock.monotonic_ns()))
+    def _on_time(self) -> None:
+        self._timer = None
+        if not self._may_do_at_once():
+            self._woken.set()
+            return
+        self._timer_ns = None
+        try:
+            self._do_at_once(self._node.tick(self._clock.monotonic_ns()))
+        except Exception as e:  # not lost: `tick` raises it, and so ends the node
+            self._failed = e
+            self._woken.set()
+
+    # -- on the spot ----------------------------------------------------------------------------------------------------
+
+    def _may_do_at_once(self) -> bool:
+        """Whether nobody has the turn, and nothing is left over."""
+        return self._send_at_once is not None and not (self._left or self._overdue or self._turn.locked())
+
+    def _do_at_once(self, frames: list[CanFrame]) -> None:
+        """Send what came of something. What cannot go out now is left to `tick`, and the timer with it."""
+        send_at_once = self._send_at_once
+        assert send_at_once is not None
+        for sent, frame in enumerate(frames):
+            if not send_at_once(frame):
+                self._left = frames[sent:]
+                self._woken.set()
+                return
+        self._overdue = self._node.take_overdue()
+        if self._overdue:
+            self._woken.set()
+        else:
             self._set_timer()
 
-    async def _send(self, frames: list[CanFrame]) -> None:
+    # -- in turn --------------------------------------------------------------------------------------------------------
+
+    async def _do(self, what: Poke) -> None:
+        async with self._turn:
+            await self._follow_up()
+            self._left = what(self._clock.monotonic_ns())
+            await self._follow_up()
+            self._set_timer()
+
+    async def _follow_up(self) -> None:
+        """Send what is left, and take back what is late; somebody who came first may have left it."""
+        await self._send_left()
+        overdue = self._overdue or self._node.take_overdue()
+        self._overdue = ()
+        if overdue and isinstance(self._connection, TakesBack):
+            dropped = self._connection.withdraw(overdue)
+            self._left = self._node.dropped(dropped, self._clock.monotonic_ns())
+            await self._send_left()
+
+    async def _send_left(self) -> None:
+        frames, self._left = self._left, []
         for frame in frames:
             await self._connection.send(frame)
 
@@ -102,4 +171,4 @@ class _Shell:
         self._timer_ns = wake_ns
         if wake_ns is not None:
             left_s = (wake_ns - self._clock.monotonic_ns()) / NS_PER_S
-            self._timer = asyncio.get_running_loop().call_later(max(0.0, left_s), self._woken.set)
+            self._timer = asyncio.get_running_loop().call_later(max(0.0, left_s), self._on_time)

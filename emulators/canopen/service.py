@@ -10,7 +10,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
+
+import msgspec
 
 from emulators.canopen.node_data import NodeData
 from gateway.core.canframe import CanFrame
@@ -23,6 +25,9 @@ class NmtState(IntEnum):
     STOPPED = 4
     OPERATIONAL = 5
     PRE_OPERATIONAL = 127
+
+
+_OPERATIONAL = NmtState.OPERATIONAL
 
 
 @dataclass(slots=True)
@@ -58,7 +63,7 @@ class NodeCounters:
         return {f.name: getattr(self, f.name) for f in fields(self)}
 
 
-class SentPdo(NamedTuple):
+class SentPdo(msgspec.Struct, frozen=True, gc=False):
     """One TPDO that left the node."""
 
     t_ns: int
@@ -132,7 +137,7 @@ class Core:
 
     @property
     def operational(self) -> bool:
-        return self.state is NmtState.OPERATIONAL
+        return self.state is _OPERATIONAL
 
     def send(self, can_id: int, data: bytes, now_ns: int) -> None:
         """Queue a frame for this turn's output; while the node is mute it is lost, and counted."""
@@ -150,9 +155,9 @@ class Core:
     def refresh(self, now_ns: int) -> None:
         """Take the source's values of `now_ns`. Raises `UsageError` when they do not fit the dictionary."""
         if self._source is not None:
-            values = self._source(now_ns)
+            values, put = self._source(now_ns), self.data.put
             for (index, subindex), raw in values.items():
-                self.data.put(index, subindex, raw)
+                put(index, subindex, raw)
             if self.held is not None:
                 self.held(values, now_ns)
 
@@ -172,8 +177,18 @@ class Core:
             self.held({(index, subindex): data}, now_ns)
 
 
+NEVER = 1 << 63
+"""A time that does not come."""
+
+
 class Service:
     """The hooks; each does nothing by default. `check_*` raise `SdoAborted` to refuse."""
+
+    @property
+    def due_ns(self) -> int:
+        """When `tick` has something to do next. Asked for after all that happens: a service that waits for one time keeps it
+        as an attribute of this name."""
+        return NEVER
 
     def owns(self, index: int) -> bool:
         """Whether `check_*` and `wrote` are to be called for `index`."""
@@ -195,8 +210,4 @@ class Service:
         """After a change of NMT state, except the one to INITIALISING."""
 
     def tick(self, now_ns: int) -> None:
-        """Do what is due."""
-
-    def wake_at_ns(self) -> int | None:
-        """When `tick` has something to do next; None for never."""
-        return None
+        """Do what is due. Called once `due_ns` has come."""

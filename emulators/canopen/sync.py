@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from emulators.canopen import emcy
 from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import Core, NmtState, Service
+from emulators.canopen.service import NEVER, Core, NmtState, Service
 from gateway.core.canframe import CanFrame
 
 DEFAULT_COB_ID = 0x80
@@ -30,8 +30,7 @@ class Sync(Service):
         self._on_sync = on_sync
         self._last_ns: int | None = None
         self._late_told = False
-        self._missing_at_ns: int | None = None
-        self._send_at_ns: int | None = None
+        self._missing_at_ns = self._send_at_ns = NEVER
         self._counter = 1
         self._was_stopped = False
 
@@ -55,19 +54,20 @@ class Sync(Service):
         if index == COB_ID:
             self._counter = 1
         if index in (COB_ID, CYCLE):
-            self._missing_at_ns = None
+            self._missing_at_ns = NEVER
             self._emergency.clear_error(emcy.COMMUNICATION_ERROR, now_ns, source=_SOURCE)
             self._schedule(now_ns)
 
     def reset(self, now_ns: int) -> None:
-        self._last_ns = self._missing_at_ns = self._send_at_ns = None
+        self._last_ns = None
+        self._missing_at_ns = self._send_at_ns = NEVER
         self._counter = 1
 
     def state_changed(self, now_ns: int) -> None:
         """The producer counts from 1 again after STOPPED; nobody misses a SYNC that STOPPED does not hear."""
         if not self._core.communicating:
-            self._send_at_ns = self._missing_at_ns = None
-        elif self._send_at_ns is None:
+            self._send_at_ns = self._missing_at_ns = NEVER
+        elif self._send_at_ns == NEVER:
             self._schedule(now_ns)
         if self._was_stopped:
             self._counter = 1
@@ -109,14 +109,16 @@ class Sync(Service):
         return None if not window_ns or self._last_ns is None else self._last_ns + window_ns
 
     def tick(self, now_ns: int) -> None:
-        if self._missing_at_ns is not None and now_ns >= self._missing_at_ns:
-            self._missing_at_ns = None
+        if now_ns >= self._missing_at_ns:
+            self._missing_at_ns = NEVER
             self._emergency.raise_error(emcy.COMMUNICATION_ERROR, now_ns, register=emcy.COMMUNICATION, source=_SOURCE)
-        if self._send_at_ns is not None and now_ns >= self._send_at_ns:
+        if now_ns >= self._send_at_ns:
             self._produce(now_ns)
 
-    def wake_at_ns(self) -> int | None:
-        return min((t for t in (self._missing_at_ns, self._send_at_ns) if t is not None), default=None)
+    @property
+    def due_ns(self) -> int:
+        """When a SYNC is missing, or to be sent."""
+        return self._missing_at_ns if self._missing_at_ns < self._send_at_ns else self._send_at_ns
 
     @property
     def _can_id(self) -> int:
@@ -132,10 +134,10 @@ class Sync(Service):
 
     def _schedule(self, now_ns: int) -> None:
         producing = self._generates and self._cycle_ns and self._core.communicating
-        self._send_at_ns = now_ns + self._cycle_ns if producing else None
+        self._send_at_ns = now_ns + self._cycle_ns if producing else NEVER
 
     def _produce(self, now_ns: int) -> None:
-        due_ns, cycle_ns = self._send_at_ns or now_ns, self._cycle_ns
+        due_ns, cycle_ns = self._send_at_ns, self._cycle_ns
         self._send_at_ns = max(due_ns + cycle_ns, now_ns + 1)
         if due_ns + cycle_ns <= now_ns:  # late by more than a cycle: skip, never burst
             self._send_at_ns = now_ns + cycle_ns
@@ -150,7 +152,7 @@ class Sync(Service):
         self._last_ns = now_ns
         self._late_told = False
         watched = self._cycle_ns and not self._generates
-        self._missing_at_ns = now_ns + self._cycle_ns * 3 // 2 if watched else None
+        self._missing_at_ns = now_ns + self._cycle_ns * 3 // 2 if watched else NEVER
         self._emergency.clear_error(emcy.COMMUNICATION_ERROR, now_ns, source=_SOURCE)
         if self._core.operational:
             self._on_sync(counter, now_ns)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import Core, Service
+from emulators.canopen.service import NEVER, Core, Service
 from gateway.core.clock import NS_PER_MS
 
 COB_ID = 0x1012
@@ -43,11 +43,13 @@ class TimeOfDay:
 class TimeService(Service):
     """The node's time of day; None until it is told."""
 
+    due_ns: int = NEVER
+    """When to produce it next."""
+
     def __init__(self, core: Core, period_ns: int) -> None:
         self._core = core
         self._period_ns = period_ns
         self._told: tuple[TimeOfDay, int] | None = None
-        self._send_at_ns: int | None = None
 
     def now(self, now_ns: int) -> TimeOfDay | None:
         """The time of day at `now_ns`."""
@@ -89,17 +91,14 @@ class TimeService(Service):
         return True
 
     def tick(self, now_ns: int) -> None:
-        if self._send_at_ns is None or now_ns < self._send_at_ns:
+        if now_ns < self.due_ns:
             return
-        due_ns = self._send_at_ns + self._period_ns
-        self._send_at_ns = due_ns if due_ns > now_ns else now_ns + self._period_ns  # never burst
+        due_ns = self.due_ns + self._period_ns
+        self.due_ns = due_ns if due_ns > now_ns else now_ns + self._period_ns  # never burst
         time = self.now(now_ns)
         if time is not None and self._core.communicating:
             self._core.send(self._core.data.number(COB_ID) & 0x7FF, time.to_bytes(), now_ns)
 
-    def wake_at_ns(self) -> int | None:
-        return self._send_at_ns
-
     def _schedule(self, now_ns: int) -> None:
         producing = self._period_ns and self._told and self._core.data.number(COB_ID) & _PRODUCES
-        self._send_at_ns = now_ns + self._period_ns if producing else None
+        self.due_ns = now_ns + self._period_ns if producing else NEVER

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from emulators.canopen.dictionary import Key
 from emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, TYPE, PdoParameters, pdo_indices
-from emulators.canopen.service import Core, SentPdo, Service
+from emulators.canopen.service import NEVER, Core, SentPdo, Service
 from gateway.core.canframe import CanFrame
 
 SAMPLED, REMOTE = 252, 253
@@ -35,17 +35,14 @@ class _Tpdo:
     """The SYNC whose counter equals the start value came by."""
     sample: bytes | None = None
 
-    @property
-    def event_driven(self) -> bool:
-        return self.parameters.type >= 254
-
-    def due_ns(self) -> int | None:
+    def due_ns(self) -> int:
         """When an event-driven PDO is to be sent next."""
-        if not self.event_driven or not self.parameters.valid:
-            return None
+        settings = self.parameters.settings
+        if settings.type < 254 or not settings.valid:
+            return NEVER
         if self.pending:
             return self.free_at_ns
-        return None if self.event_at_ns is None else max(self.event_at_ns, self.free_at_ns)
+        return NEVER if self.event_at_ns is None else max(self.event_at_ns, self.free_at_ns)
 
 
 class Tpdos(Service):
@@ -56,6 +53,9 @@ class Tpdos(Service):
         self._window_end_ns = window_end_ns
         self._of_sync: set[int] = set()  # identifiers that the last SYNC had sent, until its window ends
         self._overdue: frozenset[int] = frozenset()
+        self._event_ns = NEVER
+        self._event_of = -1
+        """The version of the values that `_event_ns` follows from; -1 once something here changed."""
         self._tpdos = [_Tpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
     def owns(self, index: int) -> bool:
@@ -75,8 +75,9 @@ class Tpdos(Service):
             if subindex in (COB_ID, TYPE):
                 self._activate(tpdo, now_ns)
             elif subindex == EVENT:
-                event_ns = tpdo.parameters.event_ns
+                event_ns = tpdo.parameters.settings.event_ns
                 tpdo.event_at_ns = now_ns + event_ns if event_ns and self._core.operational else None
+                self._event_of = -1
 
     def reset(self, now_ns: int) -> None:
         self._of_sync.clear()
@@ -91,10 +92,12 @@ class Tpdos(Service):
 
     def changed(self, keys: Iterable[Key], now_ns: int) -> None:
         """Values changed inside the device: the event of those PDOs that map them."""
-        keys = set(keys)
-        for tpdo in self._tpdos:
-            if self._core.operational and any(mapped.key in keys for mapped in tpdo.parameters.mapping()):
-                tpdo.pending = True
+        if self._core.operational:
+            keys = set(keys)
+            for tpdo in self._tpdos:
+                if not keys.isdisjoint(tpdo.parameters.settings.keys):
+                    tpdo.pending = True
+                    self._event_of = -1
 
     def tick(self, now_ns: int) -> None:
         end_ns = self._end_of_window()
@@ -104,16 +107,21 @@ class Tpdos(Service):
         if not self._core.operational or self._core.mutes:
             return
         for tpdo in self._tpdos:
-            due_ns = tpdo.due_ns()
-            if due_ns is not None and now_ns >= due_ns:
+            if now_ns >= tpdo.due_ns():
                 self._send_event(tpdo, now_ns)
 
-    def wake_at_ns(self) -> int | None:
-        end_ns = self._end_of_window()
-        due = [] if end_ns is None else [end_ns + 1]
-        if self._core.operational and not self._core.mutes:
-            due += [due_ns for tpdo in self._tpdos if (due_ns := tpdo.due_ns()) is not None]
-        return min(due, default=None)
+    @property
+    def due_ns(self) -> int:
+        """When an event is to be told, or the synchronous window is over."""
+        core, due_ns = self._core, NEVER
+        if core.operational and not core.mutes:
+            if self._event_of != core.data.version:
+                self._event_ns = min((tpdo.due_ns() for tpdo in self._tpdos), default=NEVER)
+                self._event_of = core.data.version
+            due_ns = self._event_ns
+        if self._of_sync and (end_ns := self._end_of_window()) is not None:
+            due_ns = min(due_ns, end_ns + 1)
+        return due_ns
 
     def take_overdue(self) -> frozenset[int]:
         """Identifiers of what the last SYNC had sent, once its window is over; each SYNC's once."""
@@ -134,22 +142,23 @@ class Tpdos(Service):
         self._of_sync.clear()
         self._overdue = frozenset()
         for tpdo in self._tpdos:
-            if tpdo.parameters.valid:
+            if tpdo.parameters.settings.valid:
                 self._on_sync(tpdo, counter, now_ns)
 
     def on_remote(self, can_id: int, now_ns: int) -> bool:
         """A remote frame. Returns whether it asked for a TPDO of ours; an answer is queued where one is allowed."""
         for tpdo in self._tpdos:
-            parameters = tpdo.parameters
-            if parameters.valid and parameters.can_id == can_id:
-                if parameters.remote_allowed and self._core.operational:
-                    self._transmit(tpdo, tpdo.sample if parameters.type == SAMPLED else None, now_ns)
+            settings = tpdo.parameters.settings
+            if settings.valid and settings.can_id == can_id:
+                if settings.remote_allowed and self._core.operational:
+                    self._transmit(tpdo, tpdo.sample if settings.type == SAMPLED else None, now_ns)
                 return True
         return False
 
     def _activate(self, tpdo: _Tpdo, now_ns: int) -> None:
         """Counters start anew; becoming active is an event. The inhibit time of what was sent goes on."""
-        active = self._core.operational and tpdo.parameters.valid
+        active = self._core.operational and tpdo.parameters.settings.valid
+        self._event_of = -1
         tpdo.pending = active
         tpdo.event_at_ns = None
         tpdo.syncs = 0
@@ -157,7 +166,8 @@ class Tpdos(Service):
         tpdo.sample = None
 
     def _on_sync(self, tpdo: _Tpdo, counter: int | None, now_ns: int) -> None:
-        kind = tpdo.parameters.type
+        settings = tpdo.parameters.settings
+        kind = settings.type
         if kind == 0:
             if tpdo.pending:
                 tpdo.pending = False
@@ -165,7 +175,7 @@ class Tpdos(Service):
         elif kind == SAMPLED:
             tpdo.sample = self._build(tpdo, now_ns)
         elif kind <= 240:
-            start = tpdo.parameters.sync_start
+            start = settings.sync_start
             if counter is not None and start and not tpdo.started and counter != start:
                 return
             tpdo.started = True
@@ -178,32 +188,37 @@ class Tpdos(Service):
         return self._window_end_ns() if self._of_sync else None
 
     def _transmit_for_sync(self, tpdo: _Tpdo, now_ns: int) -> None:
-        self._of_sync.add(tpdo.parameters.can_id)
+        self._of_sync.add(tpdo.parameters.settings.can_id)
         self._transmit(tpdo, None, now_ns)
 
     def _send_event(self, tpdo: _Tpdo, now_ns: int) -> None:
-        event_ns = tpdo.parameters.event_ns
+        settings = tpdo.parameters.settings
+        event_ns = settings.event_ns
         on_time = not tpdo.pending and tpdo.event_at_ns is not None
         # The timer's grid is kept, so that lateness does not add up; after any other event it starts anew.
         next_ns = (tpdo.event_at_ns or 0) + event_ns if on_time else now_ns + event_ns
         tpdo.event_at_ns = (next_ns if next_ns > now_ns else now_ns + event_ns) if event_ns else None
         tpdo.pending = False
-        tpdo.free_at_ns = now_ns + tpdo.parameters.inhibit_ns
+        tpdo.free_at_ns = now_ns + settings.inhibit_ns
+        self._event_of = -1
         self._transmit(tpdo, None, now_ns)
 
     def _transmit(self, tpdo: _Tpdo, data: bytes | None, now_ns: int) -> None:
         data = self._build(tpdo, now_ns) if data is None else data
         if not data or self._core.mutes:
             return  # nothing mapped: the PDO carries nothing and is not sent
-        can_id = tpdo.parameters.can_id
+        can_id = tpdo.parameters.settings.can_id
         self._core.counters.tpdos += 1
         self._core.journal.append(SentPdo(now_ns, can_id, data))
         self._core.send(can_id, data, now_ns)
 
     def _build(self, tpdo: _Tpdo, now_ns: int) -> bytes:
         self._core.refresh(now_ns)
+        settings = tpdo.parameters.settings
+        if settings.whole:
+            return self._core.data.joined(settings.keys)
         packed, position = 0, 0
-        for mapped in tpdo.parameters.mapping():
+        for mapped in settings.mapping:
             packed |= (self._core.data.number(*mapped.key) & ((1 << mapped.bits) - 1)) << position
             position += mapped.bits
         return packed.to_bytes((position + 7) // 8, "little")

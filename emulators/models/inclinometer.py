@@ -14,6 +14,8 @@ SLOPES = (0x6010, 0x6020)
 _PARAMETER, _PRESET, _OFFSET, _DIFFERENTIAL = 1, 2, 3, 4
 """Where a slope's settings stand behind it."""
 
+_KEYS = tuple((slope, (slope, 0), (slope + _PRESET, 0), (slope + _OFFSET, 0)) for slope in SLOPES)
+
 INVERTED, SCALED = 1, 2
 """Bits of the operating parameter."""
 
@@ -28,23 +30,23 @@ class Inclinometer(DeviceModel):
         self._offsets = {slope: situation.objects.whole(slope + _OFFSET) for slope in SLOPES}
 
     def step(self, situation: Situation) -> Outcome:
-        objects = situation.objects
+        objects, played, written = situation.objects, situation.played, situation.written
         states: dict[Key, Number] = {}
         readings: dict[Key, Number] = {}
-        for slope in SLOPES:
-            if (slope, 0) not in situation.played:
+        for slope, reading, preset_key, offset_key in _KEYS:
+            if reading not in played:
                 continue
-            measured = float(situation.played[slope, 0])
+            measured = float(played[reading])
             parameter = objects.whole(slope + _PARAMETER)
             if parameter & INVERTED:
                 measured = -measured
             differential = objects.number(slope + _DIFFERENTIAL)
-            if (slope + _OFFSET, 0) in situation.written:
+            if offset_key in written:
                 self._offsets[slope] = objects.whole(slope + _OFFSET)
-            if (slope + _PRESET, 0) in situation.written:
+            if preset_key in written:
                 preset = objects.number(slope + _PRESET)
                 self._offsets[slope] = round(preset - measured - differential)
             offset = self._offsets.get(slope, 0)
-            readings[slope, 0] = measured + (offset + differential if parameter & SCALED else 0)
-            states[slope + _OFFSET, 0] = offset
+            readings[reading] = measured + (offset + differential if parameter & SCALED else 0)
+            states[offset_key] = offset
         return Outcome(states, readings)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from math import isnan
 
-from emulators.canopen.codec import encode, integer_range
+from emulators.canopen.codec import encode, held_encoder, integer_range
 from emulators.canopen.dictionary import Dictionary
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
@@ -26,7 +27,8 @@ class PlayedObjects:
     def __init__(self, tags: Iterable[Tag], dictionary: Dictionary, player: Signals) -> None:
         self.distortions = Distortions()
         self._player = player
-        self._objects: list[tuple[Tag, Key, int]] = []
+        self._objects: list[tuple[str, Key, float, float, bool, Callable[[int | float], bytes]]] = []
+        """The tag's name, its object, scale and offset, whether it can say "no value", and what makes the object's bytes."""
         for tag in tags:
             if tag.object is None or tag.name not in player.names:
                 continue
@@ -34,7 +36,11 @@ class PlayedObjects:
             if entry is None:
                 index, subindex = tag.object
                 raise FileInvalid(f"the EDS has no object {index:04X}h:{subindex:02X} for tag {tag.name!r}")
-            self._objects.append((tag, tag.object, entry.data_type))
+            is_float = tag.type.startswith("float")
+            encoder: Callable[[int | float], bytes] = partial(encode if is_float else _encode_whole, entry.data_type)
+            if not is_float and integer_range(entry.data_type) is not None:
+                encoder = held_encoder(entry.data_type)
+            self._objects.append((tag.name, tag.object, tag.scale, tag.offset, is_float, encoder))
         if not self._objects:
             raise FileInvalid(
                 "the recording plays nothing of this device",
@@ -46,14 +52,15 @@ class PlayedObjects:
     def __call__(self, now_ns: int) -> dict[Key, bytes]:
         values = self._player.values(now_ns)
         out: dict[Key, bytes] = {}
-        for tag, key, data_type in self._objects:
-            value = values[tag.name]
-            if self.distortions:
-                value = self.distortions.apply(tag.name, value, now_ns)
-            number = (value - tag.offset) / tag.scale
-            if math.isnan(number) and not tag.type.startswith("float"):
+        distorted = bool(self.distortions)
+        for name, key, scale, offset, is_float, encoded in self._objects:
+            value = values[name]
+            if distorted:
+                value = self.distortions.apply(name, value, now_ns)
+            number = (value - offset) / scale
+            if not is_float and isnan(number):
                 continue  # no integer says "no value": the object keeps what it has
-            out[key] = encode(data_type, number if tag.type.startswith("float") else whole(number, data_type))
+            out[key] = encoded(number)
         return out
 
 
@@ -63,6 +70,10 @@ def whole(number: float, data_type: int) -> int:
     if bounds is None:
         return round(number)
     return round(min(max(number, bounds[0]), bounds[1]))
+
+
+def _encode_whole(data_type: int, number: float) -> bytes:
+    return encode(data_type, whole(number, data_type))
 
 
 class HeldObjects:

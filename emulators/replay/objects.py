@@ -194,10 +194,11 @@ class RecordedObjects:
 
     def _pdo(self, frame: CanFrame) -> None:
         for parameters in self._tpdos:
-            if not parameters.valid or parameters.can_id != frame.can_id:
+            settings = parameters.settings
+            if not settings.valid or settings.can_id != frame.can_id:
                 continue
             packed, position = int.from_bytes(frame.data, "little"), 0
-            for mapped in parameters.mapping():
+            for mapped in settings.mapping:
                 value = packed >> position & ((1 << mapped.bits) - 1)
                 position += mapped.bits
                 if position <= 8 * len(frame.data):

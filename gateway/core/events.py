@@ -75,6 +75,11 @@ class Producer(EventHandler, Generic[D]):
         if consumer not in self._consumers:
             self._consumers.append(consumer)
 
+    @property
+    def observed(self) -> bool:
+        """Whether anybody would see an event; one that nobody sees need not be made."""
+        return bool(self._consumers)
+
     def emit(self, occurred: D) -> None:
         """Pass on exactly what occurred, in the order of subscription. Never waits."""
         for consumer in self._consumers:

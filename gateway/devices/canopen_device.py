@@ -34,7 +34,9 @@ from gateway.protocols.canopen.configure import (
 )
 from gateway.protocols.canopen.master import CanopenMaster, PdoCallback
 from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
-from gateway.protocols.canopen.pdo import PdoLengthMismatch, PdoMapping
+from gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch, PdoMapping
+
+_OPERATIONAL = NmtState.OPERATIONAL
 
 CONSTANT = frozenset({0x1000, 0x1008, 0x1009, 0x100A, 0x1018})
 """Objects that do not change while a node runs (7.5.2.1, 7.5.2.9 to 7.5.2.11, 7.5.2.19): device type, names, identity."""
@@ -50,13 +52,18 @@ NMT_COMMANDS = {
 
 @dataclass(slots=True)
 class TpdoSeen:
-    """A TPDO of the node that is listened to: `frames` since it was mapped. With 0 the node never sent it."""
+    """A TPDO of the node that is listened to: `frames` since it was mapped. With 0 the node never sent it.
+
+    `puts` are the tags of its entries with their full names, None for an entry that is no tag of ours. Made with the first frame,
+    and anew once the profile changed.
+    """
 
     number: int
     cob_id: int
     tags: tuple[str, ...]
     mapping: PdoMapping
     frames: int = 0
+    puts: tuple[tuple[str, Tag] | None, ...] | None = None
 
 
 class CanopenDriver(DeviceDriver):
@@ -93,6 +100,8 @@ class CanopenDriver(DeviceDriver):
     def reconfigure(self, config: DeviceConfig) -> None:
         super().reconfigure(config)
         self._by_object = {t.object: t for t in self.profile.tags.values()}
+        for seen in self.tpdos:
+            seen.puts = None
 
     def understood(self, tag_name: str, held: TagValue, of: TagValue | None) -> TagValue:
         """What a tag's bytes mean now."""
@@ -269,20 +278,33 @@ class CanopenDriver(DeviceDriver):
         seen.frames += 1
         if self.identity_error:
             return
-        if self.master.node_state(self.node) not in (NmtState.OPERATIONAL, None) and not self.operational:
+        master = self.master
+        state = master.node_state(self.node)
+        if state is not _OPERATIONAL and state is not None and not self.operational:
             return  # a TPDO that overtook its node's last heartbeat: the state decides
-        if self.master.heartbeat_lost(self.node):
+        if master.heartbeat_lost(self.node):
             return  # whoever sends this, the node's state is not known: only its heartbeat brings it back (CO-038)
         try:
             values = seen.mapping.unpack(data)
         except PdoLengthMismatch:
             self.malformed_pdos += 1
             return
-        for entry, raw in zip(seen.mapping.entries, values, strict=True):
-            tag = self._by_object.get((entry.index, entry.subindex))
-            if tag is not None and BITS.get(tag.type) == entry.bits:
-                self.sink.put(f"{self.config.name}.{tag.name}", decode_little(tag, raw, t_ns))
-        self.emitter.emit(MEASUREMENT(data))
+        puts = seen.puts
+        if puts is None:
+            puts = seen.puts = tuple(self._put_of(entry) for entry in seen.mapping.entries)
+        for put, raw in zip(puts, values, strict=True):
+            if put is not None:
+                name, tag = put
+                self.sink.put(name, decode_little(tag, raw, t_ns))
+        if self.emitter.observed:
+            self.emitter.emit(MEASUREMENT(data))
+
+    def _put_of(self, entry: PdoEntry) -> tuple[str, Tag] | None:
+        """The tag that an entry brings, with its full name; None where there is none, or it is of another size."""
+        tag = self._by_object.get((entry.index, entry.subindex))
+        if tag is None or BITS.get(tag.type) != entry.bits:
+            return None
+        return f"{self.config.name}.{tag.name}", tag
 
     def on_event(self, event: NodeEvent) -> None:
         """The node's state changed, or its heartbeat was lost: its values follow at once.

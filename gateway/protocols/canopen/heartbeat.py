@@ -17,6 +17,9 @@ TWIN_BOOT_NS = 100 * NS_PER_MS
 """No node boots twice within this time; two nodes with one id do (CO-042)."""
 
 
+_INITIALISING = NmtState.INITIALISING
+
+
 @dataclass(slots=True)
 class _Node:
     consumer_ns: int = 0
@@ -49,11 +52,13 @@ class HeartbeatConsumer:
 
     def state(self, node: int) -> NmtState | None:
         """The last state heard, None if none was. A lost node keeps it: see `is_lost`."""
-        return self._nodes[node].state if node in self._nodes else None
+        known = self._nodes.get(node)
+        return None if known is None else known.state
 
     def is_lost(self, node: int) -> bool:
         """Whether the node's heartbeat is overdue."""
-        return node in self._nodes and self._nodes[node].lost
+        known = self._nodes.get(node)
+        return known is not None and known.lost
 
     def expect_boot_up(self, node: int) -> None:
         """The next boot-up of `node` (0: of every node) was asked for."""
@@ -67,6 +72,10 @@ class HeartbeatConsumer:
             self.ignored += 1
             return ()
         known = self._node(node)
+        same = state is known.state and known.monitored and not known.lost and state is not _INITIALISING
+        if same and (not known.consumer_ns or t_ns <= known.heard_ns + known.consumer_ns):  # as a rule
+            known.heard_ns = max(known.heard_ns, t_ns)
+            return ()
         events = list(self._overdue(node, known, t_ns))  # nobody may have checked in between
         if state is NmtState.INITIALISING:
             events += self._booted(node, known, data, t_ns)
@@ -84,6 +93,11 @@ class HeartbeatConsumer:
     def check(self, now_ns: int) -> tuple[NodeEvent, ...]:
         """Who became overdue by `now_ns`; each is told once."""
         return tuple(event for node, known in self._nodes.items() for event in self._overdue(node, known, now_ns))
+
+    def deadline_ns(self, node: int) -> int | None:
+        """When the node's heartbeat is overdue, None while it is not watched."""
+        known = self._nodes.get(node)
+        return None if known is None else known.deadline_ns
 
     def next_deadline_ns(self) -> int | None:
         """When `check` is due next, None while nobody is watched."""

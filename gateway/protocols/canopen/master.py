@@ -212,13 +212,15 @@ class CanopenMaster:
             self.counters.ignored += 1
             return
         t_ns = frame.t_ns or self._clock.monotonic_ns()
-        callbacks = self._pdos.get(frame.can_id)
-        base, node = frame.can_id & 0x780, frame.can_id & 0x7F
+        can_id = frame.can_id
+        callbacks = self._pdos.get(can_id)
         if callbacks is not None:
             self.counters.pdos += 1
             for callback in callbacks:
                 callback(frame.data, t_ns)
-        elif (service := self._services.get(frame.can_id)) is not None:
+            return
+        base, node = can_id & 0x780, can_id & 0x7F
+        if (service := self._services.get(can_id)) is not None:
             service(frame.data, t_ns)
         elif node == 0:
             self.counters.ignored += 1  # NMT, SYNC and other broadcasts of somebody else
@@ -247,7 +249,9 @@ class CanopenMaster:
             if event.kind == "boot-up" and node in self._channels:
                 self._channels[node].on_boot_up()
             self.on_event(event)
-        self._arm()
+        due_ns = self._heartbeat.deadline_ns(node)  # no other's is another than it was
+        if due_ns is not None and (self._timer is None or due_ns < self._timer_due_ns):
+            self._arm()
 
     def _on_emcy(self, node: int, data: bytes, t_ns: int) -> None:
         if len(data) < 2:  # not even a code (CO-053)

@@ -70,9 +70,7 @@ def heartbeat_state(data: bytes) -> NmtState | None:
 
     Bit 7 set is a node guarding reply or nothing known; a length other than 1 is not a heartbeat.
     """
-    if len(data) != 1 or data[0] not in _STATES:
-        return None
-    return _STATES[data[0]]
+    return _STATES.get(data[0]) if len(data) == 1 else None
 
 
 _STATES = {int(state): state for state in NmtState}

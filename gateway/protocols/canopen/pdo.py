@@ -6,7 +6,8 @@ Pure: takes mapping entries as 1A00h-style values, cuts data into objects. Knows
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import accumulate
 
 from gateway.core.errors import Desync, UsageError, WireError
 
@@ -41,16 +42,26 @@ class PdoEntry:
 
 @dataclass(frozen=True, slots=True)
 class PdoMapping:
-    """Mapped objects in their order. At most 64 bits together; `UsageError` otherwise."""
+    """Mapped objects in their order. At most 64 bits together; `UsageError` otherwise. `bits` are those of all of them, `length`
+    the bytes that the PDO has."""
 
     entries: tuple[PdoEntry, ...]
+    bits: int = field(init=False, repr=False, compare=False)
+    length: int = field(init=False, repr=False, compare=False)
+    _cuts: tuple[tuple[int, int, int], ...] = field(init=False, repr=False, compare=False)
+    """Where each object's bits begin, a mask of as many, and the bytes that they take."""
 
     def __post_init__(self) -> None:
+        starts = tuple(accumulate((entry.bits for entry in self.entries), initial=0))
+        object.__setattr__(self, "bits", starts[-1])
+        object.__setattr__(self, "length", (self.bits + 7) // 8)
         bad = [e for e in self.entries if not (0 < e.bits <= PDO_BITS and e.index <= 0xFFFF and e.subindex <= 0xFF)]
         if bad or len(self.entries) > MAX_ENTRIES or self.bits > PDO_BITS:
             raise UsageError(
                 "not a PDO mapping", expected=f"entries of 1 to 64 bits, {PDO_BITS} bits together", got=str(self)
             )
+        cuts = tuple((at, (1 << e.bits) - 1, (e.bits + 7) // 8) for at, e in zip(starts, self.entries, strict=False))
+        object.__setattr__(self, "_cuts", cuts)
 
     @classmethod
     def from_words(cls, words: Iterable[int]) -> PdoMapping:
@@ -65,15 +76,6 @@ class PdoMapping:
         """From (index, subindex, bits)."""
         return cls(tuple(PdoEntry(*triple) for triple in objects))
 
-    @property
-    def bits(self) -> int:
-        return sum(entry.bits for entry in self.entries)
-
-    @property
-    def length(self) -> int:
-        """Bytes that the PDO has."""
-        return (self.bits + 7) // 8
-
     def unpack(self, data: bytes, *, exact: bool = False) -> tuple[bytes, ...]:
         """The bytes of each object in order, little-endian, the last one padded with zero bits.
 
@@ -84,11 +86,8 @@ class PdoMapping:
             raise PdoLengthMismatch(
                 f"a PDO of {self}", expected=f"{self.length} bytes", got=f"{len(data)} ({data.hex()})"
             )
-        word, values = int.from_bytes(data, "little"), []
-        for entry in self.entries:
-            values.append((word & ((1 << entry.bits) - 1)).to_bytes((entry.bits + 7) // 8, "little"))
-            word >>= entry.bits
-        return tuple(values)
+        word = int.from_bytes(data, "little")
+        return tuple([(word >> at & mask).to_bytes(size, "little") for at, mask, size in self._cuts])
 
     def pack(self, values: Sequence[bytes]) -> bytes:
         """The PDO's data from the bytes of each object: the inverse of `unpack`."""

@@ -177,7 +177,8 @@ def _plug(endpoint: Endpoint, options: LinkOptions) -> _Plug:
 class Link:
     """An emulated connection between `near` and `far`, running.
 
-    ``near -> far`` is `EmulatedConnection.emulate_write`, ``far -> near`` is `emulate_read`. At least one end is TCP.
+    ``near -> far`` is `EmulatedConnection.emulate_write`, ``far -> near`` is `emulate_read`. At least one end is TCP, except
+    where there are `faults`: then two serial ports of this computer will do, with the masters at the near one.
     `on_event` is told, in a line for a person, when the carrier comes, goes, or cannot be had.
     """
 
@@ -192,8 +193,11 @@ class Link:
         self._faults = faults
         self.options = options or LinkOptions()
         self._near, self._far = _plug(near, self.options), _plug(far, self.options)
-        if near.scheme not in SOCKET_SCHEMES and far.scheme not in SOCKET_SCHEMES:
-            raise UsageError(f"{near} and {far}: a link is carried over TCP", expected="at least one tcp://HOST:PORT")
+        self._serial_only = near.scheme not in SOCKET_SCHEMES and far.scheme not in SOCKET_SCHEMES
+        if self._serial_only and faults is None:
+            raise UsageError(
+                f"{near} and {far}: a link is carried over TCP", expected="at least one tcp://HOST:PORT, or --faults"
+            )
         serial = self._near.stays or self._far.stays
         self.connection = EmulatedConnection(PROTOCOL.RS232 if serial else PROTOCOL.TCP)
         self.sessions = 0
@@ -292,7 +296,8 @@ class Link:
         masters, devices = near, far
         behind: FaultyEnd | None = None
         if self._faults is not None:  # the end at which masters ask: a port that was made, or where we listen
-            behind = FaultyEnd(far if isinstance(self._far, _PtyPlug | _DoorPlug) else near, self._faults)
+            asked_at_far = isinstance(self._far, _PtyPlug | _DoorPlug) and not self._serial_only
+            behind = FaultyEnd(far if asked_at_far else near, self._faults)
             masters, devices = (behind, far) if behind.inner is near else (near, behind)
         outward = asyncio.create_task(self._pump(masters, devices, outward=True))
         inward = asyncio.create_task(self._pump(devices, masters, outward=False))

@@ -7,10 +7,11 @@ from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from emulators.endpoints.bus_runner import AttachedConnection
-from emulators.faults.can_fault import SDO_REPLY, SDO_REQUEST, BusFault, CanFault, CanPiece
+from emulators.faults.can_engine import aimed, seen, struck
+from emulators.faults.can_fault import BusFault, CanFault, CanPiece
 from emulators.faults.engine import WireFaults, in_time
 from emulators.faults.fault import Active
-from emulators.faults.frames import Frame, Framing, Way
+from emulators.faults.frames import Way
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CANConnection, CanConnection
@@ -85,23 +86,7 @@ class FaultyCan(CanConnection):
         """What becomes of the frame; None: nothing happens to it."""
         if not self._faults.active or frame.error:
             return None
-        now_ns = self._now_ns()
-        pieces: list[CanPiece] | None = None
-        for active in self._faults.in_at(now_ns):
-            fault = active.fault
-            if not isinstance(fault, CanFault) or (active.units and self.node not in active.units):
-                continue
-            if not _aimed(active, frame):
-                continue
-            if not fault.aims_at(frame, self.node) or not active.strikes(_seen(way, self.node), now_ns):
-                continue
-            before = pieces if pieces is not None else [CanPiece(frame)]
-            pieces = [
-                CanPiece(after.frame, after.delay_s + piece.delay_s)
-                for piece in before
-                for after in fault.strike(piece.frame, self.node, active.random)
-            ]
-        return pieces
+        return struck(self._faults, way, frame, self.node, self._now_ns())
 
     def _put_in(self, active: Active) -> None:
         if not isinstance(active.fault, CanFault) or (active.units and self.node not in active.units):
@@ -135,22 +120,6 @@ class FaultyCan(CanConnection):
             pass  # it was too late
 
 
-def _aimed(active: Active, frame: CanFrame) -> bool:
-    """Whether a frame is one that the fault's `cob_id` and `index` mean. An index stands in SDO requests and replies that name
-    an object, so in no segment."""
-    aim = active.aim
-    if aim.cob_id is not None and frame.can_id != aim.cob_id:
-        return False
-    if aim.index is None:
-        return True
-    sdo = frame.can_id & 0x780 in (SDO_REPLY, SDO_REQUEST) and len(frame.data) == 8
-    return sdo and int.from_bytes(frame.data[1:3], "little") == aim.index
-
-
-def _seen(way: Way, node: int) -> Frame:
-    return Frame(way, Framing.RAW, b"", node)
-
-
 def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[int]) -> Any:
     """A rule for the modelled bus (emulators/wires/can_faults.py): spoil what the nodes send while the fault lasts."""
     from emulators.wires.can_faults import Disturbance
@@ -167,7 +136,7 @@ def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[in
         if attempts is None and again is not None and again.key() == frame.key():
             again = None  # its controller sends it again, and that goes well
             return None
-        if not _aimed(active, frame) or not active.strikes(_seen(Way.REPLY, frame.can_id & 0x7F), now_ns()):
+        if not aimed(active, frame) or not active.strikes(seen(Way.REPLY, frame.can_id & 0x7F), now_ns()):
             return None
         again = frame
         spoilt += 1

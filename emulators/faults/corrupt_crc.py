@@ -14,7 +14,7 @@ class CorruptCrc(WireFault):
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
         data = frame.data
-        if frame.framing is Framing.RTU:
+        if frame.framing is Framing.RTU and data:
             return passed(data[:-1] + bytes((data[-1] ^ 0x5A,)))
         if frame.framing is Framing.ASCII and len(data) > 5:
             last = data[-3:-2]

@@ -11,7 +11,7 @@ from emulators.faults.schema import MOST, aims_of
 _ABOUT = {
     "bus": "on all that is on a bus",
     "device": "on a device",
-    "unit": "Modbus: the unit id; default: the device's",
+    "unit": "the unit id, on CAN the node id; default: the device's",
     "function": "Modbus: the function code, without the bit of an exception",
     "address": "Modbus: a PDU address, or holding:0x10",
     "register": "a tag of the device",

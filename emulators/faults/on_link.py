@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from random import Random
 from typing import Any
 
+from emulators.faults.can_fault import BusFault, CanFault
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active, Kind
 from emulators.faults.frames import Framing
@@ -14,25 +15,50 @@ from gateway.core.clock import NS_PER_S
 
 
 def check_link(spec: FaultSpec) -> None:
-    """Raises `WrongAim` for what needs a system file: devices, registers by name, CAN, values."""
-    aim = spec.aim
-    if spec.kind.kind is not Kind.BYTES:
+    """Raises `WrongAim` for what needs a system file, devices, registers by name, values; and for CAN."""
+    _check_kind(spec, Kind.BYTES, "one of a line or socket")
+    _check_names(spec, "unit, function, address")
+    if spec.aim.address is not None:
+        addressed(spec.aim.address)
+
+
+def check_can_link(spec: FaultSpec) -> None:
+    """As `check_link`, of a link between two CAN buses."""
+    _check_kind(spec, Kind.CAN, "one of a CAN bus")
+    _check_names(spec, "unit, cob_id, index")
+    if issubclass(spec.kind, BusFault):
         raise WrongAim(
-            "name", f"fault {spec.kind.name} is for {spec.kind.kind.value}", expected="one of a line or socket"
-        )
+            "name", f"fault {spec.kind.name} is one of a bus that is modelled, and a link has none",
+            hint="`fieldtwin run` and `fieldtwin with` have one",
+        )  # fmt: skip
+    if issubclass(spec.kind, CanFault) and spec.kind.appears is not CanFault.appears and spec.aim.unit is None:
+        raise WrongAim("name", f"fault {spec.kind.name} is sent by a node", expected="unit: the node's id")
+
+
+def _check_kind(spec: FaultSpec, kind: Kind, expected: str) -> None:
+    if spec.kind.kind is not kind:
+        raise WrongAim("name", f"fault {spec.kind.name} is for {spec.kind.kind.value}", expected=expected)
+
+
+def _check_names(spec: FaultSpec, expected: str) -> None:
+    aim = spec.aim
     for key, name in (("device", aim.device), ("bus", aim.bus), ("register", aim.register_)):
         if name:
-            raise WrongAim(key, f"fault {spec.id}: a link knows no names", expected="unit, function, address")
-    if aim.address is not None:
-        addressed(aim.address)
+            raise WrongAim(key, f"fault {spec.id}: a link knows no names", expected=expected)
 
 
-def wire_faults(said: Iterable[Mapping[str, Any]], framing: Framing, seed: int, start_ns: int) -> WireFaults:
-    """The faults, all put in; their times count from `start_ns`. Raises as `check_link`."""
+def wire_faults(
+    said: Iterable[Mapping[str, Any]],
+    framing: Framing,
+    seed: int,
+    start_ns: int,
+    check: Callable[[FaultSpec], None] = check_link,
+) -> WireFaults:
+    """The faults, all put in; their times count from `start_ns`. Raises as `check`."""
     faults = WireFaults(framing)
     for number, one in enumerate(said, 1):
         spec = parse_fault(dict(one), number=number)
-        check_link(spec)
+        check(spec)
         aim = spec.aim
         addresses, functions = (None, frozenset[int]()) if aim.address is None else addressed(aim.address)
         until_ns = None if spec.until_s is None else start_ns + round(spec.until_s * NS_PER_S)

@@ -9,7 +9,7 @@ from random import Random
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from emulators.faults.can_fault import BusFault, CanFault
@@ -421,6 +421,7 @@ def test_no_byte_is_lost_or_made(chunks: list[bytes], framing: Framing) -> None:
 
 
 @settings(max_examples=60, deadline=None)
+@example(b"", Framing.RTU, FAULTS["corrupt-crc"])
 @given(
     st.binary(max_size=40),
     st.sampled_from(Framing),

@@ -189,6 +189,34 @@ def test_a_link_puts_faults_between_strangers() -> None:
     run(main())
 
 
+def test_a_link_puts_faults_between_two_programs_with_serial_ports(tmp_path: Path) -> None:
+    """Masters are at the near one: what comes in there is a request."""
+
+    async def main() -> None:
+        near, far = (Endpoint("pty", path=str(tmp_path / name)) for name in ("master", "device"))
+        faults = at_once({"name": "drop", "direction": "request", "nth": 1}, {"name": "truncate"}, framing=Framing.RAW)
+        link = Link(near, far, faults=faults)
+        await link.open()
+        serving = asyncio.create_task(link.serve())
+        with (
+            (tmp_path / "master").open("r+b", buffering=0) as master,
+            (tmp_path / "device").open("r+b", buffering=0) as device,
+        ):
+            await eventually(lambda: link.connected)
+            drop = next(iter(faults.active.values()))
+            master.write(REQUEST)
+            await eventually(lambda: drop.struck == 1)
+            master.write(REQUEST[::-1])
+            assert await asyncio.to_thread(device.read, 100) == REQUEST[::-1]
+            device.write(REPLY)
+            assert await asyncio.to_thread(master.read, 100) == REPLY[:-2]
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        await link.aclose()
+
+    run(main())
+
+
 def test_a_link_strikes_whole_frames_of_a_stream_in_whatever_pieces_they_come() -> None:
     """A digital thread over TCP: half a frame that is passed on by and by, or struck, would be the end of the stream."""
 

@@ -1,0 +1,129 @@
+"""Two CAN buses as one, with faults between them: masters on the near one, nodes on the far one, all of them programs of others.
+
+A frame that comes from the near side is a request, one from the far side a reply, of the node that its identifier names in the
+predefined connection set (CiA 301, 7.3.3). Frames keep their order but for those that a fault delays.
+What they mean is not known.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine, Sequence
+from typing import Any
+
+from emulators.faults.can_engine import struck
+from emulators.faults.can_fault import CanFault, CanPiece
+from emulators.faults.engine import WireFaults, in_time
+from emulators.faults.fault import Active
+from emulators.faults.frames import Way
+from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
+from gateway.core.connection import CanConnection
+from gateway.core.errors import FieldtwinError, WireError
+
+MOST_WAITING = 10_000
+"""Frames that wait for their time; what is more is lost and counted."""
+NMT, NO_NODE = 0x000, 0
+
+
+class CanLink:
+    """Runs from `start` to `aclose`, or until one of the two buses is gone: `ended` then gives why. Closes both ends."""
+
+    def __init__(self, near: CanConnection, far: CanConnection, faults: WireFaults) -> None:
+        self.passed = dict.fromkeys(Way, 0)
+        """Frames that were sent on, by their way."""
+        self.lost = 0
+        """Frames that the other bus did not take, or that too many waited before."""
+        self._near, self._far = near, far
+        self._faults = faults
+        self._loop = asyncio.get_running_loop()
+        self._waiting: set[asyncio.TimerHandle] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.ended: asyncio.Future[FieldtwinError] = self._loop.create_future()
+
+    def start(self) -> None:
+        """Forward from now on; what a fault adds by itself comes at its time."""
+        for way, source in ((Way.REQUEST, self._near), (Way.REPLY, self._far)):
+            self._task(self._pump(source, way), f"CAN link, {way.value}")
+        for active in self._faults.active.values():
+            self._appear(active)
+
+    async def aclose(self) -> None:
+        """Stop, and leave both buses. Closing twice does nothing."""
+        for timer in self._waiting:
+            timer.cancel()
+        self._waiting.clear()
+        for task in tuple(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        for end in (self._near, self._far):
+            await end.aclose()
+        self.ended.cancel()
+
+    async def _pump(self, source: CanConnection, way: Way) -> None:
+        try:
+            while True:
+                frame = await source.recv()
+                if frame.error:
+                    continue  # it tells of one controller, not of a bus
+                for piece in self._become(frame, way):
+                    if piece.delay_s <= 0:
+                        await self._pass(piece.frame, way)
+                    else:
+                        self._later(piece.delay_s, piece.frame, way)
+        except FieldtwinError as e:
+            if not self.ended.done():
+                self.ended.set_result(e)
+
+    def _become(self, frame: CanFrame, way: Way) -> Sequence[CanPiece]:
+        pieces = struck(self._faults, way, frame, node_of(frame), self._now_ns()) if self._faults.active else None
+        return (CanPiece(frame),) if pieces is None else pieces
+
+    async def _pass(self, frame: CanFrame, way: Way) -> None:
+        try:
+            await (self._far if way is Way.REQUEST else self._near).send(frame)
+        except WireError:
+            self.lost += 1  # a transmit queue that stays full; the next one may fit
+        else:
+            self.passed[way] += 1
+
+    def _appear(self, active: Active) -> None:
+        """What only the fault sends: the node that it aims at says it."""
+        if not isinstance(active.fault, CanFault) or active.aim.unit is None:
+            return
+        wait_s = max(0.0, (active.from_ns - self._now_ns()) / NS_PER_S)
+        for piece in active.fault.appears(active.aim.unit, active.random):
+            self._later(piece.delay_s + wait_s, piece.frame, Way.REPLY, active)
+
+    def _later(self, delay_s: float, frame: CanFrame, way: Way, only_while: Active | None = None) -> None:
+        if len(self._waiting) >= MOST_WAITING:
+            self.lost += 1
+            return
+
+        def due() -> None:
+            self._waiting.discard(timer)
+            if only_while is not None:
+                if not in_time(only_while, self._now_ns()):
+                    return
+                only_while.struck += 1
+            self._task(self._pass(frame, way), "a fault's frame")
+
+        timer = self._loop.call_later(delay_s, due)
+        self._waiting.add(timer)
+
+    def _task(self, work: Coroutine[Any, Any, None], name: str) -> None:
+        task = self._loop.create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def _now_ns(self) -> int:
+        return round(self._loop.time() * NS_PER_S)
+
+
+def node_of(frame: CanFrame) -> int:
+    """The node that a frame is of, or to (CiA 301, 7.3.3); `NO_NODE` for SYNC, time stamps, and what is to all."""
+    if frame.extended:
+        return NO_NODE
+    if frame.can_id == NMT:
+        return frame.data[1] & 0x7F if len(frame.data) == 2 else NO_NODE
+    return frame.can_id & 0x7F

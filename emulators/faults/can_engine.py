@@ -1,0 +1,46 @@
+"""What the faults that are in make of a CAN frame of a node, or to one. Pure: told the time, tells what goes on instead."""
+
+from __future__ import annotations
+
+from emulators.faults.can_fault import SDO_REPLY, SDO_REQUEST, CanFault, CanPiece
+from emulators.faults.engine import WireFaults
+from emulators.faults.fault import Active
+from emulators.faults.frames import Frame, Framing, Way
+from gateway.core.canframe import CanFrame
+
+
+def struck(faults: WireFaults, way: Way, frame: CanFrame, node: int, now_ns: int) -> list[CanPiece] | None:
+    """What becomes of the frame; None: nothing happens to it. Several faults strike one after the other."""
+    pieces: list[CanPiece] | None = None
+    for active in faults.in_at(now_ns):
+        fault = active.fault
+        if not isinstance(fault, CanFault) or (active.units and node not in active.units):
+            continue
+        if not aimed(active, frame):
+            continue
+        if not fault.aims_at(frame, node) or not active.strikes(seen(way, node), now_ns):
+            continue
+        before = pieces if pieces is not None else [CanPiece(frame)]
+        pieces = [
+            CanPiece(after.frame, after.delay_s + piece.delay_s)
+            for piece in before
+            for after in fault.strike(piece.frame, node, active.random)
+        ]
+    return pieces
+
+
+def aimed(active: Active, frame: CanFrame) -> bool:
+    """Whether a frame is one that the fault's `cob_id` and `index` mean. An index stands in SDO requests and replies that name
+    an object, so in no segment."""
+    aim = active.aim
+    if aim.cob_id is not None and frame.can_id != aim.cob_id:
+        return False
+    if aim.index is None:
+        return True
+    sdo = frame.can_id & 0x780 in (SDO_REPLY, SDO_REQUEST) and len(frame.data) == 8
+    return sdo and int.from_bytes(frame.data[1:3], "little") == aim.index
+
+
+def seen(way: Way, node: int) -> Frame:
+    """A node's frame as an `Active` counts it."""
+    return Frame(way, Framing.RAW, b"", node)

@@ -5,8 +5,6 @@ The names are those of the command list (SPEC ruling 12). Pure; decodes for itse
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 from emulators.replay.requests import CellRequest, parse_request
 from gateway.core.profile import DeviceProfile, RegisterRange
 
@@ -26,13 +24,9 @@ class CommandNames:
             self._reads += [(at, "receive") for at in (profile.inbox.at, profile.inbox.ack)]
             self._reads += [(at, "send") for at in (profile.outbox.at, profile.outbox.ack)]
             self._writes += [(profile.inbox.ack, "acknowledge"), (profile.outbox.at, "send")]
-        self._found = lru_cache(maxsize=256)(self._find)  # the same few polls come again and again
 
     def of(self, pdu: bytes) -> str:
         """The name of the command, the lowest addressed where a request touches several; empty where it is none."""
-        return self._found(pdu)
-
-    def _find(self, pdu: bytes) -> str:
         request = parse_request(pdu)
         if request is None:
             return ""

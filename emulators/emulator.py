@@ -12,6 +12,7 @@ from abc import ABC
 from collections import Counter
 from collections.abc import Callable, Sized
 from dataclasses import dataclass
+from functools import lru_cache
 
 from emulators.command_names import CommandNames
 from emulators.modbus.bank import RegisterBank
@@ -47,11 +48,12 @@ class UnitEmulator(Emulator):
 
     def __init__(self, connection: End[bytes], profile: DeviceProfile, virtual_context: Sized, answer: Answer) -> None:
         super().__init__(connection, profile, virtual_context)
-        self._names = CommandNames(profile)
+        names = CommandNames(profile)
+        self._recognised = lru_cache(maxsize=256)(lambda data: COMMAND(data, names.of(data)))
         self._answer = answer
 
     def recognise(self, data: bytes) -> COMMAND:
-        return COMMAND(data, self._names.of(data))
+        return self._recognised(data)  # the same few polls come again and again, and a command is a value
 
     def _execute(self, command: COMMAND, now_ns: int) -> RECORDING:
         self.executed[command.name] += 1

@@ -6,7 +6,9 @@ Neither side knows. Time is the loop's. While no fault is in, bytes pass as they
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Coroutine
 from dataclasses import replace
+from typing import Any
 
 from emulators.endpoints.pty import PtyEnd
 from emulators.endpoints.socket_end import SocketEnd
@@ -28,6 +30,7 @@ class FaultyEnd(ByteConnection):
     def __init__(self, inner: ByteConnection, faults: WireFaults) -> None:
         super().__init__(inner.inbound, inner.endpoint, inner.max_pending)
         self.inner = inner
+        self._pty = inner if isinstance(inner, PtyEnd) else None
         self.peer = getattr(inner, "peer", "")
         self.host = getattr(inner, "host", "")
         self.role = getattr(inner, "role", "")
@@ -37,7 +40,8 @@ class FaultyEnd(ByteConnection):
         self._loop = asyncio.get_running_loop()
         self._requests = Assembler(Way.REQUEST, faults.framing)
         self._replies = Assembler(Way.REPLY, faults.framing)
-        self._free_ns = dict.fromkeys(Way, 0)
+        self._free_ns: dict[Way, int] = {}
+        """Until when what was put off keeps a way, so that nothing overtakes it; a way that is free is not in it."""
         self._gathered: dict[Way, bytearray] = {}
         self._asked: Frame | None = None
         self._dead = False
@@ -58,27 +62,32 @@ class FaultyEnd(ByteConnection):
     @property
     def paced(self) -> bool:
         """Whether the end keeps a line's time by itself (`PtyEnd`)."""
-        return isinstance(self.inner, PtyEnd) and self.inner.paced
+        return self._pty is not None and self._pty.paced
 
-    async def read(self) -> bytes:
-        return await self.inner.read()
+    def read(self) -> Coroutine[Any, Any, bytes]:
+        return self.inner.read()
 
-    async def read_within(self, timeout_s: float) -> bytes:
-        return await self.inner.read_within(timeout_s)
+    def read_within(self, timeout_s: float) -> Coroutine[Any, Any, bytes]:
+        return self.inner.read_within(timeout_s)
 
     def read_pending(self) -> bytes:
         return self.inner.read_pending()
 
     async def write(self, data: bytes) -> None:
+        if self._passes(self._replies) and not self._dead:  # as a rule: no fault is in
+            await self.inner.write(data)
+            if self._faults.watch is not None:
+                self._show(Way.REPLY, data)
+            return
         for piece in self._said(data):
             await self.inner.write(piece)
             self._show(Way.REPLY, piece)
 
     async def answer(self, data: bytes, after_s: float) -> None:
         """As `PtyEnd.answer`."""
-        assert isinstance(self.inner, PtyEnd)
+        assert self._pty is not None
         for n, piece in enumerate(self._said(data, after_s)):
-            await (self.inner.answer(piece, after_s) if n == 0 else self.inner.write(piece))
+            await (self._pty.answer(piece, after_s) if n == 0 else self._pty.write(piece))
             self._show(Way.REPLY, piece)
 
     async def aclose(self) -> None:
@@ -108,13 +117,18 @@ class FaultyEnd(ByteConnection):
         if self._faults.watch is not None:
             self._faults.watch(self, way, data)
 
+    def _passes(self, assembler: Assembler) -> bool:
+        """Whether bytes pass as they are: no fault is in, and nothing that one kept is still on its way."""
+        return not (self._faults.active or assembler.pending or (self._free_ns and assembler.way in self._free_ns))
+
     def _heard(self, data: bytes) -> bool:
         """A chunk from the other side; True: it is dealt with."""
-        self._show(Way.REQUEST, data)
+        if self._faults.watch is not None:
+            self._show(Way.REQUEST, data)
         if self._dead:
             return True
         assembler = self._requests
-        if not self._faults.active and not assembler.pending and self._free_ns[Way.REQUEST] <= 0:
+        if self._passes(assembler):
             return False
         for frame in assembler.feed(data):
             self._on_request(frame)
@@ -145,7 +159,7 @@ class FaultyEnd(ByteConnection):
         if self._dead:
             return []
         assembler = self._replies
-        if not self._faults.active and not assembler.pending and self._free_ns[Way.REPLY] <= 0:
+        if self._passes(assembler):
             return [data]
         frames = assembler.feed(data)
         if not self._faults.framing.streams:
@@ -173,13 +187,13 @@ class FaultyEnd(ByteConnection):
                 delay_ns = round(piece.delay_s * NS_PER_S)
                 due_ns = now_ns + delay_ns
                 if not piece.overtake:
-                    due_ns = self._free_ns[way] = max(due_ns, self._free_ns[way])
+                    due_ns = self._free_ns[way] = max(due_ns, self._free_ns.get(way, 0))
                 if due_ns <= now_ns:
                     at_once.append(piece.data)
                 else:
                     self._send_at(due_ns + round(after_s * NS_PER_S), way, piece)
-        if self._free_ns[way] <= now_ns:
-            self._free_ns[way] = 0
+        if self._free_ns.get(way, 0) <= now_ns:
+            self._free_ns.pop(way, None)
         if outcome.hang is not None:
             self._hang(outcome.hang, at_once)
         return [] if self._dead else at_once

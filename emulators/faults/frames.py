@@ -79,30 +79,26 @@ class Assembler:
     def __init__(self, way: Way, framing: Framing) -> None:
         self.way = way
         self.framing = framing
-        self._buffer = bytearray()
-
-    @property
-    def pending(self) -> int:
+        self.pending = bytearray()
         """Bytes that wait for more."""
-        return len(self._buffer)
 
     def feed(self, data: bytes) -> list[Frame]:
-        self._buffer += data
+        self.pending += data
         frames = []
-        while self._buffer:
+        while self.pending:
             length = self._whole()
-            if not length and len(self._buffer) <= (LONGEST_IN_STREAM if self.framing.streams else LONGEST):
+            if not length and len(self.pending) <= (LONGEST_IN_STREAM if self.framing.streams else LONGEST):
                 break
-            frames.append(self._take(length or len(self._buffer)))
+            frames.append(self._take(length or len(self.pending)))
         return frames
 
     def flush(self) -> list[Frame]:
         """What is left, as a frame that nobody understands."""
-        return [self._take(len(self._buffer))] if self._buffer else []
+        return [self._take(len(self.pending))] if self.pending else []
 
     def _whole(self) -> int:
         """The length of the frame at the front; 0: not whole."""
-        buffer = self._buffer
+        buffer = self.pending
         if self.framing is Framing.RAW:
             return len(buffer)
         if self.framing is Framing.MBAP:
@@ -119,8 +115,8 @@ class Assembler:
         return len(buffer) if len(buffer) >= 4 and crc16(bytes(buffer)) == 0 else 0
 
     def _take(self, length: int) -> Frame:
-        data = bytes(self._buffer[:length])
-        del self._buffer[:length]
+        data = bytes(self.pending[:length])
+        del self.pending[:length]
         return understood(self.way, self.framing, data)
 
 

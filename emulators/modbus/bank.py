@@ -8,7 +8,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, get_args
+from operator import itemgetter
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 from gateway.core.errors import DeviceRefused, UsageError
 
@@ -122,6 +123,16 @@ class CellHooks:
 
 _NO_HOOKS = CellHooks()
 
+MAX_PLANS = 1024
+"""Different reads of a bank that are kept in mind."""
+
+
+class _Plan(NamedTuple):
+    """How to read neighbouring cells: all at once, and which of them have a hook of their own."""
+
+    cells: Callable[[dict[int, int]], Sequence[int]]
+    hooked: tuple[tuple[int, Callable[[int, int], int]], ...]
+
 
 class MapBank(RegisterBank):
     """Plain cells in declared spans, all zero at first. Gaps between spans do not exist: exception 02.
@@ -137,6 +148,7 @@ class MapBank(RegisterBank):
         self._writable: dict[Table, set[int]] = {table: set() for table in self._cells}
         self._on_write = on_write
         self._hooks: dict[tuple[Table, int], CellHooks] = {}
+        self._plans: dict[tuple[Table, int, int], _Plan] = {}
         for span in spans:
             self._declare(span)
 
@@ -156,17 +168,29 @@ class MapBank(RegisterBank):
         """Give a cell side effects, in place of those that it had. Raises `IllegalAddress` where there is none."""
         self._require(self._declared, table, range(address, address + 1), "hooked")
         self._hooks[table, address] = hooks
+        self._plans.clear()
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
+        plan = self._plans.get((table, address, count)) or self._plan(table, address, count)
+        values = plan.cells(self._cells[table])
+        if plan.hooked:
+            values = list(values)
+            for i, reading in plan.hooked:
+                values[i] = reading(values[i], now_ns)
+        return values
+
+    def _plan(self, table: Table, address: int, count: int) -> _Plan:
+        """How to read these cells. Kept: masters ask the same again and again; forgotten when what is there changes."""
         addresses = range(address, address + count)
         self._require(self._readable, table, addresses, "read")
-        values = list(map(self._cells[table].__getitem__, addresses))
-        if self._hooks:
-            for i, place in enumerate(addresses):
-                reading = self._hooks.get((table, place), _NO_HOOKS).reading
-                if reading is not None:
-                    values[i] = reading(values[i], now_ns)
-        return values
+        hooks = enumerate(self._hooks.get((table, place), _NO_HOOKS).reading for place in addresses)
+        cells: Callable[[dict[int, int]], Sequence[int]]
+        cells = itemgetter(*addresses) if count > 1 else lambda held: [held[a] for a in addresses]
+        plan = _Plan(cells, tuple((i, reading) for i, reading in hooks if reading is not None))
+        if len(self._plans) >= MAX_PLANS:
+            self._plans.clear()
+        self._plans[table, address, count] = plan
+        return plan
 
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
         self._require(self._readable, table, range(address, address + count), "read")

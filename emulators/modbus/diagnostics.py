@@ -64,6 +64,7 @@ _READABLE = {
 }
 _RESTARTS = (b"\x08\x00\x01\x00\x00", b"\x08\x00\x01\xff\x00")
 _UNCOUNTED = (0x0B, 0x0C)
+_DIAGNOSTICS, _CLEARING = 0x08, (b"\x08\x00\x01", b"\x08\x00\x0a")
 _LINE_FEED = 0x0A
 _FRAME_CHARACTERS = frozenset(b":0123456789ABCDEFabcdef\r")
 """What can stand inside an ASCII frame, and so cannot end one."""
@@ -98,7 +99,7 @@ class Diagnostics:
 
     def completed(self, pdu: bytes) -> None:
         """A request was carried out."""
-        if pdu[0] not in _UNCOUNTED and pdu[:3] not in (b"\x08\x00\x01", b"\x08\x00\x0a"):
+        if pdu[0] not in _UNCOUNTED and not (pdu[0] == _DIAGNOSTICS and pdu[:3] in _CLEARING):
             self.counters.completed += 1
 
     def respond(self, pdu: bytes) -> bytes | None:

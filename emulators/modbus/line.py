@@ -106,7 +106,7 @@ class LineSlave(ABC):
 
     def _exchange(self, frame: bytes, now_ns: int) -> Exchange:
         for unit in self.units.values():
-            unit.heard(messages=1)
+            unit.counters.bus_messages += 1
         heard = self.as_heard(frame)
         unit_id, pdu = frame[0], frame[1 : -self.check_bytes]
         if unit_id == BROADCAST:

@@ -53,6 +53,8 @@ class UnitLimits:
 
 
 _ADDRESS_AND_COUNT = struct.Struct(">HH").unpack_from
+_READ_REPLIES = tuple(struct.Struct(f">BB{count}H").pack for count in range(126))
+"""By the number of registers: function, byte count and registers as they are sent."""
 
 
 class RegisterFunctions:
@@ -63,17 +65,21 @@ class RegisterFunctions:
         self.limits = limits
 
     def read(self, pdu: bytes, now_ns: int) -> bytes:
-        table = TABLES[pdu[0]]
-        require_length(pdu, 5)
+        function, limits = pdu[0], self.limits
+        if len(pdu) != 5:
+            require_length(pdu, 5)
         address, count = _ADDRESS_AND_COUNT(pdu, 1)
-        if pdu[0] <= 0x02:
-            _require_count(count, self.limits.read_bits)
+        if function <= 0x02:
+            _require_count(count, limits.read_bits)
             _require_range(address, count)
-            data = _pack_bits(self.bank.read(table, address, count, now_ns))
-        else:
-            self._require_registers(address, count, self.limits.read_registers)
-            data = _pack_words(self.bank.read(table, address, count, now_ns))
-        return bytes((pdu[0], len(data))) + data
+            data = _pack_bits(self.bank.read(TABLES[function], address, count, now_ns))
+            return bytes((function, len(data))) + data
+        if limits.even_only or not 1 <= count <= limits.read_registers or address + count > ADDRESSES:
+            self._require_registers(address, count, limits.read_registers)
+        reply: bytes = _READ_REPLIES[count](
+            function, 2 * count, *self.bank.read(TABLES[function], address, count, now_ns)
+        )
+        return reply
 
     def write_coil(self, pdu: bytes, now_ns: int) -> bytes:
         require_length(pdu, 5)

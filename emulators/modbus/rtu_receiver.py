@@ -20,6 +20,7 @@ from emulators.modbus.rtu_shapes import (
     Declared,
     Shape,
     crc16,
+    is_whole,
     response_shape,
     with_crc,
 )
@@ -83,7 +84,7 @@ class RtuReceiver:
         """As a rule a chunk is a request to us, whole and alone; whatever else it is, `_next_frame` finds out."""
         if len(data) < MIN_FRAME or data[0] not in self._own or self._hunt is not None:
             return False
-        return FIXED_REQUESTS.get(data[1]) == len(data) and crc16(data) == 0
+        return FIXED_REQUESTS.get(data[1]) == len(data) and is_whole(data)
 
     def _next_frame(self, wait: bool) -> bytes | None:
         if self._hunt is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 MIN_FRAME = 4
 MAX_FRAME = 256
@@ -23,6 +24,8 @@ def _crc_table() -> tuple[int, ...]:
 
 
 CRC_TABLE = _crc_table()
+KEPT = 256
+"""Frames whose check sums are kept."""
 
 
 _NEXT = [n >> 8 ^ CRC_TABLE[n & 0xFF] for n in range(0x10000)]
@@ -41,9 +44,16 @@ def crc16(data: bytes | bytearray | memoryview, crc: int = 0xFFFF) -> int:
     return crc >> 8 ^ CRC_TABLE[(crc ^ data[-1]) & 0xFF] if size & 1 else crc
 
 
+@lru_cache(maxsize=KEPT)
 def with_crc(frame: bytes) -> bytes:
-    """`frame` (unit and PDU) with its check sum, low byte first."""
+    """`frame` (unit and PDU) with its check sum, low byte first. Kept: masters ask the same, and values seldom change."""
     return frame + crc16(frame).to_bytes(2, "little")
+
+
+@lru_cache(maxsize=KEPT)
+def is_whole(frame: bytes) -> bool:
+    """Whether a frame's check sum is right. Kept as `with_crc`'s."""
+    return crc16(frame) == 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,15 +52,16 @@ async def serve_rtu(
     also hears what it sends, as behind a two-wire adapter that listens to itself. Returns when the connection is lost; does
     not close it.
     """
+    line = connection if isinstance(connection, PtyEnd | FaultyEnd) else None
     try:
         while True:
-            data = await _read_or_silence(connection, slave)
+            data = await (_read_or_silence(connection, slave) if slave.pending else connection.read())
             now_ns = clock.monotonic_ns()
             if echo and data:
                 await connection.write(data)
             exchanges = slave.receive(data, now_ns)
-            if isinstance(connection, PtyEnd | FaultyEnd) and connection.paced:
-                await _reply_on_line(connection, exchanges, clock, now_ns, latency_s, on_frame)
+            if line is not None and line.paced:
+                await _reply_on_line(line, exchanges, clock, now_ns, latency_s, on_frame)
             else:
                 await _reply(connection.write, exchanges, clock, now_ns, latency_s, on_frame)
     except ConnectionLost:
@@ -121,9 +122,7 @@ async def serve_udp(
 
 
 async def _read_or_silence(connection: ByteConnection, slave: LineSlave) -> bytes:
-    """What comes next; empty after a pause that ends an unfinished frame."""
-    if not slave.pending:
-        return await connection.read()
+    """What comes next to an unfinished frame; empty after a pause that ends it."""
     try:
         async with asyncio.timeout(slave.gap_ns / NS_PER_S):
             return await connection.read()
@@ -139,12 +138,13 @@ async def _reply(
     latency_s: float | Latency,
     on_frame: OnFrame | None,
 ) -> None:
-    _tell_heard(exchanges, now_ns, on_frame)
+    if on_frame is not None:
+        _tell_heard(exchanges, now_ns, on_frame)
     due_ns = now_ns
     for exchange in exchanges:
         if not exchange.reply:
             continue
-        thinks_s = _thinks_s(exchange, latency_s)
+        thinks_s = latency_s(exchange) if callable(latency_s) else latency_s
         if thinks_s > 0:
             due_ns += round(thinks_s * NS_PER_S)
             await clock.sleep_until_ns(due_ns)
@@ -162,21 +162,17 @@ async def _reply_on_line(
     on_frame: OnFrame | None,
 ) -> None:
     """As `_reply`, where the line itself keeps the time: a device thinks from the request's last character on."""
-    _tell_heard(exchanges, now_ns, on_frame)
+    if on_frame is not None:
+        _tell_heard(exchanges, now_ns, on_frame)
     after_s = 0.0
     for exchange in exchanges:
         if exchange.reply:
-            after_s += _thinks_s(exchange, latency_s)
+            after_s += latency_s(exchange) if callable(latency_s) else latency_s
             await end.answer(exchange.reply, after_s)
             if on_frame is not None:
                 on_frame(Direction.RECEIVED, clock.monotonic_ns(), exchange.reply)
 
 
-def _tell_heard(exchanges: list[Exchange], now_ns: int, on_frame: OnFrame | None) -> None:
-    if on_frame is not None:
-        for exchange in exchanges:  # all of them came before any is answered
-            on_frame(Direction.SENT, now_ns, exchange.heard)
-
-
-def _thinks_s(exchange: Exchange, latency_s: float | Latency) -> float:
-    return latency_s(exchange) if callable(latency_s) else latency_s
+def _tell_heard(exchanges: list[Exchange], now_ns: int, on_frame: OnFrame) -> None:
+    for exchange in exchanges:  # all of them came before any is answered
+        on_frame(Direction.SENT, now_ns, exchange.heard)

@@ -33,8 +33,8 @@ STUCK_AFTER = 1_000_000
 ENDING_INSTANTS = 10_000
 """What a task may take to end once its loop is closed."""
 _WAITING_SHOWN = 20
-_COMPACT_ABOVE = 1_000
-"""Timers in the heap before those that were cancelled are looked for."""
+_COMPACT_AFTER = 1_000
+"""Timers that are set before those that nobody waits for any more are looked for."""
 
 
 class Escape(Bug):
@@ -89,7 +89,16 @@ class _Timer(asyncio.TimerHandle):
         self._cancelled = False
         self._loop = loop
         self._when = when_ns / NS_PER_S
-        self._scheduled = True  # as asyncio's own loops do: cancel() then tells us
+
+    def cancel(self) -> None:
+        """It stays among the loop's timers until its time comes, or until they are looked through."""
+        self._cancelled = True
+        self._callback = _nothing  # what it held is let go
+        self._args = ()
+
+
+def _nothing() -> None:
+    """What is left of a timer that was cancelled."""
 
 
 def _way_out(name: str) -> Callable[..., NoReturn]:
@@ -110,7 +119,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._ready: deque[_Call | _Timer] = deque()
         self._timers: list[tuple[int, int, _Timer | asyncio.Future[None]]] = []
         self._sequence = 0
-        self._cancelled = 0
+        self._compact_at = _COMPACT_AFTER
         self._tasks = 0
         self._running = self._stopping = self._closed = False
         self._handler: Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object] | None = None
@@ -152,6 +161,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._sequence = sequence = self._sequence + 1
         now_ns = self.now_ns
         heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, sequence, timer))
+        if sequence >= self._compact_at:
+            self._compact()
         return timer
 
     def sleeper(self, when_ns: int) -> asyncio.Future[None]:
@@ -160,14 +171,19 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._sequence = sequence = self._sequence + 1
         now_ns = self.now_ns
         heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, sequence, future))
+        if sequence >= self._compact_at:
+            self._compact()
         return future
 
-    def _timer_handle_cancelled(self, timer: asyncio.TimerHandle) -> None:
-        self._cancelled += 1
-        if self._cancelled > _COMPACT_ABOVE and 2 * self._cancelled > len(self._timers):
-            self._timers = [entry for entry in self._timers if not entry[2].cancelled()]
-            heapify(self._timers)
-            self._cancelled = 0
+    def alarm(self, delay_s: float) -> asyncio.Future[None]:
+        """As `sleeper`, in seconds from now (`gateway.core.alarm`). Whoever has it may set it before."""
+        return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
+
+    def _compact(self) -> None:
+        """Let go of the timers that nobody waits for any more; again when half as many as are left could be over."""
+        self._timers = [entry for entry in self._timers if not _is_over(entry[2])]
+        heapify(self._timers)
+        self._compact_at = self._sequence + max(_COMPACT_AFTER, len(self._timers) // 2)
 
     # -- futures and tasks --------------------------------------------------------------------------------------------
 
@@ -188,8 +204,8 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def get_task_factory(self) -> None:
         return None
 
-    def get_debug(self) -> bool:
-        return False
+    get_debug: Any = bool
+    """False, and said without a frame of Python's: each future that is made asks."""
 
     def set_debug(self, enabled: bool) -> None:
         """Nothing: asyncio's debugging measures on the wall clock."""
@@ -249,16 +265,14 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         now_ns = None
         while timers and (now_ns is None or timers[0][0] == now_ns):
             when_ns, _, due = heappop(timers)
-            if isinstance(due, _Timer):
-                due._scheduled = False
+            if type(due) is _Timer:
                 if due._cancelled:
-                    self._cancelled -= 1
                     continue
                 ready.append(due)
-            elif due.done():
+            elif due.done():  # type: ignore[union-attr]  # a future
                 continue
             else:
-                due.set_result(None)
+                due.set_result(None)  # type: ignore[union-attr]
             self.now_ns = now_ns = when_ns
         if now_ns is None:
             raise Deadlock("a deadlock: nothing is ready and no timer is set", got=self._who_waits())
@@ -369,6 +383,11 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     remove_writer: Any = _way_out("remove_writer")
     add_signal_handler: Any = _way_out("add_signal_handler")
     remove_signal_handler: Any = _way_out("remove_signal_handler")
+
+
+def _is_over(due: _Timer | asyncio.Future[None]) -> bool:
+    """Whether nobody waits for it any more."""
+    return due._cancelled if isinstance(due, _Timer) else due.done()
 
 
 def culprit() -> str:

@@ -14,6 +14,7 @@ from gateway.core.endpoint import Endpoint, SerialSettings
 from gateway.core.errors import ConnectionLost, FieldtwinError
 
 MAX_PENDING = 1024
+SENT = Direction.SENT
 
 
 class MemoryWire:
@@ -41,18 +42,19 @@ class MemoryWire:
         that follows another without a pause the first character is heard by itself, or the line would seem to be silent."""
         if not data:
             return
-        receiver, pacer = self._way(direction)
+        receiver, pacer = (self.far, self._sent) if direction is SENT else (self.near, self._received)
         if pacer is None:
             receiver.arrived(data)
             return
-        if pacer.busy_until_ns > self.loop.now_ns and len(data) > 1:
-            self.loop.call_at_ns(pacer.send(self.loop.now_ns, 1), receiver.arrived, data[:1])
+        now_ns = self.loop.now_ns
+        if pacer.busy_until_ns > now_ns and len(data) > 1:
+            self.loop.call_at_ns(pacer.send(now_ns, 1), receiver.arrived, data[:1])
             data = data[1:]
-        self.loop.call_at_ns(pacer.send(self.loop.now_ns, len(data)), receiver.arrived, data)
+        self.loop.call_at_ns(pacer.send(now_ns, len(data)), receiver.arrived, data)
 
     def ended(self, direction: Direction) -> None:
         """The writer of `direction` hung up: behind what is on its way, the other side learns of it."""
-        receiver, pacer = self._way(direction)
+        receiver, pacer = (self.far, self._sent) if direction is SENT else (self.near, self._received)
         lost = ConnectionLost("the other side ended the connection", where=str(receiver.endpoint))
         if pacer is None:
             receiver.feed_lost(lost)
@@ -63,13 +65,6 @@ class MemoryWire:
         """The wire is gone for both."""
         self.near.cut(error)
         self.far.cut(error)
-
-    def _way(self, direction: Direction) -> tuple[MemoryEnd, SerialPacer | None]:
-        """Who receives what goes there, and what times it."""
-        return (self.far, self._sent) if direction is Direction.SENT else (self.near, self._received)
-
-    def sender(self, direction: Direction) -> MemoryEnd:
-        return self.near if direction is Direction.SENT else self.far
 
 
 class MemoryEnd(Client):
@@ -91,19 +86,19 @@ class MemoryEnd(Client):
 
     @property
     def other(self) -> MemoryEnd:
-        return self.wire.sender(Direction.RECEIVED if self.direction is Direction.SENT else Direction.SENT)
+        return self.wire.far if self.direction is SENT else self.wire.near
 
     def arrived(self, data: bytes) -> None:
         """Bytes from the other side; those that come to a closed end are nobody's."""
-        if self.lost is None:
+        if self._lost is None:
             self.feed(data)
 
     async def write(self, data: bytes) -> None:
-        if self.lost is not None:
+        if self._lost is not None:
             raise self._loss()
         self.wire.write(self.direction, data)
         other = self.other
-        while len(other.inbound.data_stream) >= other.max_pending and other.lost is None and self.lost is None:
+        while len(other._stream) >= other.max_pending and other._lost is None and self._lost is None:
             other._room = asyncio.get_running_loop().create_future()
             await other._room
 

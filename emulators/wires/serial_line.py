@@ -22,12 +22,12 @@ class SerialPacer:
 
     def __init__(self, settings: SerialSettings) -> None:
         self.settings = settings
-        self._busy_until_ns = 0
-
-    @property
-    def busy_until_ns(self) -> int:
+        self._char = (
+            settings.bits_per_char * NS_PER_S,
+            settings.baudrate,
+        )  # as a fraction, so that nothing is rounded twice
+        self.busy_until_ns = 0
         """When the last character that was sent is on the far side; 0 if none was."""
-        return self._busy_until_ns
 
     @property
     def t1_5_ns(self) -> int:
@@ -41,17 +41,19 @@ class SerialPacer:
 
     def duration_ns(self, nbytes: int) -> int:
         """How long `nbytes` characters take back to back."""
-        return self._half_chars_ns(2 * nbytes)
+        numerator, denominator = self._char
+        return -(-nbytes * numerator // denominator)
 
     def earliest_end(self, now_ns: int, nbytes: int) -> int:
         """When `nbytes` handed over at `now_ns` would be on the far side, behind what is on its way. Books nothing."""
-        return max(now_ns, self._busy_until_ns) + self.duration_ns(nbytes)
+        busy_ns = self.busy_until_ns
+        return (now_ns if now_ns > busy_ns else busy_ns) + self.duration_ns(nbytes)
 
     def send(self, now_ns: int, nbytes: int) -> int:
         """Like `earliest_end`, and the line is taken until then."""
-        self._busy_until_ns = self.earliest_end(now_ns, nbytes)
-        return self._busy_until_ns
+        self.busy_until_ns = end_ns = self.earliest_end(now_ns, nbytes)
+        return end_ns
 
     def _half_chars_ns(self, count: int) -> int:
-        bits = count * self.settings.bits_per_char
-        return -(-bits * NS_PER_S // (2 * self.settings.baudrate))
+        numerator, denominator = self._char
+        return -(-count * numerator // (2 * denominator))

@@ -13,10 +13,11 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from enum import Enum
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
+from gateway.core.alarm import alarm, ring
 from gateway.core.canframe import CanFrame
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import Bug, ConnectionLost, FieldtwinError
@@ -84,6 +85,7 @@ class _End(Generic[T]):
 
     def __init__(self, inbound: Connection[T], endpoint: Endpoint, max_pending: int) -> None:
         self.inbound: Connection[T] = inbound
+        self._stream: deque[T] = inbound.data_stream  # that very one: its `write` and `read` are append and popleft
         self.endpoint = endpoint
         self.max_pending = max_pending
         self.on_arrival: Callable[[T], None] | None = None
@@ -101,17 +103,17 @@ class _End(Generic[T]):
     def feed(self, item: T) -> bool:
         """Something arrived. Returns False when nothing more should be taken from the medium for now."""
         if self.intercept is not None and self.intercept(item):
-            return len(self.inbound.data_stream) < self.max_pending
+            return len(self._stream) < self.max_pending
         return self.feed_through(item)
 
     def feed_through(self, item: T) -> bool:
         """As `feed`, past `intercept`."""
-        self.inbound.write(item)
+        self._stream.append(item)
         if self.on_arrival is not None:
             self.on_arrival(item)
         if self._waiter is not None:
-            self._wake()
-        return len(self.inbound.data_stream) < self.max_pending
+            ring(self._waiter)
+        return len(self._stream) < self.max_pending
 
     def feed_lost(self, error: FieldtwinError) -> None:
         """The medium is gone; what arrived before is still read first. The first reason is kept."""
@@ -131,50 +133,49 @@ class _End(Generic[T]):
         return fresh
 
     def _wake(self) -> None:
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        if self._waiter is not None:
+            ring(self._waiter)
 
     async def _next(self) -> T:
-        while not self.inbound.data_stream:
-            await self._arrival(asyncio.get_running_loop().create_future())
-        item = self.inbound.read()
-        self.on_room()
-        return item
-
-    async def _next_within(self, timeout_s: float) -> T | None:
-        """As `_next`; None when nothing came for `timeout_s`."""
-        if not self.inbound.data_stream:
-            loop = asyncio.get_running_loop()
-            waiter = loop.create_future()
-            timer = loop.call_later(timeout_s, _end_wait, waiter)
+        while not self._stream:
+            waiter = self._waits(asyncio.get_running_loop().create_future())
             try:
-                await self._arrival(waiter)
+                await waiter
             finally:
-                timer.cancel()
-            if not self.inbound.data_stream:
+                self._waiter = None
+        return self._taken()
+
+    async def _next_within(self, timeout_s: float, nothing: T) -> T:
+        """As `_next`; `nothing` when nothing came for `timeout_s`."""
+        if not self._stream:
+            waiter, end = alarm(asyncio.get_running_loop(), timeout_s)
+            try:
+                self._waits(waiter)
+                await waiter
+            finally:
+                if self._waiter is waiter:
+                    self._waiter = None
+                if end is not None:
+                    end()
+            if not self._stream:
                 if self._lost is not None:
                     raise self._loss()
-                return None
-        item = self.inbound.read()
+                return nothing
+        return self._taken()
+
+    def _taken(self) -> T:
+        item = self._stream.popleft()
         self.on_room()
         return item
 
-    async def _arrival(self, waiter: asyncio.Future[None]) -> None:
-        """Wait until something arrives, the medium is gone, or somebody ends `waiter`."""
+    def _waits(self, waiter: asyncio.Future[None]) -> asyncio.Future[None]:
+        """From now on `waiter` is told when something arrives or the medium is gone. Raises when it is gone already."""
         if self._lost is not None:
             raise self._loss()
         if self._waiter is not None:
             raise Bug("two readers on one connection", where=str(self.endpoint))
         self._waiter = waiter
-        try:
-            await waiter
-        finally:
-            self._waiter = None
-
-
-def _end_wait(waiter: asyncio.Future[None]) -> None:
-    if not waiter.done():
-        waiter.set_result(None)
+        return waiter
 
 
 class ByteConnection(_End[bytes], ABC):
@@ -190,21 +191,22 @@ class ByteConnection(_End[bytes], ABC):
     def type(self) -> PROTOCOL:
         return self.inbound.type
 
-    async def read(self) -> bytes:
+    def read(self) -> Coroutine[Any, Any, bytes]:
         """The next chunk, never empty. Raises `ConnectionLost` once the peer is gone and all is read."""
-        return await self._next()
+        return self._next()
 
-    async def read_within(self, timeout_s: float) -> bytes:
+    def read_within(self, timeout_s: float) -> Coroutine[Any, Any, bytes]:
         """The next chunk, empty when nothing came for `timeout_s`. Raises as `read`. Costs less than a timeout around it."""
-        return await self._next_within(timeout_s) or b""
+        return self._next_within(timeout_s, b"")
 
     def read_pending(self) -> bytes:
         """All that arrived and was not read yet, possibly empty; never waits."""
+        if not self._stream:
+            return b""
         chunks = []
-        while self.inbound.data_stream:
-            chunks.append(self.inbound.read())
-        if chunks:
-            self.on_room()
+        while self._stream:
+            chunks.append(self._stream.popleft())
+        self.on_room()
         return b"".join(chunks)
 
     @abstractmethod
@@ -274,9 +276,9 @@ class CanConnection(_End[CanFrame], ABC):
     def on_overrun(self, item: CanFrame) -> None:
         """Called with a frame that was dropped because the reader was too slow."""
 
-    async def recv(self) -> CanFrame:
+    def recv(self) -> Coroutine[Any, Any, CanFrame]:
         """The next frame. Raises `ConnectionLost` once the bus is gone and all is read."""
-        return await self._next()
+        return self._next()
 
     @abstractmethod
     async def send(self, frame: CanFrame) -> None:

@@ -8,7 +8,7 @@ A driver is a stranger to this module (gateway.devices.driver).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import ClassVar, Generic
 
@@ -17,24 +17,19 @@ from gateway.core.errors import Bug, CommandListMismatch, UnknownCommand
 from gateway.core.values import COMMAND, RESPONSE
 
 
-@dataclass(frozen=True, slots=True)
 class End(Generic[T]):
     """One end of a duplex medium: what the other end wrote is read here, in order (SPEC ruling 4)."""
 
-    inbound: Connection[T]
-    outbound: Connection[T]
+    __slots__ = ("inbound", "outbound", "read", "type", "write")
 
-    @property
-    def type(self) -> PROTOCOL:
-        return self.inbound.type
-
-    def write(self, value: T) -> None:
-        """Send `value` to the other end."""
-        self.outbound.write(value)
-
-    def read(self) -> T:
-        """Take the oldest item that the other end sent. There must be one."""
-        return self.inbound.read()
+    def __init__(self, inbound: Connection[T], outbound: Connection[T]) -> None:
+        self.inbound: Connection[T] = inbound
+        self.outbound: Connection[T] = outbound
+        self.type = inbound.type
+        self.write: Callable[[T], None] = outbound.write
+        """Sends to the other end."""
+        self.read: Callable[[], T] = inbound.read
+        """Takes the oldest item that the other end sent. There must be one."""
 
 
 def wire(kind: type[Connection[T]]) -> tuple[End[T], End[T]]:

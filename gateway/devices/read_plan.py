@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from gateway.core.profile import DeviceProfile, Message, RegisterRange, Tag
 
@@ -27,12 +28,24 @@ class Read:
     tags: tuple[Tag, ...]
     messages: tuple[Message, ...]
 
+    @cached_property
+    def places(self) -> tuple[tuple[Tag, slice], ...]:
+        """Each tag with where its bytes stand among those that the read brings."""
+        return tuple((tag, place_of(tag.registers, self.range)) for tag in self.tags)
+
     @property
     def members(self) -> list[Member]:
         """What is read, by address; the longer first where two start at one address."""
         both: list[Member] = [(t.registers, t) for t in self.tags]
         both += [(m.at, m) for m in self.messages]
         return sorted(both, key=lambda m: (m[0].address, -m[0].count))
+
+
+def place_of(at: RegisterRange, read: RegisterRange) -> slice:
+    """Where the bytes of `at` stand among those that reading `read` brings: two a register, one a bit."""
+    width = 1 if read.table in ("coil", "discrete") else 2
+    start = (at.address - read.address) * width
+    return slice(start, start + at.count * width)
 
 
 @dataclass

@@ -8,9 +8,9 @@ are as old as the sample and not as the poll: a sensor that answers and does not
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Coroutine
 from dataclasses import dataclass, field
-
-from msgspec.structs import replace
+from typing import Any
 
 from gateway.core.connection import PROTOCOL, ByteConnection
 from gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
@@ -19,8 +19,9 @@ from gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, Tag
 from gateway.devices.codec import apply_scale, decode, encode
 from gateway.devices.config import DeviceConfig
 from gateway.devices.driver import DeviceDriver, TagSink
-from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read
+from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, place_of
 from gateway.protocols.modbus.client import ModbusClient, UnitPace
+from gateway.protocols.modbus.replies import BitsReply, RegistersReply
 
 SAMPLED_STEPS = 0x80000000
 """A sample counter that moved by more than this went backwards: the device restarted."""
@@ -57,6 +58,10 @@ class RegisterDriver(DeviceDriver):
         self._sample_count: int | None = None
         self._sample_t_ns = 0
         self._held: dict[str, TagValue] = {}
+        self._decoded: dict[str, TagValue] = {}
+        """What each tag's bytes said when they were decoded last: as a rule they are the same again."""
+        self._names = {name: f"{config.name}.{name}" for name in self.profile.tags}
+        self._scales = any(tag.scale_by is not None for tag in self.profile.tags.values())
 
     @property
     def message_tag(self) -> str | None:
@@ -79,6 +84,9 @@ class RegisterDriver(DeviceDriver):
     def reconfigure(self, config: DeviceConfig) -> None:
         if config.profile != self.profile:
             self.plans = {g: GroupPlan(config.profile, g, self.learnt) for g in config.profile.groups}
+            self._decoded.clear()
+            self._names = {name: f"{config.name}.{name}" for name in config.profile.tags}
+            self._scales = any(tag.scale_by is not None for tag in config.profile.tags.values())
         super().reconfigure(config)
         if self._client is not None:
             self._client.set_pace(config.address, UnitPace(config.timeout_s, config.spacing_s))
@@ -157,7 +165,7 @@ class RegisterDriver(DeviceDriver):
     async def _read_block(self, reading: Reading) -> None:
         plan, read = self.plans[reading.what], reading.todo[0]
         try:
-            raw, t_ns = await self._transaction(read.range)
+            reply = await self._transaction(read.range)
         except ModbusExceptionReply as e:
             if e.code not in (ILLEGAL_ADDRESS, TOO_LONG):
                 raise
@@ -169,13 +177,23 @@ class RegisterDriver(DeviceDriver):
             return
         reading.todo.popleft()
         plan.taken(read)
+        raw, t_ns, values = _cells(reply), reply.t_ns, reading.values
         reading.blocks.append((read, raw))
-        reading.values |= {t.name: decode(t, _slice(read.range, t.registers, raw), t_ns) for t in read.tags}
+        for tag, place in read.places:
+            values[tag.name] = self._decode(tag, raw[place], t_ns)
+
+    def _decode(self, tag: Tag, raw: bytes, t_ns: int) -> TagValue:
+        """As `codec.decode`, which is asked when the bytes are others than the last ones."""
+        last = self._decoded.get(tag.name)
+        if last is not None and last.raw == raw:
+            return TagValue(last.value, last.quality, last.reason, t_ns, raw)
+        value = self._decoded[tag.name] = decode(tag, raw, t_ns)
+        return value
 
     def _complete(self, reading: Reading) -> list[DATA]:
         """Publish the values of a group that was read; what occurred."""
         values, what = reading.values, reading.what
-        for name, value in values.items():
+        for name, value in values.items() if self._scales else ():
             tag = self.profile.tags[name]
             if tag.scale_by is not None:
                 values[name] = apply_scale(tag, value, values.get(tag.scale_by) or self._held.get(tag.scale_by))
@@ -185,26 +203,24 @@ class RegisterDriver(DeviceDriver):
             self._publish(name, value)
         if not fresh:
             return []
-        return [MEASUREMENT(_slice(read.range, m.at, raw)) for read, raw in reading.blocks for m in read.messages]
+        return [MEASUREMENT(raw[place_of(m.at, read.range)]) for read, raw in reading.blocks for m in read.messages]
 
-    async def _transaction(self, at: RegisterRange) -> tuple[bytes, int]:
-        """Read a range; the bytes as on the wire (bits one a byte) and when the reply was complete."""
+    def _transaction(self, at: RegisterRange) -> Coroutine[Any, Any, BitsReply | RegistersReply]:
+        """Read a range."""
         unit = self.config.address
         if at.table == "coil" or at.table == "discrete":
-            bits = await self.client.read_bits(unit, at.table, at.address, at.count)
-            return bytes(bits.bits), bits.t_ns
-        reply = await self.client.read_registers(unit, at.table, at.address, at.count)
-        return reply.raw, reply.t_ns
+            return self.client.read_bits(unit, at.table, at.address, at.count)
+        return self.client.read_registers(unit, at.table, at.address, at.count)
 
     async def _read_tag(self, tag: Tag) -> TagValue:
-        raw, t_ns = await self._transaction(tag.registers)
-        value = decode(tag, raw, t_ns)
+        reply = await self._transaction(tag.registers)
+        value = decode(tag, _cells(reply), reply.t_ns)
         self._publish(tag.name, value)
         return value
 
     def _publish(self, name: str, value: TagValue) -> None:
         self._held[name] = value
-        self.sink.put(f"{self.config.name}.{name}", value)
+        self.sink.put(self._names[name], value)
 
     def trigger_wait_ms(self, group: str) -> int:
         """How long after `trigger` the values of `group` are there; 0 where they need no trigger."""
@@ -244,7 +260,7 @@ class RegisterDriver(DeviceDriver):
                 values[name] = TagValue(None, Quality.BAD, reason, 0, value.raw)
             else:
                 quality = Quality.GOOD if reason is Reason.NONE else Quality.UNCERTAIN
-                values[name] = replace(value, quality=quality, reason=reason, t_ns=self._sample_t_ns)
+                values[name] = TagValue(value.value, quality, reason, self._sample_t_ns, value.raw)
         return fresh
 
     def _sample_reason(self, count: int, now_ns: int) -> Reason:
@@ -305,8 +321,6 @@ class SensorDriver(RegisterDriver):
     wire_types = frozenset({PROTOCOL.RS232})
 
 
-def _slice(read: RegisterRange, at: RegisterRange, raw: bytes) -> bytes:
-    """The bytes of `at` out of what `read` brought."""
-    width = 1 if read.table in ("coil", "discrete") else 2
-    start = (at.address - read.address) * width
-    return raw[start : start + at.count * width]
+def _cells(reply: BitsReply | RegistersReply) -> bytes:
+    """The bytes of registers as on the wire; bits one a byte."""
+    return bytes(reply.bits) if isinstance(reply, BitsReply) else reply.raw

@@ -10,6 +10,8 @@ here, the other way round. Payloads are never looked into.
 
 from __future__ import annotations
 
+import struct
+
 from gateway.core.connection import PROTOCOL
 from gateway.core.errors import Desync, FileInvalid, NotAllowed
 from gateway.core.profile import Box
@@ -19,6 +21,7 @@ from gateway.devices.driver import TagSink
 from gateway.devices.register_device import Reading, RegisterDriver
 
 LAST_SEQUENCE = 0xFFFF
+_SEQUENCE_AND_LENGTH = struct.Struct(">HH").unpack_from
 
 
 def next_sequence(sequence: int) -> int:
@@ -98,7 +101,7 @@ class TransmitterDriver(RegisterDriver):
     async def _read_inbox(self) -> list[DATA]:
         box = self._inbox
         reply = await self.client.read_registers(self.config.address, "holding", box.at.address, box.at.count)
-        sequence, length = reply.registers[0], reply.registers[1]
+        sequence, length = _SEQUENCE_AND_LENGTH(reply.raw)
         if sequence in (0, self._seen):
             return []
         if not 0 < length <= box.bytes:

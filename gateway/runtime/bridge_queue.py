@@ -57,21 +57,19 @@ class GuestQueue:
     on_put: Callable[[], None] = lambda: None
     counters: GuestCounters = field(default_factory=GuestCounters)
     _waiting: dict[str, deque[Guest]] = field(default_factory=dict)
-    _size: int = 0
-
-    def __len__(self) -> int:
-        return self._size
+    size: int = 0
+    """How many wait."""
 
     def put(self, guest: Guest) -> None:
         """Put it in line. On a full queue it fails at once, with `EndpointBusy`."""
-        if self._size >= self.limit:
+        if self.size >= self.limit:
             self._drop_gone()
-        if self._size >= self.limit:
+        if self.size >= self.limit:
             self.counters.full += 1
-            guest.done(EndpointBusy("the bus has no room for another request", got=f"{self._size} waiting"))
+            guest.done(EndpointBusy("the bus has no room for another request", got=f"{self.size} waiting"))
             return
         self._waiting.setdefault(guest.client, deque()).append(guest)
-        self._size += 1
+        self.size += 1
         self.on_put()
 
     def take(self, now_ns: int) -> Guest | None:
@@ -79,7 +77,7 @@ class GuestQueue:
         while self._waiting:
             client, line = next(iter(self._waiting.items()))
             guest = line.popleft()
-            self._size -= 1
+            self.size -= 1
             del self._waiting[client]
             if line:
                 self._waiting[client] = line  # to the end: the others first
@@ -106,7 +104,7 @@ class GuestQueue:
                 guest.attempts += 1
             if guest.attempts > 0 and guest.wanted():
                 self._waiting.setdefault(guest.client, deque()).appendleft(guest)
-                self._size += 1
+                self.size += 1
             else:
                 guest.done(e)
             if isinstance(e, ConnectionLost):
@@ -124,14 +122,14 @@ class GuestQueue:
             _, line = self._waiting.popitem()
             for guest in line:
                 guest.done(error)
-        self._size = 0
+        self.size = 0
 
     def _drop_gone(self) -> None:
         """Make room of those whose client went."""
         for client, line in list(self._waiting.items()):
             kept = deque(guest for guest in line if guest.wanted())
             self.counters.gone += len(line) - len(kept)
-            self._size -= len(line) - len(kept)
+            self.size -= len(line) - len(kept)
             if kept:
                 self._waiting[client] = kept
             else:

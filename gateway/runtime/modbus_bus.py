@@ -13,7 +13,9 @@ import asyncio
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass
+from typing import TypeVar
 
+from gateway.core.alarm import alarm, ring
 from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
 from gateway.core.connection import Connector
 from gateway.core.errors import (
@@ -39,6 +41,8 @@ from gateway.runtime.bridge_queue import GuestQueue
 from gateway.runtime.bus_turns import DeviceState, Turns, rates_of, restate, states_of
 from gateway.runtime.coming import Coming
 from gateway.runtime.tags import TagTable
+
+T = TypeVar("T")
 
 MAX_JOBS = 256
 
@@ -93,7 +97,7 @@ class ModbusBus:
         self.down: FieldtwinError | None = None
         """Why the wire could not be opened when that was tried last; None while it is open, or was until just now."""
         self.guests = GuestQueue()
-        self.guests.on_put = self._wake_up
+        self.guests.on_put = self._wake
         self._guest_was_last = False
         self._turns = Turns(self.devices, config.probe_share)
         self._connector = connector
@@ -103,7 +107,9 @@ class ModbusBus:
         self._offset = offset
         self._coming: Coming | None = None
         self._jobs: deque[Job] = deque()
-        self._wake = asyncio.Event()
+        self._awake = False
+        """Somebody wants to be looked at, whether `_serve` sleeps or not."""
+        self._sleeper: asyncio.Future[None] | None = None
         self._idle = asyncio.Event()
         self._halted = False
         self.latency = Latencies()
@@ -124,14 +130,14 @@ class ModbusBus:
             job.done(EndpointBusy("the bus has no room for another request", where=self.config.name))
         else:
             self._jobs.append(job)
-            self._wake.set()
+            self._wake()
 
     def reconfigure(self, coming: Coming) -> None:
         """Another configuration, taken over between two polls: each device's when nothing of it is being read."""
         self._coming = coming
         if self._client is None:
             self._take_over()
-        self._wake.set()
+        self._wake()
 
     def _take_over(self) -> None:
         coming, now_ns = self._coming, self._clock.monotonic_ns()
@@ -153,8 +159,10 @@ class ModbusBus:
             self._coming = None
             coming.done.set()
 
-    def _wake_up(self) -> None:
-        self._wake.set()
+    def _wake(self) -> None:
+        self._awake = True
+        if self._sleeper is not None:
+            ring(self._sleeper)
 
     def totals(self) -> Counter[str]:
         """Counters over all connections so far: requests, replies, timeouts... and `missed_polls`, periods in which a
@@ -166,7 +174,7 @@ class ModbusBus:
     async def halt(self, timeout_s: float) -> None:
         """Send nothing more: return when the request under way has ended, or after `timeout_s` seconds."""
         self._halted = True
-        self._wake.set()
+        self._wake()
         if self._client is not None:
             try:
                 async with asyncio.timeout(timeout_s):
@@ -238,7 +246,7 @@ class ModbusBus:
     async def _serve(self, client: ModbusClient, backoff: Backoff) -> None:
         answered = timeouts = 0
         while True:
-            self._wake.clear()
+            self._awake = False
             counters = client.counters
             if counters.replies + counters.exceptions != answered:
                 answered, timeouts = counters.replies + counters.exceptions, counters.timeouts
@@ -251,23 +259,25 @@ class ModbusBus:
                 self._take_over()
             if self._halted:
                 self._idle.set()
-                await self._wake.wait()
+                await self._sleep(None)
                 continue
             now_ns = self._clock.monotonic_ns()
-            job, wake_ns = self._next_job(client, now_ns)
-            if job is not None:
-                await self._run_job(job)
-                continue
+            wake_ns = now_ns + NS_PER_S
+            if self._jobs:
+                job, wake_ns = self._next_job(client, now_ns)
+                if job is not None:
+                    await self._run_job(job)
+                    continue
             device, group, at_ns = self._turns.next(client.spaced_ns, now_ns)
             due = at_ns <= now_ns
-            if not (due and self._guest_was_last) and await self._carry_guest():
+            if self.guests.size and not (due and self._guest_was_last) and await self._carry_guest():
                 backoff.reset()
             elif due and device is not None:
                 self._guest_was_last = False
                 await self._poll(client, device, group)
                 backoff.reset()
             else:
-                await self._sleep_or_job(min(at_ns, wake_ns))
+                await self._sleep(min(at_ns, wake_ns))
 
     def _next_job(self, client: ModbusClient, now_ns: int) -> tuple[Job | None, int]:
         """The first job in line whose unit has had its pause; else None, and when there may be one."""
@@ -290,14 +300,22 @@ class ModbusBus:
         await self.guests.carry_out(guest, client, framing_of(self.config.endpoint) == "rtu")
         return True
 
-    async def _sleep_or_job(self, until_ns: int) -> None:
-        left_s = max(0.0, (until_ns - self._clock.monotonic_ns()) / NS_PER_S)
-        # Whoever is woken looks at everything: that the next poll is due wakes as a job does.
-        next_poll = asyncio.get_running_loop().call_later(left_s, self._wake.set)
+    async def _sleep(self, until_ns: int | None) -> None:
+        """Until then, or until somebody wakes the bus; None: until that."""
+        if self._awake:
+            return
+        loop, end = asyncio.get_running_loop(), None
+        if until_ns is None:
+            self._sleeper = loop.create_future()
+        else:
+            left_s = (until_ns - self._clock.monotonic_ns()) / NS_PER_S
+            self._sleeper, end = alarm(loop, left_s if left_s > 0.0 else 0.0)
         try:
-            await self._wake.wait()
+            await self._sleeper
         finally:
-            next_poll.cancel()
+            self._sleeper = None
+            if end is not None:
+                end()
 
     async def _poll(self, client: ModbusClient, device: DeviceState, group: str) -> None:
         """One turn of a device: a transaction of a group, or first contact."""
@@ -350,14 +368,8 @@ class ModbusBus:
             if await self._trigger(device, group, now_ns):
                 return
             reading = device.reading = driver.begin(group)
-        complete = False
-
-        async def next_transaction() -> None:
-            nonlocal complete
-            complete = await driver.read_next(reading)
-
-        await self._attempts(device, next_transaction)
-        if complete:
+        going = reading
+        if await self._attempts(device, lambda: driver.read_next(going)):
             device.reading = None
             driver.finish(reading)
 
@@ -424,17 +436,17 @@ class ModbusBus:
         else:
             job.done(None)
 
-    async def _attempts(self, device: DeviceState | None, what: Callable[[], Awaitable[None]]) -> None:
+    async def _attempts(self, device: DeviceState | None, what: Callable[[], Awaitable[T]]) -> T:
         """Try `1 + retries` times as long as the wire is at fault; what the device refuses is not asked again, nor is
         one that was away asked more than once."""
         retries = self.config.retries
         if device is not None:
             stated = device.driver.config.retries
             retries = 0 if not device.retries_left else retries if stated is None else stated
-        for left in range(retries, -1, -1):
+        while True:
             try:
-                await what()
-                return
+                return await what()
             except WireError:
-                if not left:
+                if not retries:
                     raise
+                retries -= 1

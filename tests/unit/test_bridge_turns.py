@@ -101,7 +101,7 @@ def test_what_waited_too_long_and_what_nobody_wants_stays_off_the_wire() -> None
     queue.put(guest("a", results, wanted=lambda: False))
     assert queue.take(MAX_WAIT_NS + 1) is None
     assert [type(r) for r in results] == [EndpointBusy]
-    assert (queue.counters.stale, queue.counters.gone, len(queue)) == (1, 1, 0)
+    assert (queue.counters.stale, queue.counters.gone, queue.size) == (1, 1, 0)
 
 
 def test_when_the_wire_does_not_come_back_all_are_told() -> None:
@@ -128,12 +128,12 @@ def test_the_queue_never_holds_more_than_its_limit_and_answers_each_once(
     for client, take in puts:
         answers.append([])
         queue.put(guest(client, answers[-1]))
-        assert len(queue) <= limit
+        assert queue.size <= limit
         if take:
             taken += queue.take(0) is not None
-    waiting = len(queue)
+    waiting = queue.size
     queue.fail_all(EndpointBusy("the end"))
-    assert len(queue) == 0
+    assert queue.size == 0
     assert all(len(a) <= 1 for a in answers)
     assert sum(len(a) for a in answers) + taken == len(puts)
     assert queue.counters.full + waiting + taken == len(puts)

@@ -80,7 +80,7 @@ def test_mb_062_dead_units_cost_the_others_no_more_than_the_share_of_their_probe
     before, after = probes[0] + 1.1, probes[1]
     between = [t for t in beside.line.times(living[0], before) if t < after]
     assert len(between) == pytest.approx((after - before) * rate, abs=1)
-    assert {d.unit for d in beside.bus.devices if d.online} == set(living)
+    assert {d.driver.config.address for d in beside.bus.devices if d.online} == set(living)
 
 
 def test_mb_062_a_unit_that_comes_and_goes_has_no_larger_share() -> None:

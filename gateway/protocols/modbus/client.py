@@ -6,11 +6,10 @@ retries, reconnects or scales: that is the runtime's and the drivers' business. 
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, closed_here
@@ -26,6 +25,7 @@ from gateway.core.errors import (
     VerifyFailed,
 )
 from gateway.core.latency import Latencies
+from gateway.core.turn import Turn
 from gateway.protocols.modbus.framings import Framing, framing_of, make_framer
 from gateway.protocols.modbus.identity import ReadDeviceIdentification
 from gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
@@ -130,9 +130,11 @@ class ModbusClient:
             spacing_ns=round(_checked_pause(spacing_s) * NS_PER_S),
         )
         self._paces: dict[int, UnitPace] = {}
+        self._spaces = False
+        """Whether any unit needs pauses."""
         self._spaced_ns: dict[int, int] = {}
         self._timeout_s = _checked_timeout(timeout_s)
-        self._turn = asyncio.Lock()
+        self._turn = Turn()
         self._closed = False
         self.counters = ClientCounters()
         self.latency = (
@@ -178,6 +180,7 @@ class ModbusClient:
     def set_pace(self, unit: int, pace: UnitPace) -> None:
         """From now on `unit` (0 to 255) is asked at this pace."""
         self._paces[unit] = pace
+        self._spaces = self._spaces or bool(pace.spacing_s)
 
     def spaced_ns(self, unit: int) -> int:
         """From when on `unit` has had its pause; a broadcast (unit 0) waits for all units. 0 where nobody waits."""
@@ -202,17 +205,17 @@ class ModbusClient:
 
     # -- requests ------------------------------------------------------------------------------------------------
 
-    async def read_registers(
+    def read_registers(
         self, unit: int, table: RegisterTable, address: int, count: int, timeout_s: float | None = None
-    ) -> RegistersReply:
+    ) -> Coroutine[Any, Any, RegistersReply]:
         """Read 1 to 125 holding (03h) or input (04h) registers. Errors as `execute`."""
-        return await self.execute(unit, _read_registers(table, address, count), timeout_s)
+        return self.execute(unit, _read_registers(table, address, count), timeout_s)
 
-    async def read_bits(
+    def read_bits(
         self, unit: int, table: BitTable, address: int, count: int, timeout_s: float | None = None
-    ) -> BitsReply:
+    ) -> Coroutine[Any, Any, BitsReply]:
         """Read 1 to 2000 coils (01h) or discrete inputs (02h). Errors as `execute`."""
-        return await self.execute(unit, ReadBits(table, address, count), timeout_s)
+        return self.execute(unit, ReadBits(table, address, count), timeout_s)
 
     async def write_register(self, unit: int, address: int, value: int, timeout_s: float | None = None) -> WriteReply:
         """Write one holding register (06h). Errors as `execute`."""
@@ -275,17 +278,22 @@ class ModbusClient:
         sent; `ConnectionLost` when the client has become useless. Cancelling it is safe: its reply is never taken for
         another's.
         """
-        timeout_ns = round(_checked_timeout(self._timeout_of(unit) if timeout_s is None else timeout_s) * NS_PER_S)
+        timeout_s = self._timeout_of(unit) if timeout_s is None else _checked_timeout(timeout_s)
+        timeout_ns = round(timeout_s * NS_PER_S)
         if not 0 <= unit <= 255:
             raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
         unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)
         if unanswered:
             request.unanswered(0)  # refuses what cannot be broadcast
-        async with self._turn:
+        if not self._turn.take():
+            await self._turn.wait()
+        try:
             if self._closed:
                 raise closed_here(self._connection.endpoint)
-            await self._await_spacing(unit)
-            await self._await_silence()
+            if self._spaced_ns:
+                await self._await_spacing(unit)
+            if not self._is_silent():
+                await self._await_silence()
             transaction = Transaction(
                 self._framer, unit, request, timeout_ns=timeout_ns, char_time_ns=self._char_time_ns
             )
@@ -294,7 +302,10 @@ class ModbusClient:
                     return await self._send_only(transaction, request)
                 return await self._exchange(transaction, timeout_ns)
             finally:
-                self._space(unit)
+                if self._spaces:
+                    self._space(unit)
+        finally:
+            self._turn.pass_on()
 
     # -- one exchange --------------------------------------------------------------------------------------------
 
@@ -344,8 +355,9 @@ class ModbusClient:
         clock, connection = self._clock, self._connection
         await connection.write(transaction.start(clock.monotonic_ns()))
         transaction.handed_over(clock.monotonic_ns())
+        arrived = connection.inbound.data_stream
         while True:
-            data = await self._read_pending() or await self._read_until(transaction.wake_ns)
+            data = await (self._read_pending() if arrived else self._read_until(transaction.wake_ns))
             now_ns = clock.monotonic_ns()
             reply = transaction.feed(data, now_ns) if data else transaction.poll(now_ns)
             if reply is not None:
@@ -365,6 +377,13 @@ class ModbusClient:
         return request.unanswered(transaction.sent_ns)
 
     # -- the line between exchanges ------------------------------------------------------------------------------
+
+    def _is_silent(self) -> bool:
+        """Whether a request may go at once: as a rule. Otherwise `_await_silence` sees to it."""
+        connection = self._connection
+        if connection.inbound.data_stream or connection.lost is not None:
+            return False
+        return self._line.may_go(self._clock.monotonic_ns())
 
     async def _await_spacing(self, unit: int) -> None:
         """Give `unit` its pause. What arrives meanwhile is nobody's."""
@@ -399,7 +418,7 @@ class ModbusClient:
         lost = self._connection.lost
         if lost is not None:
             raise ConnectionLost(lost.message, where=lost.where)
-        self._line.silent()
+        self._line.may_go(now_ns)
 
     def _drain(self, data: bytes, now_ns: int, *, live: bool) -> None:
         if data:
@@ -409,10 +428,10 @@ class ModbusClient:
             self.counters.noise_bytes += self._framer.noise_bytes - before[1]
             self._line.heard(now_ns, live=live)
 
-    async def _read_until(self, deadline_ns: int) -> bytes:
+    def _read_until(self, deadline_ns: int) -> Coroutine[Any, Any, bytes]:
         """What arrives next, or nothing at `deadline_ns`."""
-        left_s = max(0.0, (deadline_ns - self._clock.monotonic_ns()) / NS_PER_S)
-        return await self._connection.read_within(left_s)
+        left_s = (deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
+        return self._connection.read_within(left_s if left_s > 0.0 else 0.0)
 
     async def _read_pending(self) -> bytes:
         """What arrived already, possibly nothing; of datagrams only the first, so that none is joined to another."""

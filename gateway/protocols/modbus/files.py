@@ -157,4 +157,4 @@ class ReadFifoQueue(Request[RegistersReply]):
     def decode(self, pdu: bytes, t_ns: int) -> RegistersReply:
         if int.from_bytes(pdu[3:5], "big") * 2 != len(pdu) - 5:
             raise Desync("the count of a FIFO queue does not fit its byte count", got=short_hex(pdu))
-        return RegistersReply(words_of(pdu[5:]), bytes(pdu[5:]), t_ns)
+        return RegistersReply(bytes(pdu[5:]), t_ns)

@@ -57,6 +57,16 @@ class LineSilence:
         """Whether an exchange ended badly and the line has not been silent long enough since."""
         return self._in_quarantine
 
+    def may_go(self, now_ns: int) -> bool:
+        """Whether a request may go now, if nothing arrived since; the quarantine, if there was one, is over then."""
+        if self._not_before_ns > now_ns or (
+            self._active_ns is not None and self._active_ns + self._required_ns > now_ns
+        ):
+            return False
+        self._in_quarantine = False
+        self._required_ns = self._t35_ns
+        return True
+
     def clear_ns(self, now_ns: int) -> int:
         """When a request may go if nothing arrives any more."""
         silent_ns = now_ns if self._active_ns is None else self._active_ns + self._required_ns
@@ -78,15 +88,11 @@ class LineSilence:
             self._note_latency(now_ns)
             self._required_ns = max(self._required_ns, self.longest_latency_ns)
 
-    def silent(self) -> None:
-        """The silence was kept; the quarantine is over."""
-        self._in_quarantine = False
-        self._required_ns = self._t35_ns
-
     def answered(self, now_ns: int, sent_ns: int) -> None:
         """A reply came, complete at `now_ns`, to the request that had left at `sent_ns`."""
         self._sent_ns = sent_ns
-        self._note_latency(now_ns)
+        if now_ns - sent_ns > self.longest_latency_ns:
+            self._note_latency(now_ns)
         self._end(now_ns, self._t35_ns)
 
     def damaged(self, now_ns: int) -> None:

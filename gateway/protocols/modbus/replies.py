@@ -5,7 +5,10 @@ Knows nothing of framing, requests or scaling: a register here is the unsigned 1
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
+
+import msgspec
 
 
 class Reply:
@@ -28,13 +31,16 @@ class WriteReply(Reply):
     acknowledged: bool = True
 
 
-@dataclass(frozen=True, slots=True)
-class RegistersReply(Reply):
-    """Registers 0 to 65535 in the order of their addresses; `raw` is their 2 x n bytes, high byte first (AP 4.2)."""
+class RegistersReply(Reply, msgspec.Struct, frozen=True, gc=False):
+    """Registers; `raw` is their 2 x n bytes, high byte first (AP 4.2). A struct: one is made with nearly every exchange."""
 
-    registers: tuple[int, ...]
     raw: bytes
     t_ns: int
+
+    @property
+    def registers(self) -> tuple[int, ...]:
+        """0 to 65535 each, in the order of their addresses."""
+        return struct.unpack(f">{len(self.raw) // 2}H", self.raw)
 
 
 @dataclass(frozen=True, slots=True)

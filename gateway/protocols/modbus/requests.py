@@ -5,7 +5,7 @@ Addresses are those on the wire, 0 to 65535 (not 40001). Limits are the standard
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from gateway.core.errors import UsageError, VerifyFailed
@@ -57,27 +57,28 @@ class ReadRegisters(Request[RegistersReply]):
     table: RegisterTable
     address: int
     count: int
+    function: int = field(init=False, repr=False, compare=False)  # asked for with every reply
+    _reply_bytes: int = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         _check_table(self.table, _REGISTER_FUNCTIONS)
         _check_span(self.address, self.count, MAX_READ_REGISTERS)
-
-    @property
-    def function(self) -> int:
-        return _REGISTER_FUNCTIONS[self.table]
+        object.__setattr__(self, "function", _REGISTER_FUNCTIONS[self.table])
+        object.__setattr__(self, "_reply_bytes", 2 * self.count)
 
     def encode(self) -> bytes:
         return pdus.encode_read(self.function, self.address, self.count)
 
     def nominal_length(self) -> int:
-        return 2 + 2 * self.count
+        return 2 + self._reply_bytes
 
     def reply_length(self, head: bytes) -> int:
-        return _counted(head, 2 * self.count)
+        if len(head) < 2:
+            return NEED_MORE
+        return 2 + self._reply_bytes if head[1] == self._reply_bytes else IMPOSSIBLE
 
     def decode(self, pdu: bytes, t_ns: int) -> RegistersReply:
-        raw = pdu[2:]
-        return RegistersReply(pdus.words_of(raw), raw, t_ns)
+        return RegistersReply(pdu[2:], t_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,4 +265,4 @@ class ReadWriteRegisters(Request[RegistersReply]):
 
     def decode(self, pdu: bytes, t_ns: int) -> RegistersReply:
         raw = pdu[2:]
-        return RegistersReply(pdus.words_of(raw), raw, t_ns)
+        return RegistersReply(raw, t_ns)

@@ -14,7 +14,7 @@ from typing import Any
 
 from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError
-from gateway.protocols.modbus.crc import crc16, with_crc
+from gateway.protocols.modbus.crc import crc16, is_whole, with_crc
 from gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 from gateway.protocols.modbus.framing import Framer
 from gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request, short_hex
@@ -120,7 +120,7 @@ class RtuFramer(Framer):
         request = self._request
         if request is None or self._echo_due or len(data) < _EXCEPTION_FRAME or data[0] != self._unit:
             return False
-        return data[1] == request.function and request.reply_length(data[1:]) + 3 == len(data) and crc16(data) == 0
+        return data[1] == request.function and request.reply_length(data[1:3]) + 3 == len(data) and is_whole(data)
 
     def _scan(self, settled: bool) -> bytes | None:
         if self._echo_due and not self._strip_echo():
@@ -265,11 +265,12 @@ class RtuFramer(Framer):
 
     def _end(self, size: int) -> None:
         """The exchange is over: behind its frame of `size` is a tail of zeros (case MB-009) or a reply twice (MB-014)."""
-        del self._buffer[:size]
-        rest = len(self._buffer.rstrip(b"\x00"))
-        self.late_bytes += rest
-        self.noise_bytes += len(self._buffer) - rest
-        self._buffer.clear()
+        if self._buffer:
+            del self._buffer[:size]
+            rest = len(self._buffer.rstrip(b"\x00"))
+            self.late_bytes += rest
+            self.noise_bytes += len(self._buffer) - rest
+            self._buffer.clear()
         self._request = None
         self._echo_due = False
 

@@ -35,17 +35,14 @@ class Transaction(Generic[R]):
         self._frame = b""
         self._heard_ns = 0
         self._settled = True
+        self._granted_ns = timeout_ns
+        if char_time_ns and (nominal := request.nominal_length()):
+            self._granted_ns += framer.wire_length(nominal) * char_time_ns
         self.sent_ns = 0
         """When the last character has left."""
-        self.done = False
-
-    @property
-    def deadline_ns(self) -> int:
+        self.deadline_ns = self._granted_ns
         """When the reply has to be complete."""
-        due_ns = self.sent_ns + self._timeout_ns
-        if self._char_time_ns and (nominal := self._request.nominal_length()):
-            due_ns += self._framer.wire_length(nominal) * self._char_time_ns
-        return due_ns
+        self.done = False
 
     @property
     def wake_ns(self) -> int:
@@ -65,13 +62,15 @@ class Transaction(Generic[R]):
     def handed_over(self, now_ns: int) -> None:
         """The frame was handed to the wire at `now_ns`, later than `start` where a buffer was full."""
         self.sent_ns = now_ns + len(self._frame) * self._char_time_ns
+        self.deadline_ns = self.sent_ns + self._granted_ns
 
     def feed(self, data: bytes, now_ns: int) -> R | None:
         """Bytes arrived. The reply if it is complete, else None.
 
         Raises `CrcError`, `Desync`, `ModbusExceptionReply` or `VerifyFailed`; then the transaction is over.
         """
-        self._check_running()
+        if self.done or not self._frame:
+            raise _not_under_way()
         self._heard_ns = now_ns
         self._settled = False
         try:
@@ -83,7 +82,8 @@ class Transaction(Generic[R]):
 
     def poll(self, now_ns: int) -> R | None:
         """Time passed. As `feed`; at the deadline raises what `Framer.overdue` says, `ReplyTimeout` as a rule."""
-        self._check_running()
+        if self.done or not self._frame:
+            raise _not_under_way()
         overdue = now_ns >= self.deadline_ns
         if not self._settled and (overdue or now_ns >= self._heard_ns + self._framer.gap_ns):
             self._settled = True
@@ -107,6 +107,6 @@ class Transaction(Generic[R]):
         self.done = True
         return error.at(f"unit {self._unit}")
 
-    def _check_running(self) -> None:
-        if self.done or not self._frame:
-            raise Bug("bytes for a Modbus transaction that is not under way")
+
+def _not_under_way() -> Bug:
+    return Bug("bytes for a Modbus transaction that is not under way")

@@ -67,6 +67,9 @@ class MbapSlave:
         """Like `feed`, with every request ADU, for taps and journals."""
         if self.desync is not None:
             return []
+        if not self._buffer and _is_adu(data):
+            self.requests += 1
+            return [self._exchange(data, False, now_ns)]
         self._buffer += data
         exchanges: list[Exchange] = []
         while adu := self._next_adu():
@@ -77,8 +80,7 @@ class MbapSlave:
 
     def answer(self, data: bytes, now_ns: int) -> bytes:
         """Like `feed`, the responses in one piece. What comes is one whole ADU as a rule: that is not copied together first."""
-        length = len(data) - HEADER
-        if MIN_LENGTH <= length <= MAX_LENGTH and data[5] == length and data[2:5] == b"\0\0\0" and not self._buffer:
+        if not self._buffer and _is_adu(data):
             if self.desync is not None:
                 return b""
             self.requests += 1
@@ -140,3 +142,9 @@ class MbapSlave:
         if unit_id in ANY_UNIT and len(self.units) == 1:
             return next(iter(self.units.values()))
         return None
+
+
+def _is_adu(data: bytes) -> bool:
+    """Whether a chunk is one whole ADU of Modbus, and nothing else: as a rule."""
+    length = len(data) - HEADER
+    return MIN_LENGTH <= length <= MAX_LENGTH and data[5] == length and data[2:5] == b"\0\0\0"

@@ -23,6 +23,9 @@ RECEIVED = 64
 """Messages that wait for a free inbox; the link waits beyond that."""
 
 
+_LINK = "link_state", "link_sent", "link_received", "link_resent"
+
+
 class MailboxModem(RegisterBank):
     """One modem. `outgoing` carries what it sends, `incoming` what it receives; `identity` is what others of its tags hold."""
 
@@ -36,8 +39,8 @@ class MailboxModem(RegisterBank):
         self._outgoing, self._incoming = outgoing, incoming
         self._tags = profile.tags
         self._cells = MapBank(_spans(profile), self._on_write)
-        self._told: dict[str, int] = {}
-        """The counters of the link as its registers show them."""
+        self._told = (-1, -1, -1, -1)
+        """The counters of the link as its registers show them (`_LINK`); as made, none."""
         self._received: deque[bytes] = deque(maxlen=RECEIVED)
         self._sequence = 0
         self._accepted = 0
@@ -82,15 +85,16 @@ class MailboxModem(RegisterBank):
             self._received.append(payload)
         if self._received and self._cells.peek("holding", self._inbox.ack.address) == self._sequence:
             self._fill_inbox(self._received.popleft())
-        for name, number in (
-            ("link_state", 1),
-            ("link_sent", self._outgoing.sent),
-            ("link_received", self._incoming.delivered),
-            ("link_resent", self._outgoing.resent),
-        ):
+        counters = 1, self._outgoing.sent, self._incoming.delivered, self._outgoing.resent
+        if counters != self._told:
+            self._tell(counters, now_ns)
+
+    def _tell(self, counters: tuple[int, int, int, int], now_ns: int) -> None:
+        """The link's counters, which changed, into the registers that show them."""
+        before, self._told = self._told, counters
+        for name, number, told in zip(_LINK, counters, before, strict=True):
             tag = self._tags.get(name)
-            if tag is not None and self._told.get(name) != number:
-                self._told[name] = number
+            if tag is not None and number != told:
                 words = encode(number, tag.type, tag.order)
                 self._cells.poke(tag.registers.table, tag.registers.address, *words)
                 self.journal.note(name, b"".join(w.to_bytes(2) for w in words), now_ns)

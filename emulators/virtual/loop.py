@@ -46,55 +46,38 @@ class Deadlock(Bug):
 
 
 class _Call(asyncio.Handle):
-    """A handle made in fewer steps: on a virtual loop they are most of what is made, and there is no debug mode to look for."""
+    """A handle made in fewer steps (`call_soon`): on a virtual loop they are most of what is made, and it has no debug mode."""
 
     __slots__ = ()
     _callback: Callable[..., object]
     _args: tuple[Any, ...]
     _context: Context
     _cancelled: bool
+    _loop: VirtualLoop
     _repr = _source_traceback = None  # of the debug mode
-
-    def __init__(
-        self, callback: Callable[..., object], args: tuple[Any, ...], loop: VirtualLoop, context: Context | None
-    ) -> None:
-        self._callback = callback
-        self._args = args
-        self._context = copy_context() if context is None else context
-        self._cancelled = False
-        self._loop = loop
 
 
 class _Timer(asyncio.TimerHandle):
     """As `_Call`, with a time."""
 
     __slots__ = ()
+    _when: float
     _callback: Callable[..., object]
     _args: tuple[Any, ...]
     _context: Context
     _cancelled: bool
+    _loop: VirtualLoop
     _repr = _source_traceback = None  # of the debug mode
-
-    def __init__(
-        self,
-        when_ns: int,
-        callback: Callable[..., object],
-        args: tuple[Any, ...],
-        loop: VirtualLoop,
-        context: Context | None,
-    ) -> None:
-        self._callback = callback
-        self._args = args
-        self._context = copy_context() if context is None else context
-        self._cancelled = False
-        self._loop = loop
-        self._when = when_ns / NS_PER_S
 
     def cancel(self) -> None:
         """It stays among the loop's timers until its time comes, or until they are looked through."""
         self._cancelled = True
         self._callback = _nothing  # what it held is let go
         self._args = ()
+
+
+_new = object.__new__
+"""The constructors of asyncio's handles look for its debug mode; `call_soon` and `call_at_ns` do the rest."""
 
 
 def _nothing() -> None:
@@ -134,30 +117,36 @@ class VirtualLoop(asyncio.AbstractEventLoop):
     def call_soon(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        handle = _Call(callback, args, self, context)
+        handle = _new(_Call)
+        handle._callback = callback
+        handle._args = args
+        handle._context = copy_context() if context is None else context
+        handle._cancelled = False
+        handle._loop = self
         self._ready.append(handle)
         return handle
 
     def call_later(
         self, delay: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        return self._at(self.now_ns + round(delay * NS_PER_S), callback, args, context)
+        return self.call_at_ns(self.now_ns + round(delay * NS_PER_S), callback, *args, context=context)
 
     def call_at(
         self, when: float, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
-        return self._at(round(when * NS_PER_S), callback, args, context)
+        return self.call_at_ns(round(when * NS_PER_S), callback, *args, context=context)
 
     def call_at_ns(
         self, when_ns: int, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.TimerHandle:
         """As `call_at`, to the nanosecond. What is past is due at this instant, behind what is ready."""
-        return self._at(when_ns, callback, args, context)
-
-    def _at(
-        self, when_ns: int, callback: Callable[..., object], args: tuple[Any, ...], context: Context | None
-    ) -> _Timer:
-        timer = _Timer(when_ns, callback, args, self, context)
+        timer = _new(_Timer)
+        timer._callback = callback
+        timer._args = args
+        timer._context = copy_context() if context is None else context
+        timer._cancelled = False
+        timer._loop = self
+        timer._when = when_ns / NS_PER_S
         self._sequence = sequence = self._sequence + 1
         now_ns = self.now_ns
         heappush(self._timers, (when_ns if when_ns > now_ns else now_ns, sequence, timer))
@@ -177,7 +166,13 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def alarm(self, delay_s: float) -> asyncio.Future[None]:
         """As `sleeper`, in seconds from now (`gateway.core.alarm`). Whoever has it may set it before."""
-        return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
+        future: asyncio.Future[None] = asyncio.Future(loop=self)
+        self._sequence = sequence = self._sequence + 1
+        now_ns = self.now_ns
+        heappush(self._timers, (now_ns + round(delay_s * NS_PER_S) if delay_s > 0 else now_ns, sequence, future))
+        if sequence >= self._compact_at:
+            self._compact()
+        return future
 
     def _compact(self) -> None:
         """Let go of the timers that nobody waits for any more; again when half as many as are left could be over."""

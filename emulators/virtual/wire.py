@@ -84,10 +84,6 @@ class MemoryEnd(Client):
         """A new end in the place of one that was closed, as when a port is opened again."""
         return cls(old.wire, old.direction, type(old.inbound)(), old.endpoint)
 
-    @property
-    def other(self) -> MemoryEnd:
-        return self.wire.far if self.direction is SENT else self.wire.near
-
     def arrived(self, data: bytes) -> None:
         """Bytes from the other side; those that come to a closed end are nobody's."""
         if self._lost is None:
@@ -96,8 +92,9 @@ class MemoryEnd(Client):
     async def write(self, data: bytes) -> None:
         if self._lost is not None:
             raise self._loss()
-        self.wire.write(self.direction, data)
-        other = self.other
+        wire = self.wire
+        wire.write(self.direction, data)
+        other = wire.far if self.direction is SENT else wire.near
         while len(other._stream) >= other.max_pending and other._lost is None and self._lost is None:
             other._room = asyncio.get_running_loop().create_future()
             await other._room

@@ -51,7 +51,9 @@ class SerialPacer:
 
     def send(self, now_ns: int, nbytes: int) -> int:
         """Like `earliest_end`, and the line is taken until then."""
-        self.busy_until_ns = end_ns = self.earliest_end(now_ns, nbytes)
+        busy_ns = self.busy_until_ns
+        numerator, denominator = self._char
+        self.busy_until_ns = end_ns = (now_ns if now_ns > busy_ns else busy_ns) - (-nbytes * numerator // denominator)
         return end_ns
 
     def _half_chars_ns(self, count: int) -> int:

@@ -111,8 +111,9 @@ class _End(Generic[T]):
         self._stream.append(item)
         if self.on_arrival is not None:
             self.on_arrival(item)
-        if self._waiter is not None:
-            ring(self._waiter)
+        waiter = self._waiter
+        if waiter is not None and not waiter.done():
+            waiter.set_result(None)
         return len(self._stream) < self.max_pending
 
     def feed_lost(self, error: FieldtwinError) -> None:

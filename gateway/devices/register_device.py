@@ -8,8 +8,7 @@ are as old as the sample and not as the poll: a sensor that answers and does not
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Coroutine
-from dataclasses import dataclass, field
+from collections.abc import Coroutine, Iterable
 from typing import Any
 
 from gateway.core.connection import PROTOCOL, ByteConnection
@@ -27,15 +26,17 @@ SAMPLED_STEPS = 0x80000000
 """A sample counter that moved by more than this went backwards: the device restarted."""
 
 
-@dataclass(eq=False)
 class Reading:
     """A group that is being read, transaction by transaction. `items` are what occurred, once it is complete."""
 
-    what: str
-    todo: deque[Read] = field(default_factory=deque)
-    blocks: list[tuple[Read, bytes]] = field(default_factory=list)
-    values: dict[str, TagValue] = field(default_factory=dict)
-    items: list[DATA] = field(default_factory=list)
+    __slots__ = ("blocks", "items", "todo", "values", "what")
+
+    def __init__(self, what: str, todo: Iterable[Read] = ()) -> None:
+        self.what = what
+        self.todo = deque(todo)
+        self.blocks: list[tuple[Read, bytes]] = []
+        self.values: dict[str, TagValue] = {}
+        self.items: list[DATA] = []
 
 
 class RegisterDriver(DeviceDriver):
@@ -136,7 +137,7 @@ class RegisterDriver(DeviceDriver):
 
     def begin(self, what: str) -> Reading:
         """Start to read `what`, a poll group. Nothing is sent yet."""
-        return Reading(what, deque(self.plans[what].reads))
+        return Reading(what, self.plans[what].reads)
 
     async def read_next(self, reading: Reading) -> bool:
         """One transaction of `reading`; True when it was the last one, and all values are published.

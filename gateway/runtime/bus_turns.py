@@ -108,9 +108,11 @@ class Turns:
                 choices = ((device.reading.what, device.reading_due_ns),)
             else:
                 choices = device.schedule.due_ns.items()
-            ready_ns = max(now_ns, spaced_ns(device.unit))
+            ready_ns = spaced_ns(device.driver.config.address)
+            if ready_ns < now_ns:
+                ready_ns = now_ns
             for group, due_ns in choices:
-                key = max(due_ns, ready_ns), due_ns, order
+                key = (due_ns if due_ns > ready_ns else ready_ns), due_ns, order
                 if best is None or key < best:
                     best, found = key, (device, group)
         return *found, best[0] if best is not None else now_ns + NS_PER_S

@@ -365,7 +365,7 @@ class ModbusBus:
             now_ns = self._clock.monotonic_ns()
             device.reading_due_ns = device.schedule.due_ns[group]
             device.schedule.took(group, now_ns)
-            if await self._trigger(device, group, now_ns):
+            if driver.profile.form.trigger is not None and await self._trigger(device, group, now_ns):
                 return
             reading = device.reading = driver.begin(group)
         going = reading

@@ -134,6 +134,8 @@ class ModbusClient:
         """Whether any unit needs pauses."""
         self._spaced_ns: dict[int, int] = {}
         self._timeout_s = _checked_timeout(timeout_s)
+        self._timeouts_ns: dict[int, int] = {}
+        """By unit, until something else is stated."""
         self._turn = Turn()
         self._closed = False
         self.counters = ClientCounters()
@@ -172,6 +174,7 @@ class ModbusClient:
     def restate(self, *, timeout_s: float, turnaround_s: float, spacing_s: float) -> None:
         """From the next request on, another pace of the whole connection; as in the constructor."""
         self._timeout_s = _checked_timeout(timeout_s)
+        self._timeouts_ns.clear()
         self._line.restate(
             turnaround_ns=round(_checked_timeout(turnaround_s) * NS_PER_S),
             spacing_ns=round(_checked_pause(spacing_s) * NS_PER_S),
@@ -180,6 +183,7 @@ class ModbusClient:
     def set_pace(self, unit: int, pace: UnitPace) -> None:
         """From now on `unit` (0 to 255) is asked at this pace."""
         self._paces[unit] = pace
+        self._timeouts_ns.clear()
         self._spaces = self._spaces or bool(pace.spacing_s)
 
     def spaced_ns(self, unit: int) -> int:
@@ -278,8 +282,12 @@ class ModbusClient:
         sent; `ConnectionLost` when the client has become useless. Cancelling it is safe: its reply is never taken for
         another's.
         """
-        timeout_s = self._timeout_of(unit) if timeout_s is None else _checked_timeout(timeout_s)
-        timeout_ns = round(timeout_s * NS_PER_S)
+        if timeout_s is not None:
+            timeout_ns = round(_checked_timeout(timeout_s) * NS_PER_S)
+        elif (known_ns := self._timeouts_ns.get(unit)) is not None:
+            timeout_ns = known_ns
+        else:
+            timeout_ns = self._timeouts_ns[unit] = round(self._timeout_of(unit) * NS_PER_S)
         if not 0 <= unit <= 255:
             raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
         unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)

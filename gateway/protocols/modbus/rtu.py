@@ -67,7 +67,8 @@ class RtuFramer(Framer):
         return 1 + pdu_length + 2
 
     def begin(self, unit: int, request: Request[Any]) -> bytes:
-        self._skip(len(self._buffer))
+        if self._buffer:
+            self._skip(len(self._buffer))
         self._request = request
         self._unit = unit
         self._sent = with_crc(bytes([unit]) + request.encode())

@@ -167,7 +167,7 @@ class _Run(VirtualRun):
         self.before: Callable[[VirtualBench], Awaitable[None]] | None = None
         self.seen = {(row.wire, row.name): Seen() for row in rows}
 
-    async def _through(self, bench: VirtualBench, loop: VirtualLoop) -> None:
+    async def _through(self, bench: VirtualBench, loop: VirtualLoop, judge: Callable[[], None]) -> None:
         values_before: dict[str, int] = {}
         while bench.now_s() < self.options.duration_s:
             await bench.sleep_until_s(bench.now_s() + 0.1)

@@ -37,10 +37,6 @@ class DeviceState:
     triggered: set[str] = field(default_factory=set)
 
     @property
-    def unit(self) -> int:
-        return self.driver.config.address
-
-    @property
     def retries_left(self) -> bool:
         """Whether a request that nobody answers is worth repeating: not while the device is known to be away."""
         return self.online or not self.backoff.failures

@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 from contextlib import suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -81,7 +82,9 @@ class GatewayProcess:
         if self._config.capture:
             from gateway.connections.tap import TapFile, TappedConnector
 
-            tap = TapFile(Path(self._config.capture))
+            started = datetime.fromtimestamp(self._clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+            of_run = {"started": started, "system": system.name, "prototype": self._config.mapping is not None}
+            tap = TapFile(Path(self._config.capture), head={**of_run, "t_ns": self._clock.monotonic_ns()})
             connector = TappedConnector(connector, [tap], self._clock)
         audit = self._audit = AuditLog(run_dir / "audit.jsonl", self._clock)
         log = ExchangeLog(run_dir / "store.sqlite", system=system.name, prototype=self._config.mapping is not None)
@@ -167,7 +170,12 @@ class GatewayProcess:
             **describe(self._gateway, self._clock.monotonic_ns()),
             "learnt": describe_learnt(self._gateway.drivers.values()),
             "store_error": self._store_error,
-            "config": {"hash": self._system.hash, "reloads": self._reloads, "changed": self._changed},
+            "config": {
+                "system": self._system.name,
+                "hash": self._system.hash,
+                "reloads": self._reloads,
+                "changed": self._changed,
+            },
         }
 
     async def _published(self, args: dict[str, Any]) -> dict[str, Any]:

@@ -87,7 +87,9 @@ def command(
             save_state.write_text(state.dump(loaded), encoding="utf-8")
         except OSError as e:
             raise FileInvalid(f"cannot be written: {e.strerror or e}", path=str(save_state)) from e
-        talk.print(f"{len(state.values)} values, {len(state.programs)} programs → {save_state}")
+        values, programs = len(state.values), len(state.programs)
+        told = f"{values} value{'s'[: values != 1]} and what {programs} program{'s'[: programs != 1]} hold{'s'[: programs == 1]}"
+        talk.print(f"{told} → {escape(str(save_state))}", soft_wrap=True)
         return 0
     if commands or require or finally_ or fault_file or not plans:
         faults = _faults(fault_file, loaded)
@@ -134,9 +136,9 @@ def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> 
     if not source:
         return KnownState()
     if source.startswith("instance:"):
-        from twin.instance import runtime_root
+        from fieldtwin.running.plc_client import choose
 
-        return asyncio.run(of_instance(runtime_root() / source.removeprefix("instance:")))
+        return asyncio.run(of_instance(choose(source.removeprefix("instance:")).parent, loaded))
     if source.startswith(("postgresql:", "postgres:")) or _is_sqlite(Path(source)):
         return asyncio.run(known_state(source, loaded, origin))
     return read_state(Path(source), loaded)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from fieldtwin.whatif.outcome import Outcome
@@ -17,17 +18,23 @@ def show(console: Console, outcomes: Sequence[Outcome], units: Mapping[str, str]
     """Each plan: its verdict, its requirements, its states, its variables. `units` by the name of a tag."""
     for outcome in outcomes:
         console.print()
-        console.print(f"[bold]{outcome.plan}[/]: {'met' if outcome.met else 'not met'}", markup=True)
+        console.print(f"[bold]{escape(outcome.plan)}[/]: {'met' if outcome.met else 'not met'}", soft_wrap=True)
         if outcome.error:
-            console.print(f"  error  {outcome.error}", markup=False)
+            console.print(f"  error  {outcome.error}", markup=False, soft_wrap=True)
         for r in outcome.requirements:
             when = "" if r.broken_s is None else f"  from {_time(r.broken_s)} on: {r.seen}"
-            console.print(f"  {'met    ' if r.broken_s is None else 'not met'}  {r.kind} {r.text}{when}", markup=False)
+            console.print(
+                f"  {'met    ' if r.broken_s is None else 'not met'}  {r.kind} {r.text}{when}",
+                markup=False,
+                soft_wrap=True,
+            )
         for program, seen in outcome.states.items():
             told = " → ".join(f"{state} at {_time(t)}" for t, state in seen[:8])
-            console.print(f"  {program}  {told}{' …' if len(seen) > 8 else ''}", markup=False)
+            console.print(f"  {program}  {told}{' …' if len(seen) > 8 else ''}", markup=False, soft_wrap=True)
         if outcome.not_taken:
-            console.print(f"  begun without what is known of: {', '.join(outcome.not_taken)}", markup=False)
+            console.print(
+                f"  begun without what is known of: {', '.join(outcome.not_taken)}", markup=False, soft_wrap=True
+            )
         console.print(_table(outcome, units))
 
 

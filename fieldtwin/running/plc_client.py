@@ -37,7 +37,8 @@ def choose(instance: str) -> Path:
         instance = found[0]
     path = runtime_root() / instance / "plc.sock"
     if not path.exists():
-        raise Unreachable(f"the instance {instance!r} has no PLC", expected=", ".join(found) or "one that is running")
+        running = f"one of {', '.join(found)}" if found else "one that is running"
+        raise Unreachable(f"no instance {instance!r} is running here", expected=running)
     return path
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 
 from gateway.core.control import ControlClient
-from gateway.core.errors import FileInvalid
+from gateway.core.errors import FileInvalid, UsageError
 from twin.system import System
 
 VERSION = 1
@@ -83,9 +83,12 @@ def read_state(path: Path, system: System) -> KnownState:
     return KnownState(form.values, form.programs, form.utc_ms, str(path))
 
 
-async def of_instance(run_dir: Path) -> KnownState:
-    """What an instance knows that runs now, by its control channels. Raises `Unreachable`."""
+async def of_instance(run_dir: Path, system: System) -> KnownState:
+    """What an instance of `system` knows that runs now, by its control channels. Raises `Unreachable`, and `UsageError` for one
+    of another system."""
     gateway, plc = await _asked(run_dir / "gateway.sock"), await _asked(run_dir / "plc.sock")
+    if (runs := gateway["config"]["system"]) != system.name:
+        raise UsageError(f"the instance {run_dir.name!r} is one of another system", expected=system.name, got=runs)
     values = {
         name: tag["value"]
         for name, tag in gateway["tags"].items()

@@ -10,6 +10,18 @@ import pytest
 from procs import Fieldtwin, fieldtwin, no_tracebacks, run_to_end, wait_for
 
 
+def what_if(root: Path, system: str, instance: str) -> tuple[int, str, int]:
+    """Exit code, state and period of a fork of an instance that runs, a few seconds ahead; or what is wrong."""
+    ended = run_to_end(
+        root, "what-if", system, "--from", f"instance:{instance}", "--horizon", "5s", "--json", name=f"if-{instance}"
+    )
+    if ended.process.returncode > 1:
+        return ended.process.returncode, ended.err.removeprefix("fieldtwin: ").partition(";")[0], 0
+    [outcome] = ended.summary["outcomes"]
+    [(_, state)] = outcome["states"]["relay"]
+    return ended.process.returncode, state, outcome["variables"]["ctd.sample_period_s"]["last"]
+
+
 @pytest.mark.slow
 @pytest.mark.long
 def test_two_twins_of_one_system_run_side_by_side_and_each_has_its_own_plant(tmp_path: Path) -> None:
@@ -35,6 +47,9 @@ def test_two_twins_of_one_system_run_side_by_side_and_each_has_its_own_plant(tmp
         assert "is running already" in again.err
         for plant, twin in zip(plants, twins, strict=True):
             wait_for(lambda p=plant: p("get")["commands_taken"] == 1 and p("get")["sent_through"] > 20, 40, twin.err)
+        assert what_if(root, "observatory", "two") == (0, "ACTIVE", 7)
+        assert what_if(root, "ocean_west", "two") == (2, "the instance 'two' is one of another system", 0)
+        assert what_if(root, "observatory", "three") == (4, "no instance 'three' is running here", 0)
         for twin in twins:
             twin.signal(2)
             assert twin.wait(20) == 0, twin.err

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.seal import sealed
@@ -69,9 +69,9 @@ class DrivenRun(ABC):
         loop = VirtualLoop()
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))
-            sink: BinaryIO | None = stack.enter_context(open_sink(self._trace_file)) if self._trace_file else None
+            self.trace = Trace(TRACE_KEPT, open_sink(self._trace_file) if self._trace_file else None)
+            stack.callback(self.trace.close)
             stack.callback(loop.close)
-            self.trace = Trace(TRACE_KEPT, sink)
             with sealed():
                 main = loop.create_task(self._main(loop, folder), name="run")
                 main.add_done_callback(lambda _: loop.stop())

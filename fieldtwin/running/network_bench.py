@@ -13,7 +13,7 @@ from typing import Any
 from fieldtwin.conformance.case import Danger
 from fieldtwin.running.shore import Shore
 from fieldtwin.scenarios.bench import Bench, Can, Reading
-from fieldtwin.scenarios.trace import Event, Kind, Trace
+from fieldtwin.scenarios.trace import Kind, Trace
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import UsageError
 from twin.network import WATER, Network
@@ -39,8 +39,7 @@ class MemberTrace(Trace):
             if data.get("target"):
                 data = {**data, "target": self._prefix + data["target"]}
         else:
-            for listener in self.listeners:
-                listener(Event(t_ns, kind, where, data))
+            self.tell(t_ns, kind, where, data)
             where = self._prefix + where
         self._whole.note(t_ns + self.offset_ns, kind, where, data)
 

@@ -65,7 +65,7 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
         refused = "--can is of one system, and this is a network"
     sink = open_sink(trace_file) if trace_file is not None else None
     trace = Trace(sink=sink)
-    trace.listeners.append(collector.feed)
+    trace.listen(collector.feed)
     try:
         if refused:  # then the plant is left alone
             result = result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)
@@ -76,8 +76,7 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
     except FieldtwinError as e:
         result = result_of(scenario, target.name, Verdict.ERROR, reason=str(e), trace=tuple(trace.events))
     finally:
-        if sink is not None:
-            sink.close()
+        trace.close()
     return replace(
         result,
         seed=target.seed if target.seed is not None else scenario.form.seed,

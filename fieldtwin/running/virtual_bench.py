@@ -5,7 +5,8 @@ A `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `Virtua
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +32,10 @@ from twin.prototype_file import Prototype
 from twin.system import System
 from twin.virtual import VirtualPrototype
 
+ASKED_KEPT = 64
 _QUALITIES = {quality: quality.name.lower() for quality in Quality}
 _REASONS = {reason: reason.name.lower() for reason in Reason}
+_FRAME, _TAG, _SENT = Kind.FRAME, Kind.TAG, Direction.SENT  # an Enum's members are slow to look up
 
 
 class VirtualBench(Started):
@@ -77,6 +80,8 @@ class VirtualBench(Started):
         if probes and all(probe.endpoint is None for probe in probes):  # nothing else is in memory
             self.can = self.can | {Can.PROBE}
         self._probes: Probes | None = None
+        self.asked_ns: dict[str, deque[int]] = {bus: deque(maxlen=ASKED_KEPT) for bus in system.buses}
+        """By bus: when the gateway last sent something, on the loop's clock, the latest last."""
         self._updates: dict[str, int] = {}
         self._words = {
             f"{p}.state": words for p, words in state_words(self.run.twin.ecs.layout, system.plc.programs).items()
@@ -140,9 +145,11 @@ class VirtualBench(Started):
 
     def _put(self, name: str, value: TagValue) -> None:
         self._updates[name] = self._updates.get(name, 0) + 1
-        shown = value.value.hex() if isinstance(value.value, bytes) else value.value
-        quality, reason = _QUALITIES[value.quality], _REASONS[value.reason]
-        self.note(Kind.TAG, name, {"value": shown, "quality": quality, "reason": reason})
+        shown = value.value
+        if isinstance(shown, bytes):
+            shown = shown.hex()
+        data = {"value": shown, "quality": _QUALITIES[value.quality], "reason": _REASONS[value.reason]}
+        self.trace.note(self.loop.now_ns - self.run.started_ns, _TAG, name, data)
 
     def _changed(self, change: Change) -> None:
         self.note(Kind.STATE, change.tag, {"value": self._named(change.tag, change.after)})
@@ -229,15 +236,15 @@ class VirtualBench(Started):
 
 
 class _FrameTap:
-    """`gateway.core.connection.Tap` that writes a trace."""
+    """`gateway.core.connection.Tap` that writes a trace, and when something was sent."""
 
     def __init__(self, bench: VirtualBench, system: System) -> None:
-        self._note: Callable[[Kind, str, dict[str, Any]], None] = bench.note
+        self._bench = bench
         self._bus = {str(bus.endpoint): name for name, bus in system.buses.items()}
         self._known: dict[int, tuple[Endpoint, str]] = {}
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
-        self._note(Kind.FRAME, self._name(endpoint), {"dir": direction._value_, "bytes": data.hex()})
+        self._note(endpoint, direction, t_ns, {"dir": direction._value_, "bytes": data.hex()})
 
     def on_frame(self, endpoint: Endpoint, direction: Direction, t_ns: int, frame: CanFrame) -> None:
         data: dict[str, Any] = {"dir": direction._value_, "id": frame.can_id, "bytes": frame.data.hex()}
@@ -247,12 +254,13 @@ class _FrameTap:
             data["ext"] = True
         if frame.error:
             data["err"] = True
-        self._note(Kind.FRAME, self._name(endpoint), data)
+        self._note(endpoint, direction, t_ns, data)
 
-    def _name(self, endpoint: Endpoint) -> str:
-        """The bus of an endpoint: writing one out takes longer than all else here."""
-        known = self._known.get(id(endpoint))
+    def _note(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: dict[str, Any]) -> None:
+        known = self._known.get(id(endpoint))  # writing an endpoint out takes longer than all else here
         if known is None or known[0] is not endpoint:
-            known = endpoint, self._bus.get(str(endpoint), str(endpoint))
-            self._known[id(endpoint)] = known
-        return known[1]
+            known = self._known[id(endpoint)] = endpoint, self._bus.get(str(endpoint), str(endpoint))
+        bus, bench = known[1], self._bench
+        if direction is _SENT and bus in bench.asked_ns:
+            bench.asked_ns[bus].append(t_ns)
+        bench.trace.note(t_ns - bench.run.started_ns, _FRAME, bus, data)

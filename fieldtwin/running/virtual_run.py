@@ -35,9 +35,9 @@ SETTLE_S = 10.0
 LAST_REPLIES_S = 0.5
 CALM_S = 60.0
 """How long after the last fault all must be well again."""
-ASKED_KEPT = 64
 CAN_WIRE_NS = 10 * NS_PER_MS
 """What a frame may need on a CAN bus: several attempts, behind others."""
+_GOOD = Quality.GOOD  # an Enum's members are slow to look up
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,6 @@ class VirtualRun(DrivenRun):
         self.far: dict[str, Endpoint] = {}
         self.shore: Shore | None = None
         self._numbers: dict[str, int] = {}
-        self._asked: dict[str, deque[int]] = {}
-        """By bus: when requests were sent, ns since the start."""
         self._emulated: frozenset[str] = frozenset()
 
     @property
@@ -149,7 +147,7 @@ class VirtualRun(DrivenRun):
         self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
         self._emulated = frozenset(bench.run.field.devices)
         bench.run.gateway.tags.on_put = self._watched(bench)
-        bench.trace.listeners.append(self._on_event)
+        bench.trace.listen(self._on_state, Kind.STATE)
         self.states.knows(bench.run.twin.ecs.layout)
         for program, state in bench.states().items():
             self.states.note(program, state, bench.loop.now_ns)
@@ -182,34 +180,38 @@ class VirtualRun(DrivenRun):
 
     def _watched(self, bench: VirtualBench) -> Callable[[str, TagValue], None]:
         told, loop = bench.run.gateway.tags.on_put, bench.loop
-        start_ns = bench.run.started_ns
-        bus_of = {
-            name: device.bus
+        asked_by_device = {
+            name: bench.asked_ns[device.bus]
             for name, device in self.system.devices.items()
             if not self.system.buses[device.bus].endpoint.is_can
         }
+        asked_of: dict[str, deque[int] | None] = {}
+        """By tag: when its bus was asked; None for what a node sends unasked."""
 
         def put(name: str, value: TagValue) -> None:
             if told is not None:
                 told(name, value)
-            if value.quality is Quality.GOOD:
+            if value.quality is _GOOD:
                 # A value is of the moment in which its reply was complete; the device answered after it was asked. What a node
                 # sends unasked was on the wire for a while, longer where it had to be sent again.
-                bus = bus_of.get(name.partition(".")[0])
-                asked = () if bus is None else self._asked.get(bus, ())
-                unasked_ns = value.t_ns - (CAN_WIRE_NS if bus is None else 0)
-                asked_ns = next((start_ns + t for t in reversed(asked) if start_ns + t <= value.t_ns), unasked_ns)
-                self.oracle.published(name, value.raw, value.value, asked_ns, loop.now_ns)
+                try:
+                    asked = asked_of[name]
+                except KeyError:
+                    asked = asked_of[name] = asked_by_device.get(name.partition(".")[0])
+                since_ns = value.t_ns
+                if asked is None:
+                    since_ns -= CAN_WIRE_NS
+                else:
+                    for asked_ns in reversed(asked):
+                        if asked_ns <= since_ns:
+                            since_ns = asked_ns
+                            break
+                self.oracle.published(name, value.raw, value.value, since_ns, loop.now_ns)
 
         return put
 
-    def _on_event(self, event: Event) -> None:
-        if event.kind is Kind.FRAME:
-            if event.data["dir"] == "sent":
-                if event.where not in self._asked:
-                    self._asked[event.where] = deque(maxlen=ASKED_KEPT)
-                self._asked[event.where].append(event.t_ns)
-        elif event.kind is Kind.STATE and event.where.endswith(".state") and isinstance(event.data["value"], str):
+    def _on_state(self, event: Event) -> None:
+        if event.where.endswith(".state") and isinstance(event.data["value"], str):
             self.states.note(event.where.removesuffix(".state"), event.data["value"], event.t_ns)
 
     def _judge(self, side: FieldSide) -> None:

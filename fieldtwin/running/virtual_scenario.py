@@ -36,7 +36,7 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
     with tempfile.TemporaryDirectory(prefix="ft-scenario-") as folder:
         sink = open_sink(trace_file) if trace_file is not None else None
         trace = Trace(sink=sink)
-        trace.listeners.append(collector.feed)
+        trace.listen(collector.feed)
 
         async def main() -> ScenarioResult:
             if scenario.network is not None:
@@ -55,8 +55,7 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
             error = str(e)
         finally:
             loop.close()
-            if sink is not None:
-                sink.close()
+            trace.close()
     if result is None:
         result = result_of(scenario, "virtual", Verdict.ERROR, reason=error, trace=tuple(trace.events))
     return replace(

@@ -88,7 +88,7 @@ class Runner:
         self._watched: deque[Exchange] = deque()
         self._excused: list[bool] = []
         self._whole = WholeRun(scenario, bench, self._look)
-        bench.trace.listeners.append(self._on_event)
+        bench.trace.listen(self._on_event)
 
     async def run(self) -> ScenarioResult:
         """All steps. Never raises for what the system does; raises what a bench raises that is gone."""

@@ -18,7 +18,8 @@ import msgspec
 from gateway.core.errors import FileInvalid
 
 CAPACITY = 200_000
-_HASHED_AT_ONCE = 256
+_AT_ONCE = 256
+"""Events that are encoded and hashed together: one by one takes three times as long."""
 FAR_END = "far end"
 
 
@@ -51,46 +52,87 @@ class Event(NamedTuple):
     data: dict[str, Any]
 
 
+_Noted = tuple[int, Kind, str, dict[str, Any]]
+"""An event's fields."""
+
+
 class Trace:
-    """The latest `capacity` events, the hash of all, and who listens. `sink`: a file that takes every event as a JSON line."""
+    """The latest `capacity` events, the hash of all, and who listens. `sink`: a file that takes every event as a JSON line.
+
+    Hash and sink are given events a block at a time: `hexdigest` has all of them, the sink after `flush` or `close`.
+    """
 
     def __init__(self, capacity: int = CAPACITY, sink: BinaryIO | None = None) -> None:
-        self.events: deque[Event] = deque(maxlen=capacity)
-        self.count = 0
-        self.listeners: list[Callable[[Event], None]] = []
-        """Told of each event, in the order of their subscription. They may not raise."""
+        self._kept: deque[_Noted] = deque(maxlen=capacity)
+        self._told: dict[str, list[Callable[[Event], None]]] = {kind.value: [] for kind in Kind}
         self._hash = hashlib.sha256()
-        self._unhashed: list[bytes] = []
+        self._hashed = 0
+        self._pending: list[_Noted] = []
+        """Neither hashed nor in the sink yet."""
         self._sink = sink
-        self._encode = msgspec.json.Encoder(order="sorted").encode
+        self._encode_lines = msgspec.json.Encoder(order="sorted").encode_lines
+
+    @property
+    def events(self) -> list[Event]:
+        """The latest, oldest first."""
+        return [Event(*noted) for noted in self._kept]
+
+    @property
+    def count(self) -> int:
+        """How many events there were."""
+        return self._hashed + len(self._pending)
 
     @property
     def dropped(self) -> int:
         """Events that are no longer in memory; the hash and the sink have them."""
-        return self.count - len(self.events)
+        return self.count - len(self._kept)
+
+    def listen(self, listener: Callable[[Event], None], *kinds: Kind) -> None:
+        """From now on `listener` is told of each event, or of each of these kinds, behind those who asked before. It may not
+        raise."""
+        for kind in kinds or Kind:
+            self._told[kind.value].append(listener)
 
     def note(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
         """Something happened. `data` is JSON-able and not changed afterwards."""
+        noted = t_ns, kind, where, data  # an `Event` only where somebody looks: these are made by the million
+        self._kept.append(noted)
+        self._pending.append(noted)
+        if len(self._pending) >= _AT_ONCE:
+            self.flush()
+        if self._told[kind._value_]:  # `value` goes through a descriptor, a Kind's hash through Python: slow
+            self.tell(t_ns, kind, where, data)
+
+    def tell(self, t_ns: int, kind: Kind, where: str, data: dict[str, Any]) -> None:
+        """Those who listen hear of it, in the order in which they asked to."""
         event = Event(t_ns, kind, where, data)
-        line = self._encode((t_ns, kind._value_, where, data)) + b"\n"  # `value` goes through a descriptor: slow
-        self._unhashed.append(line)
-        if len(self._unhashed) == _HASHED_AT_ONCE:
-            self._hash_all()
-        if self._sink is not None:
-            self._sink.write(line)
-        self.events.append(event)
-        self.count += 1
-        for listener in self.listeners:
+        for listener in self._told[kind._value_]:
             listener(event)
 
     def hexdigest(self) -> str:
         """SHA-256 of every event so far."""
-        self._hash_all()
+        self.flush()
         return self._hash.hexdigest()
 
-    def _hash_all(self) -> None:
-        self._hash.update(b"".join(self._unhashed))
-        self._unhashed.clear()
+    def flush(self) -> None:
+        """Hash what is pending, and hand it to the sink."""
+        pending, self._pending = self._pending, []
+        lines = self._encode_lines(pending)
+        self._hashed += len(pending)
+        self._hash.update(lines)
+        if self._sink is not None:
+            self._sink.write(lines)
+
+    def close(self) -> None:
+        """Nothing more will happen that the sink has to take: it gets what is pending, and is closed. Closing twice does
+        nothing."""
+        if self._sink is None:
+            return
+        try:
+            self.flush()
+        finally:
+            self._sink.close()
+            self._sink = None
 
 
 def read_trace(lines: list[bytes]) -> list[Event]:

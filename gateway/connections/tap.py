@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO, cast
@@ -30,7 +30,7 @@ class TappedConnector(Connector):
 
     def __init__(self, inner: Connector, taps: Sequence[Tap], clock: Clock) -> None:
         self._inner = inner
-        self._observers = _Observers(list(taps), clock)
+        self._observers = _Observers(taps, clock)
 
     @property
     def failed_taps(self) -> int:
@@ -47,25 +47,34 @@ class TappedConnector(Connector):
 class _Observers:
     """The taps of a connector, and their clock."""
 
-    def __init__(self, taps: list[Tap], clock: Clock) -> None:
-        self._taps = taps
-        self._clock = clock
+    def __init__(self, taps: Sequence[Tap], clock: Clock) -> None:
+        self._taps = tuple(taps)
+        self._now_ns = clock.monotonic_ns
         self.failed = 0
 
-    def saw(self, endpoint: Endpoint, direction: Direction, item: bytes | CanFrame) -> None:
-        t_ns = self._clock.monotonic_ns()
-        for tap in tuple(self._taps):
+    def saw_bytes(self, endpoint: Endpoint, direction: Direction, chunk: bytes) -> None:
+        t_ns = self._now_ns()
+        for tap in self._taps:
             try:
-                if isinstance(item, CanFrame):
-                    tap.on_frame(endpoint, direction, t_ns, item)
-                else:
-                    tap.on_bytes(endpoint, direction, t_ns, item)
-            except Exception as e:  # an observer may not harm what it observes: off with it, and say so
-                self._taps.remove(tap)
-                self.failed += 1
-                asyncio.get_running_loop().call_exception_handler(
-                    {"message": f"a tap on {endpoint} failed and was taken off: {tap!r}", "exception": e}
-                )
+                tap.on_bytes(endpoint, direction, t_ns, chunk)
+            except Exception as e:  # an observer may not harm what it observes
+                self._take_off(tap, endpoint, e)
+
+    def saw_frame(self, endpoint: Endpoint, direction: Direction, frame: CanFrame) -> None:
+        t_ns = self._now_ns()
+        for tap in self._taps:
+            try:
+                tap.on_frame(endpoint, direction, t_ns, frame)
+            except Exception as e:
+                self._take_off(tap, endpoint, e)
+
+    def _take_off(self, tap: Tap, endpoint: Endpoint, error: Exception) -> None:
+        """Off with it, and say so. Whoever goes through the taps now still has those of before."""
+        self._taps = tuple(other for other in self._taps if other is not tap)
+        self.failed += 1
+        asyncio.get_running_loop().call_exception_handler(
+            {"message": f"a tap on {endpoint} failed and was taken off: {tap!r}", "exception": error}
+        )
 
 
 class _TappedBytes(ByteConnection):
@@ -76,7 +85,7 @@ class _TappedBytes(ByteConnection):
         self._inner = inner
         self._observers = observers
         for chunk in inner.inbound.data_stream:  # arrived while it was being opened
-            observers.saw(endpoint, Direction.RECEIVED, chunk)
+            observers.saw_bytes(endpoint, Direction.RECEIVED, chunk)
         inner.on_arrival = self._arrived
 
     @property
@@ -90,22 +99,24 @@ class _TappedBytes(ByteConnection):
         self._inner.feed_lost(error)
 
     def _arrived(self, chunk: bytes) -> None:
-        self._observers.saw(self.endpoint, Direction.RECEIVED, chunk)
+        self._observers.saw_bytes(self.endpoint, Direction.RECEIVED, chunk)
         if self.on_arrival is not None:  # another tapped connector around this one
             self.on_arrival(chunk)
 
-    async def read(self) -> bytes:
-        return await self._inner.read()
+    # What is awaited is the inner connection's own: one coroutine less to be woken through, each time.
 
-    async def read_within(self, timeout_s: float) -> bytes:
-        return await self._inner.read_within(timeout_s)
+    def read(self) -> Coroutine[Any, Any, bytes]:
+        return self._inner.read()
+
+    def read_within(self, timeout_s: float) -> Coroutine[Any, Any, bytes]:
+        return self._inner.read_within(timeout_s)
 
     def read_pending(self) -> bytes:
         return self._inner.read_pending()
 
     async def write(self, data: bytes) -> None:
         await self._inner.write(data)
-        self._observers.saw(self.endpoint, Direction.SENT, data)
+        self._observers.saw_bytes(self.endpoint, Direction.SENT, data)
 
     async def aclose(self) -> None:
         await self._inner.aclose()
@@ -121,7 +132,7 @@ class _TappedCan(CanConnection):
         """What the medium runs at (bit/s), 0 where it does not know."""
         super().__init__(cast(CANConnection, inner.inbound), endpoint, inner.max_pending)
         for frame in inner.inbound.data_stream:
-            observers.saw(endpoint, Direction.RECEIVED, frame)
+            observers.saw_frame(endpoint, Direction.RECEIVED, frame)
         inner.on_arrival = self._arrived
 
     @property
@@ -143,16 +154,16 @@ class _TappedCan(CanConnection):
         self._inner.feed_lost(error)
 
     def _arrived(self, frame: CanFrame) -> None:
-        self._observers.saw(self.endpoint, Direction.RECEIVED, frame)
+        self._observers.saw_frame(self.endpoint, Direction.RECEIVED, frame)
         if self.on_arrival is not None:
             self.on_arrival(frame)
 
-    async def recv(self) -> CanFrame:
-        return await self._inner.recv()
+    def recv(self) -> Coroutine[Any, Any, CanFrame]:
+        return self._inner.recv()
 
     async def send(self, frame: CanFrame) -> None:
         await self._inner.send(frame)
-        self._observers.saw(self.endpoint, Direction.SENT, frame)
+        self._observers.saw_frame(self.endpoint, Direction.SENT, frame)
 
     async def aclose(self) -> None:
         await self._inner.aclose()

@@ -181,10 +181,13 @@ class _Run(VirtualRun):
         self._judge(bench.run.field)
         self.elapsed_s = bench.now_s()
 
-    def _on_event(self, event: Event) -> None:
+    def attach(self, bench: VirtualBench) -> None:
+        super().attach(bench)
+        bench.trace.listen(self._on_tag, Kind.TAG)
+
+    def _on_tag(self, event: Event) -> None:
         """What lasts less than a scan counts as well."""
-        super()._on_event(event)
-        if event.kind is Kind.TAG and event.data["quality"] != "good":
+        if event.data["quality"] != "good":
             for row in self.rows:
                 at_s = event.t_ns / NS_PER_S - row.begins_s
                 if TAGS[row.wire] == event.where and 0 <= at_s < ROW_S:

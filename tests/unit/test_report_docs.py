@@ -20,6 +20,7 @@ def test_the_python_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         trace = Trace(sink=sink)
         for event in run_trace(3):
             trace.note(*event)
+        trace.flush()
     space: dict[str, Any] = {}
     for text in re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE):
         exec(compile(text, "docs/reports.md", "exec"), space)

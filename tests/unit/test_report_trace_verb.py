@@ -26,6 +26,7 @@ def trace(tmp_path: Path) -> Path:
         kept = Trace(sink=sink)
         for event in run_trace(20):
             kept.note(*event)
+        kept.flush()
     return path
 
 

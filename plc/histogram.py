@@ -31,7 +31,7 @@ class Histogram:
         if ns > self.max_ns:
             self.max_ns = ns
         self.count += 1
-        self._counts[_bucket(ns)] += 1
+        self._counts[ns if ns < _SUB else _bucket(ns)] += 1
 
     def percentile_ns(self, percent: float) -> int:
         """A duration that at least `percent` of all do not exceed (0 to 100); 0 when there are none."""

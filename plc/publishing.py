@@ -34,6 +34,7 @@ from plc.program import Outbox, ProgramFailed, Variable
 Seen = Callable[[], dict[str, Scalar | None]]
 """A program's inputs as it read them, by variable."""
 
+_GOOD, _NO_REASON = Quality.GOOD, Reason.NONE  # an Enum's members are slow to look up
 MAX_CHANGES = 16
 """Changes of a tag that are remembered, with what the program saw when it made them."""
 
@@ -96,11 +97,19 @@ class OutputImage:
         self.on_change: Callable[[Change], None] | None = None
         """Told of each change. It may not raise."""
         self._readers: dict[str, RegionReader] = {}
+        self._read: list[tuple[int, RegionReader, str]] = []
+        """Place, reader and name of each message tag that somebody reads."""
+        self._forced = False
+        """Whether the last publication had forced outputs."""
         self._bind(programs, image.reader(INPUTS).shape)
         layout = self.writer.shape.layout
         self._reals = [o.index for o in self.outputs if layout.tags[o.index].kind is TagKind.REAL]
         self._by_tag = {o.tag: o for o in self.outputs}
         self._plain = [o for o in self.outputs if o.outbox is None]
+        self._same = False
+        """Whether what is collected is what was published last, times aside."""
+        self._room_for: Sequence[Scalar | None] | None = None
+        """INPUTS by which the room in the outboxes was counted; None when messages were sent since."""
         self._by_owner: dict[str, list[Output]] = {}
         for output in self.outputs:
             self._by_owner.setdefault(output.owner, []).append(output)
@@ -143,6 +152,11 @@ class OutputImage:
         if self._readers.setdefault(tag, reader) is not reader:
             raise FileInvalid(f"messages of {tag} go to programs of two tasks", expected="programs of one task")
         reader.resume(tag, self._resumed[tag])
+        self._read = [
+            (at, self._readers[tag], tag)
+            for at, tag in enumerate(self.consumed, len(self.outputs))
+            if tag in self._readers
+        ]
 
     # -- the cycle ----------------------------------------------------------------------------------------------------
 
@@ -156,6 +170,9 @@ class OutputImage:
 
     def room(self, taken: Sequence[Scalar | None]) -> None:
         """Learn from INPUTS how far the messages got that were sent."""
+        if taken is self._room_for:  # a reader gives the same columns as long as nothing in them changes
+            return
+        self._room_for = taken
         for output, outbox in self.outboxes:
             got = taken[output.taken] if output.taken is not None else 0
             outbox.outstanding = self.writer.last_sequence(output.tag) - (got if isinstance(got, int) else 0)
@@ -192,6 +209,7 @@ class OutputImage:
                 if self.on_change is not None:
                     self.on_change(change)
             values[output.index] = value
+            self._same = False
 
     def publish(self, now_ns: int) -> None:
         """Publish what was collected. Raises `ProgramFailed` naming the program whose value no tag can hold."""
@@ -202,22 +220,29 @@ class OutputImage:
             if outbox.pending:
                 messages[output.tag] = outbox.pending
                 outbox.pending = []
-        for n, tag in enumerate(self.consumed, len(self.outputs)):
-            reader = self._readers.get(tag)
-            if reader is not None:
-                values[n] = reader.seen(tag)
+                self._room_for = None
+        for at, reader, tag in self._read:
+            seen = reader.seen(tag)
+            if values[at] != seen:
+                values[at] = seen
+                self._same = False
         but = None
-        if self.forces.outputs:
+        if self.forces.outputs or self._forced:
+            self._forced = bool(self.forces.outputs)
             but = {o.index: Quality.SIMULATED for o in self._plain if o.tag in self.forces.outputs}
+            self._same = False
+        same, self._same = self._same, False
         try:
-            self.writer.publish_columns(values, Quality.GOOD, Reason.NONE, now_ns, messages, but=but)
+            self.writer.publish_columns(values, _GOOD, _NO_REASON, now_ns, messages, but=but, same=same)
         except NotEncodable as e:
             values[self.writer.shape.index[e.tag]] = None  # so that stopping can publish what is left
             owner = next((output.owner for output in self.outputs if output.tag == e.tag), "?")
             raise ProgramFailed(owner, f"{e.message}; expected {e.expected}; got {e.got}", variable=e.tag) from e
+        self._same = True
 
     def stop(self, now_ns: int) -> None:
         """Publish that nothing may be acted upon any more: flagged stopped, every tag BAD, values as last."""
+        self._same = False
         self.writer.publish_columns(self._values, Quality.BAD, Reason.NOT_OPERATIONAL, now_ns, None, RegionFlag.STOPPED)
 
     def current(self, tag: str) -> Scalar | None:

@@ -180,9 +180,12 @@ class Relay(Program):
             logic.transmitter.observe(COMMAND(message.data))
         for message in self.sample:
             logic.sensor.observe(RESPONSE(message.data))
-        logic.send_cmd(scan.now_ns)
-        logic.send_rsp(scan.now_ns)
-        self._pass_on_responses(scan.now_ns)
+        if logic.transmitter.queue:
+            logic.send_cmd(scan.now_ns)
+        if logic.sensor.queue:
+            logic.send_rsp(scan.now_ns)
+        if self._outgoing.queue:
+            self._pass_on_responses(scan.now_ns)
         self._pass_on_log()
         self._show()
 

@@ -32,6 +32,7 @@ RESTARTABLE = (StopReason.WATCHDOG, StopReason.STUCK)
 STEADY_NS = 60 * NS_PER_S
 """Running this long makes earlier restarts forgotten."""
 _NEVER_NS = 2**62
+_STOPPED = TaskState.STOPPED  # an Enum's members are slow to look up
 _EVENT_MS = 1e9
 
 
@@ -66,6 +67,8 @@ class Runner:
         self.forces = Forces()
         self.restarts = 0
         self.entries: list[Entry] = []
+        self._triggered: list[Entry] = []
+        """Those of them that are SINGLE."""
         self.programs: list[BoundProgram] = []
         self.outputs: OutputImage
         self.retained: Retained
@@ -111,6 +114,7 @@ class Runner:
             scan = Scan(self._image, mine, config.heartbeat_limit_ms, self.outputs, outputs_first=config.outputs_first)
             timing = TaskConfig(_EVENT_MS if spec.single else spec.interval_ms, config.late_ms, config.stop_after)
             self.entries.append(Entry(spec, scan, CyclicTask(scan, timing, self._now_ns, self._guard)))
+        self._triggered = [entry for entry in self.entries if entry.single]
 
     def _check(self, specs: tuple[TaskSpec, ...]) -> None:
         names = [s.name for s in specs]
@@ -160,7 +164,7 @@ class Runner:
 
     def run_once(self) -> None:
         """What is due first: one scan, or a restart."""
-        if not self.running:
+        if self._ended is not None or not self._began:
             raise Bug("a scan of a PLC that does not run")
         now_ns = self._now_ns()
         if self._stopped is not None:
@@ -169,12 +173,13 @@ class Runner:
             return
         entry = self.entries[0] if len(self.entries) == 1 else self._next(now_ns)
         entry.task.run_once()
-        if entry.task.state is TaskState.STOPPED:
+        if entry.task.state is _STOPPED:
             self._on_stopped(entry)
             return
-        if entry.single:
-            entry.task.deadline_ns = _NEVER_NS
-        self._look_at_triggers(entry.scan)
+        if self._triggered:
+            if entry.single:
+                entry.task.deadline_ns = _NEVER_NS
+            self._look_at_triggers(entry.scan)
         if self._in_a_row and now_ns - self._started_ns > STEADY_NS:
             self._in_a_row = 0
         try:
@@ -192,12 +197,11 @@ class Runner:
         return min(due, key=lambda e: (e.spec.priority, e.task.deadline_ns))
 
     def _look_at_triggers(self, scan: Scan) -> None:
-        for entry in self.entries:
-            if entry.single:
-                now = bool(scan.value(entry.single))
-                if now and not entry.before:
-                    entry.task.deadline_ns = self._now_ns()
-                entry.before = now
+        for entry in self._triggered:
+            now = bool(scan.value(entry.single))
+            if now and not entry.before:
+                entry.task.deadline_ns = self._now_ns()
+            entry.before = now
 
     def _on_stopped(self, entry: Entry) -> None:
         for other in self.entries:

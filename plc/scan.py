@@ -173,7 +173,8 @@ class Scan:
         self._reader.release()
 
     def _alive(self, now_ns: int) -> bool:
-        return not self._snapshot.stopped and self._snapshot.age_ns(now_ns) <= self._limit_ns
+        snapshot = self._snapshot
+        return snapshot.counter > 0 and now_ns - snapshot.t_ns <= self._limit_ns and not snapshot.stopped
 
     def _read(self, now_ns: int) -> None:
         snapshot = self._snapshot = self._reader.snapshot()
@@ -198,8 +199,9 @@ class Scan:
                     item.namespace[item.name] = float(value) if item.widen else value
         if self._between:
             self._read_other_programs()
+        messages = snapshot.messages
         for item in self._messages:
-            item.namespace[item.name] = snapshot.messages.get(item.tag, ())
+            item.namespace[item.name] = messages.get(item.tag, ()) if messages else ()
         self.output_image.room(values)
 
     def _read_other_programs(self) -> None:

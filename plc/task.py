@@ -67,6 +67,9 @@ class TaskState(Enum):
     STOPPED = "stopped"
 
 
+_RUNNING = TaskState.RUNNING  # an Enum's members are slow to look up
+
+
 class StopReason(Enum):
     NONE = "none"
     REQUESTED = "requested"
@@ -123,7 +126,7 @@ class CyclicTask:
 
     @property
     def running(self) -> bool:
-        return self.state is TaskState.RUNNING
+        return self.state is _RUNNING
 
     def start(self) -> None:
         """READY to RUNNING: the first scan is due one cycle from now."""
@@ -134,7 +137,7 @@ class CyclicTask:
 
     def run_once(self) -> None:
         """The scan that is due. Afterwards `deadline_ns` is the next one to wait for, or the task is STOPPED."""
-        if not self.running:
+        if self.state is not _RUNNING:
             raise Bug("a scan of a task that does not run", got=self.state.value)
         began_ns = self._now_ns()
         late_ns = began_ns - self.deadline_ns
@@ -142,10 +145,14 @@ class CyclicTask:
             self._scan.hold(began_ns)
             self.deadline_ns += ((began_ns - self.deadline_ns) // self._cycle_ns + 1) * self._cycle_ns
             return
-        self.steps = max(0, self.steps - 1)
+        if self.steps:
+            self.steps -= 1
         self.lateness.record(late_ns)
         try:
-            self._execute(began_ns)
+            if self._guard is None:
+                self._scan.execute(began_ns)
+            else:
+                self._guarded(self._guard, began_ns)
         except FieldtwinError as e:
             self.error = e
             stuck, tripped = isinstance(e, ProgramStuck), isinstance(e, InputTripped)
@@ -154,23 +161,26 @@ class CyclicTask:
         self.scans += 1
         ended_ns = self._now_ns()
         self.duration.record(ended_ns - began_ns)
-        missed = max(0, (ended_ns - self.deadline_ns) // self._cycle_ns)
-        self.missed_periods += missed
-        self.deadline_ns += (missed + 1) * self._cycle_ns
-        self._watch(overrun=late_ns > self._late_ns or missed > 0)
+        due_ns = self.deadline_ns = self.deadline_ns + self._cycle_ns
+        missed = 0
+        if ended_ns >= due_ns:
+            missed = (ended_ns - due_ns) // self._cycle_ns + 1
+            self.missed_periods += missed
+            self.deadline_ns += missed * self._cycle_ns
+        if missed or late_ns > self._late_ns:
+            self._overrun()
+        else:
+            self._overruns_in_a_row = 0
 
-    def _execute(self, now_ns: int) -> None:
-        if self._guard is None:
-            self._scan.execute(now_ns)
-            return
+    def _guarded(self, guard: Guard, now_ns: int) -> None:
         try:
-            self._guard.arm()
+            guard.arm()
             try:
                 self._scan.execute(now_ns)
             finally:
-                self._guard.disarm()
+                guard.disarm()
         except ScanStuck as e:  # between two programs
-            self._guard.disarm()  # it may have come while the alarm was being taken back
+            guard.disarm()  # it may have come while the alarm was being taken back
             raise ProgramStuck("(all)", f"the scan did not end: {e}") from e
 
     def stop(self) -> None:
@@ -178,10 +188,7 @@ class CyclicTask:
         if self.state is not TaskState.STOPPED:
             self._stop(StopReason.REQUESTED)
 
-    def _watch(self, overrun: bool) -> None:
-        if not overrun:
-            self._overruns_in_a_row = 0
-            return
+    def _overrun(self) -> None:
         self.overruns += 1
         self._overruns_in_a_row += 1
         if self.config.stop_after and self._overruns_in_a_row >= self.config.stop_after:

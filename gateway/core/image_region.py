@@ -14,9 +14,12 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+
+from msgspec.structs import replace
 
 from gateway.core.errors import Bug, FileInvalid
-from gateway.core.image_layout import CHECK, RECORD_HEAD, RegionShape, RingShape, TagKind
+from gateway.core.image_layout import CHECK, RECORD_HEAD, SLOTS, RegionShape, RingShape, TagKind
 from gateway.core.image_snapshot import Message, RegionFlag, Snapshot
 from gateway.core.values import Quality, Reason, Scalar, TagValue
 
@@ -24,6 +27,9 @@ MAX_LOOKS = 16
 """How often a reader looks before it gives up for now. Trying four slots gave 0.0015 retries a read (DESIGN.md)."""
 
 _NO_VALUE = 0x80  # in the quality byte: the tag has a quality and no value
+_NO_MESSAGES: Mapping[str, tuple[Message, ...]] = MappingProxyType({})
+_UNFLAGGED = RegionFlag.NONE  # an Enum's members are slow to look up
+_QUALITY_OF = bytes(mark & ~_NO_VALUE for mark in range(256))
 
 
 class NotEncodable(Bug):
@@ -42,6 +48,7 @@ class _Region:
         self._memory = memory[: shape.size]
         self._words = self._memory[:8].cast("Q")
         self._rings = {ring.spec.name: ring for ring in shape.rings}
+        self._slots = tuple(shape.slot_offset(n) for n in range(SLOTS))
 
     def release(self) -> None:
         """Let go of the memory, so that a map can be closed. Afterwards the object is of no use."""
@@ -50,13 +57,12 @@ class _Region:
 
     def _slot(self, counter: int) -> bytes | None:
         """Publication `counter`, verified, without its check sum; None if it is not, or no longer, there."""
-        at = self.shape.slot_offset(counter)
-        copy = bytes(self._memory[at : at + CHECK.size + self.shape.body.size])
-        body = memoryview(copy)[CHECK.size :]
-        (check,) = CHECK.unpack_from(copy)
-        if zlib.crc32(body) != check or int.from_bytes(copy[8:16], "little") != counter:
+        at = self._slots[counter % SLOTS]
+        copy = self._memory[at : at + CHECK.size + self.shape.body.size].tobytes()
+        body = copy[CHECK.size :]
+        if zlib.crc32(body) != CHECK.unpack_from(copy)[0] or int.from_bytes(body[:8], "little") != counter:
             return None
-        return copy
+        return body
 
 
 class RegionWriter(_Region):
@@ -68,14 +74,15 @@ class RegionWriter(_Region):
         self._copy = bytearray(CHECK.size + shape.body.size)
         self._body = memoryview(self._copy)[CHECK.size :]
         self._packed: tuple[list[Scalar | None], bytes, bytes] | None = None
+        """The columns that stand in `_body`, packed."""
         self._last = {ring.spec.name: 0 for ring in shape.rings}
         self.counter = int(self._words[0])
         if self.counter:
-            copy = self._slot(self.counter)
-            if copy is None:
+            body = self._slot(self.counter)
+            if body is None:
                 self.release()
                 raise FileInvalid("a damaged process image", expected="a whole last publication", got=shape.layout.name)
-            fields = shape.body.unpack_from(copy, CHECK.size)
+            fields = shape.body.unpack(body)
             self._last = {r.spec.name: int(fields[4 + shape.count + r.index]) for r in shape.rings}
 
     def last_sequence(self, tag: str) -> int:
@@ -113,9 +120,17 @@ class RegionWriter(_Region):
         times_ns: list[int],
         now_ns: int,
         messages: Mapping[str, Sequence[tuple[int, bytes]]] | None = None,
+        *,
+        same: bool = False,
     ) -> int:
-        """`publish` for a writer that keeps columns, one entry a tag in the layout's order."""
+        """`publish` for a writer that keeps columns, one entry a tag in the layout's order.
+
+        `same`: the caller has not touched values, qualities and reasons since it published them last, times aside. As a rule
+        a cycle brings nothing, and then they are not looked at.
+        """
         stamps = self._stamps(times_ns)
+        if same and not messages and self._packed is not None:
+            return self._commit(stamps, now_ns, 0)
         return self._publish(list(values), bytes(qualities), bytes(reasons), stamps, now_ns, messages, RegionFlag.NONE)
 
     def publish_columns(
@@ -127,12 +142,17 @@ class RegionWriter(_Region):
         messages: Mapping[str, Sequence[tuple[int, bytes]]] | None = None,
         flags: RegionFlag = RegionFlag.NONE,
         but: Mapping[int, Quality] | None = None,
+        *,
+        same: bool = False,
     ) -> int:
         """`publish` for a writer whose values are all of one quality and instant (a scan): no object a tag is made.
 
         `but` has the quality of the few tags, by index, that differ. A None has no value and is BAD, NEVER_READ.
+        `same`: `values`, `quality`, `reason` and `but` are what the caller published last; then they are not looked at.
         """
         count = len(values)
+        if same and not messages and self._packed is not None:
+            return self._commit(now_ns.to_bytes(8, "little", signed=True) * count, now_ns, flags)
         marks, reasons = bytes([quality]) * count, bytes([reason]) * count
         if but:
             mixed = bytearray(marks)
@@ -178,18 +198,22 @@ class RegionWriter(_Region):
         for ring in shape.rings:
             values[ring.index] = last[ring.spec.name]
         columns = (values, marks, reasons)
-        if columns != self._packed:  # as a rule nothing changed: what was packed stands
+        if columns != self._packed:
             self._packed = None
             self._pack(values, marks, reasons)
             self._packed = columns
-        body, counter = self._body, self.counter + 1
-        body[shape.times_at : shape.columns_at] = stamps
-        shape.head.pack_into(body, 0, counter, now_ns, flags)
-        CHECK.pack_into(self._copy, 0, zlib.crc32(body))
         if messages:
             self._write_messages(messages)
             self._last = last
-        at = shape.slot_offset(counter)
+        return self._commit(stamps, now_ns, flags)
+
+    def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
+        """Publish the columns that are packed, with these times."""
+        shape, body, counter = self.shape, self._body, self.counter + 1
+        body[shape.times_at : shape.columns_at] = stamps
+        shape.head.pack_into(body, 0, counter, now_ns, flags)
+        CHECK.pack_into(self._copy, 0, zlib.crc32(body))
+        at = self._slots[counter % SLOTS]
         self._memory[at : at + len(self._copy)] = self._copy
         self._words[0] = counter
         self.counter = counter
@@ -198,8 +222,12 @@ class RegionWriter(_Region):
     def _pack(self, values: list[Scalar | None], marks: bytes, reasons: bytes) -> None:
         plain = values
         if None in values:
-            plain = [0 if v is None else v for v in values]
-            marks = bytes([m if v is not None else m | _NO_VALUE for m, v in zip(marks, values, strict=True)])
+            plain, marked, at = values.copy(), bytearray(marks), -1
+            for _ in range(values.count(None)):
+                at = values.index(None, at + 1)
+                plain[at] = 0
+                marked[at] |= _NO_VALUE
+            marks = bytes(marked)
         try:
             self.shape.columns.pack_into(self._body, self.shape.columns_at, *plain, marks, reasons)
         except (struct.error, TypeError, OverflowError) as e:
@@ -269,12 +297,19 @@ class RegionReader(_Region):
             bytes([Quality.BAD]) * count,
             bytes([Reason.NEVER_READ]) * count,
             bytes(shape.times.size),
+            _NO_MESSAGES,
         )
         self._columns = b""
+        """Packed, those of the latest snapshot."""
+        self._marks = b""
+        """The quality bytes that `_empty` and `_qualities` were made of: they change seldom."""
+        self._empty: list[int] = []
+        self._qualities = b""
 
     def resume(self, tag: str, seq: int) -> None:
         """Message `seq` of `tag` is already dealt with (a reader that was restarted): the next one is `seq` + 1."""
         self._seen[tag] = seq
+        self._columns = b""  # the same columns may mean other new messages now
 
     def seen(self, tag: str) -> int:
         """The sequence of the last message of `tag` that a snapshot carried or counted as missed."""
@@ -288,13 +323,13 @@ class RegionReader(_Region):
     def snapshot(self) -> Snapshot:
         """The latest publication, whole. Never waits: at most `MAX_LOOKS` looks, then the last snapshot again."""
         for _ in range(MAX_LOOKS):
-            counter = int(self._words[0])
+            counter = self._words[0]
             if counter == self._latest.counter:
                 return self._again()
-            copy = self._slot(counter)
-            if copy is not None:
-                self._latest = self._decode(copy)
-                return self._latest
+            body = self._slot(counter)
+            if body is not None:
+                self._latest = snapshot = self._decode(body)
+                return snapshot
             self.retries += 1
         self.gave_up += 1
         return self._again()
@@ -303,43 +338,39 @@ class RegionReader(_Region):
         """The last snapshot; its messages were handed out before."""
         s = self._latest
         if s.messages:
-            s = Snapshot(s.shape, s.counter, s.t_ns, s.flags, s.values, s.qualities, s.reasons, s.stamps)
-            self._latest = s
+            s = self._latest = replace(s, messages=_NO_MESSAGES)
         return s
 
-    def _decode(self, copy: bytes) -> Snapshot:
+    def _decode(self, body: bytes) -> Snapshot:
         shape, latest = self.shape, self._latest
-        counter, t_ns, flags = shape.head.unpack_from(copy, CHECK.size)
-        columns_at = CHECK.size + shape.columns_at
-        columns = copy[columns_at : columns_at + shape.columns.size]
-        if columns != self._columns:
-            values, marks, reasons = self._decode_columns(columns)
-            self._columns = columns
-        else:  # as a rule: a scan comes by more often than values change
-            values, marks, reasons = latest.values, latest.qualities, latest.reasons
-        messages: dict[str, tuple[Message, ...]] = {}
+        counter, t_ns, flags = shape.head.unpack_from(body)
+        named = RegionFlag(flags) if flags else _UNFLAGGED
+        columns, stamps = body[shape.columns_at :], body[shape.times_at : shape.columns_at]
+        if columns == self._columns:  # as a rule: a scan comes by more often than values, sequences among them, change
+            return Snapshot(
+                shape, counter, t_ns, named, latest.values, latest.qualities, latest.reasons, stamps, _NO_MESSAGES
+            )
+        values, marks, reasons = self._decode_columns(columns)
+        messages: Mapping[str, tuple[Message, ...]] = _NO_MESSAGES
         for ring in shape.rings:
             last = values[ring.index]
             if isinstance(last, int) and last > self._seen[ring.spec.name]:
-                messages[ring.spec.name] = self._drain(ring, last)
-        stamps = copy[CHECK.size + shape.times_at : columns_at]
-        named = RegionFlag(flags) if flags else RegionFlag.NONE
+                messages = {**messages, ring.spec.name: self._drain(ring, last)}
+        self._columns = columns
         return Snapshot(shape, counter, t_ns, named, values, marks, reasons, stamps, messages)
 
     def _decode_columns(self, columns: bytes) -> tuple[tuple[Scalar | None, ...], bytes, bytes]:
         """Values, qualities and reasons."""
-        fields = self.shape.columns.unpack(columns)
-        values: tuple[Scalar | None, ...] = fields[:-2]
-        marks: bytes = fields[-2]
-        if self.shape.bool_indexes:
-            listed = list(values)
-            for i in self.shape.bool_indexes:
-                listed[i] = bool(listed[i])
-            values = tuple(listed)
-        if marks and max(marks) >= _NO_VALUE:
-            values = tuple(None if mark & _NO_VALUE else v for v, mark in zip(values, marks, strict=True))
-            marks = bytes(mark & ~_NO_VALUE for mark in marks)
-        return values, marks, fields[-1]
+        values = list(self.shape.columns.unpack(columns))
+        reasons, marks = values.pop(), values.pop()
+        for i in self.shape.bool_indexes:
+            values[i] = bool(values[i])
+        if marks != self._marks:
+            self._marks, self._qualities = marks, marks.translate(_QUALITY_OF)
+            self._empty = [i for i, mark in enumerate(marks) if mark & _NO_VALUE]
+        for i in self._empty:
+            values[i] = None
+        return tuple(values), self._qualities, reasons
 
     def _drain(self, ring: RingShape, last: int) -> tuple[Message, ...]:
         """Messages from the first unseen one to `last`; the ones that are overwritten are counted."""

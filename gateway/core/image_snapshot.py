@@ -6,10 +6,9 @@ It must never know where the memory is, nor who wrote it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import IntFlag
-from types import MappingProxyType
-from typing import NamedTuple
+
+import msgspec
 
 from gateway.core.image_layout import RegionShape
 from gateway.core.values import Quality, Reason, Scalar, TagValue
@@ -26,8 +25,10 @@ class RegionFlag(IntFlag):
     """The writer stopped on purpose or by its watchdog: nothing in the region may be acted upon."""
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+_UNFLAGGED = RegionFlag.NONE  # an Enum's members are slow to look up
+
+
+class Message(msgspec.Struct, frozen=True, gc=False):
     """One message of a MESSAGE tag. `seq` counts from 1 without gaps; `t_ns` is the source's monotonic time."""
 
     seq: int
@@ -35,7 +36,7 @@ class Message:
     data: bytes
 
 
-class Snapshot(NamedTuple):
+class Snapshot(msgspec.Struct, frozen=True, gc=False):
     """One publication of a region, whole. `counter` counts publications from 1; 0 means that there never was one.
 
     `values`, `qualities`, `reasons` and `stamps` are columns in the order of the region's tags; `value` joins them
@@ -52,7 +53,7 @@ class Snapshot(NamedTuple):
     qualities: bytes
     reasons: bytes
     stamps: bytes
-    messages: Mapping[str, tuple[Message, ...]] = MappingProxyType({})
+    messages: Mapping[str, tuple[Message, ...]]
 
     def value(self, tag: str | int) -> TagValue:
         """The value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
@@ -69,7 +70,7 @@ class Snapshot(NamedTuple):
 
     @property
     def stopped(self) -> bool:
-        return self.flags is not RegionFlag.NONE and bool(self.flags & RegionFlag.STOPPED)
+        return self.flags is not _UNFLAGGED and bool(self.flags & RegionFlag.STOPPED)
 
     def age_ns(self, now_ns: int) -> float:
         """How long ago the writer published this: its heartbeat. Infinite when it never did."""

@@ -5,13 +5,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 from gateway.core.clock import NS_PER_MS
 from gateway.core.events import Consumer
-from gateway.core.image import INPUTS, OUTPUTS, Image, Message, TagKind, TagSpec, consumed_name, taken_name
+from gateway.core.image import INPUTS, OUTPUTS, Image, Message, Snapshot, TagKind, TagSpec, consumed_name, taken_name
 from gateway.core.values import DATA, NEVER, Quality, Reason, Scalar, TagValue
 from gateway.runtime.tags import FOREVER_NS, TagTable
+
+_BAD = Quality.BAD  # an Enum's members are slow to look up
 
 
 class ImageExchange:
@@ -37,7 +39,7 @@ class ImageExchange:
         """By output message tag: how many messages that were read have not been dealt with yet."""
         self.outputs: dict[str, TagValue] = {}
         """Made anew when a value or quality changed: times are those of that change."""
-        self._seen: tuple[object, ...] = ()
+        self._seen: Snapshot | None = None
         self._taken = [
             (at, tag) for at, t in enumerate(inputs.tags) for tag in self._message_outputs if t.name == taken_name(tag)
         ]
@@ -64,14 +66,25 @@ class ImageExchange:
             self._plc_heard_ns = snapshot.t_ns
         self.plc_stopped = snapshot.stopped
         self.new_messages = snapshot.messages
-        seen = snapshot.values, snapshot.qualities, snapshot.reasons
-        if snapshot.counter and seen != self._seen:
-            self._seen = seen
+        if snapshot.counter and not self._seen_before(snapshot):
             self.outputs = {name: snapshot.value(name) for name in self._output_names}
             for tag in self._depth:
                 value = self.outputs[consumed_name(tag)].value
                 self._consumed[tag] = int(value) if value is not None else 0
         self._publish(now_ns)
+
+    def _seen_before(self, snapshot: Snapshot) -> bool:
+        """Whether values and qualities are those of the last call. Snapshots share them as long as they are."""
+        before, self._seen = self._seen, snapshot
+        if before is None:
+            return False
+        if snapshot.values is before.values and snapshot.qualities is before.qualities:
+            return snapshot.reasons == before.reasons
+        return (
+            snapshot.values == before.values
+            and snapshot.qualities == before.qualities
+            and snapshot.reasons == before.reasons
+        )
 
     def plc_age_ms(self, now_ns: int) -> float:
         """Milliseconds since the PLC last published; infinite when it never did."""
@@ -98,12 +111,19 @@ class ImageExchange:
         for at, tag in self._taken:
             columns.put(at, self._reader.seen(tag) - self.untaken.get(tag, 0), now_ns)
         self._writer.publish_mixed(
-            columns.values, columns.qualities, columns.reasons, columns.times_ns, now_ns, messages
+            columns.values,
+            columns.qualities,
+            columns.reasons,
+            columns.times_ns,
+            now_ns,
+            messages,
+            same=not columns.changed,
         )
+        columns.changed = False
 
 
 class _Columns:
-    """INPUTS as the tag table has them: only what changed, or may have grown stale, is looked up again."""
+    """INPUTS as the tag table has them: only what is new, or may have grown stale, is looked up again."""
 
     def __init__(self, specs: Sequence[TagSpec], tags: TagTable, others: Container[int]) -> None:
         """`others`: the places of what the exchange itself puts."""
@@ -113,30 +133,38 @@ class _Columns:
         self.qualities = bytearray([Quality.GOOD if s.kind is TagKind.MESSAGE else Quality.BAD for s in specs])
         self.reasons = bytearray([Reason.NONE if s.kind is TagKind.MESSAGE else NEVER.reason for s in specs])
         self.times_ns = [0] * len(specs)
-        self._until_ns = [FOREVER_NS] * len(specs)
+        self.changed = True
+        """Whether values, qualities or reasons may be others than when they were published last; for the publisher to reset."""
         self._earliest_ns = -1
+        """No tag grows stale before; it may be earlier than the first that does."""
 
     def refresh(self, now_ns: int) -> None:
         """What is new in the table, and what grew stale by `now_ns`."""
-        names: Iterable[str] = self._tags.take_news()
+        news = self._tags.take_news()
         if now_ns > self._earliest_ns:
-            names = self._index
-        elif not names:
+            self._earliest_ns = FOREVER_NS
+            for name, at in self._index.items():
+                self._set(at, self._tags.current(name, now_ns), self._tags.fresh_until_ns(name))
             return
-        for name in names:
-            at = self._index.get(name)
-            if at is None:
-                continue
-            value = self._tags.current(name, now_ns)
-            self.values[at] = value.value
-            self.qualities[at] = value.quality
-            self.reasons[at] = value.reason
-            self.times_ns[at] = value.t_ns
-            until_ns = self._tags.fresh_until_ns(name)
-            self._until_ns[at] = FOREVER_NS if value.quality is Quality.BAD else until_ns
-        self._earliest_ns = min(self._until_ns, default=FOREVER_NS)
+        for held in news:
+            place = self._index.get(held.name)
+            if place is not None:
+                until_ns = held.fresh_until_ns
+                self._set(place, held.value if now_ns <= until_ns else self._tags.current(held.name, now_ns), until_ns)
+
+    def _set(self, at: int, value: TagValue, until_ns: int) -> None:
+        self.times_ns[at] = value.t_ns
+        self.values[at] = value.value
+        self.qualities[at] = value.quality
+        self.reasons[at] = value.reason
+        self.changed = True
+        if until_ns < self._earliest_ns and value.quality is not _BAD:
+            self._earliest_ns = until_ns
 
     def put(self, at: int, value: int, now_ns: int) -> None:
-        """A number of the exchange's own."""
-        self.values[at], self.times_ns[at] = value, now_ns
-        self.qualities[at], self.reasons[at] = Quality.GOOD, Reason.NONE
+        """A number of the exchange's own. Good from the first time on."""
+        self.times_ns[at] = now_ns
+        if self.values[at] != value:
+            self.values[at] = value
+            self.qualities[at], self.reasons[at] = Quality.GOOD, Reason.NONE
+            self.changed = True

@@ -200,8 +200,18 @@ def write_drafts(drafts: Drafts, recording: Path, origin: str) -> list[Path]:
 def _header(path: Path, out: Path, endpoint: str) -> RecordingHeader:
     return RecordingHeader(
         version=1, device=f"imported/{out.stem}", kind="exchanges", source="imported", endpoint=endpoint,
-        made_by=f"fieldtwin import {path.name}",
+        made_by=f"fieldtwin import {path.name}", prototype=_of_prototype(path),
     )  # fmt: skip
+
+
+def _of_prototype(capture: Path) -> bool:
+    """Whether the run that a capture is of said so (SPEC ruling 15)."""
+    try:
+        with capture.open("rb") as file:
+            head = json.loads(file.readline(MAX_LINE))
+    except (OSError, ValueError):
+        return False
+    return isinstance(head, dict) and "started" in head and head.get("prototype") is True
 
 
 def _lines(source: IO[bytes], path: Path) -> Iterator[str]:

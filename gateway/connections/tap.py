@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections import deque
-from collections.abc import Coroutine, Sequence
+from collections.abc import Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO, cast
@@ -216,8 +216,11 @@ class TapFile(Tap):
     that ends early never ends the run.
     """
 
-    def __init__(self, path: Path, max_bytes: int = 1 << 30) -> None:
-        """Start the file anew; raises `FileInvalid` when that is not possible."""
+    def __init__(self, path: Path, max_bytes: int = 1 << 30, *, head: Mapping[str, object] | None = None) -> None:
+        """Start the file anew. `head`, if there is one, is its first line, of which run it is; it has a key ``started``.
+
+        Raises `FileInvalid` when that is not possible.
+        """
         self.path = path
         self.dropped = 0
         self.error: OSError | None = None
@@ -226,6 +229,8 @@ class TapFile(Tap):
             self._file: TextIO | None = path.open("w", encoding="ascii", buffering=1, newline="\n")
         except OSError as e:
             raise FileInvalid(f"cannot write the capture: {e.strerror or e}", path=str(path)) from e
+        if head is not None:
+            self._write(dict(head))
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None:
         self._write({"t_ns": t_ns, "endpoint": str(endpoint), "direction": direction.value, "hex": data.hex()})

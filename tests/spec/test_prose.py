@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
 import socket
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -18,7 +20,10 @@ from spec_rig import CHECKOUT, CLOCK, SYSTEMS, observatory
 
 from emulators.models.sampled_sensor import SampledSensor
 from emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.recording.importing import import_capture
 from gateway.core.clock import NS_PER_S
+from gateway.core.recording import RecordingReader, shown
+from twin.system import load_system
 
 pytestmark = pytest.mark.slow
 
@@ -52,7 +57,7 @@ class Ended:
             [sys.executable, "-m", "fieldtwin", "run", *args, "--instance", "i", "--json"],
             cwd=folder, env=env, capture_output=True, text=True, timeout=50, check=False,
         )  # fmt: skip
-        self.run_dir = folder / "r" / "i"
+        self.folder, self.run_dir = folder, folder / "r" / "i"
         self.code, self.err = done.returncode, done.stderr
         self.summary: dict[str, Any] = json.loads(done.stdout) if done.stdout else {}
         lines = (folder / "opened").read_text(encoding="utf-8").splitlines()
@@ -86,9 +91,10 @@ def deserted(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def standby(tmp_path_factory: pytest.TempPathFactory) -> Ended:
-    """A prototype that nobody commands."""
+    """A prototype that nobody commands; its wires are captured, and it has a thread that nobody asks for."""
     folder = tmp_path_factory.mktemp("standby") / "run"
-    return Ended(folder, "observatory", "--prototype", "--commands", "none", "--for", "3s")
+    more = ("--capture", "wires.jsonl", "--thread", "tcp://127.0.0.1:0")
+    return Ended(folder, "observatory", "--prototype", "--commands", "none", "--for", "3s", *more)
 
 
 def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(deserted: Path, tmp_path: Path) -> None:
@@ -135,6 +141,28 @@ def test_prose_2_the_emulated_connection_belongs_to_neither_device_nor_driver() 
             for stranger in strangers:
                 assert f"from {stranger}" not in text, path
                 assert f"import {stranger}" not in text, path
+
+
+def test_DigitalTwinPrototype_values_are_simply_good_and_what_its_run_leaves_says_that_it_was_one(
+    standby: Ended, tmp_path: Path
+) -> None:
+    """Ruling 15: summary, store, knowledge, capture, and what is recorded from that."""
+    assert standby.code == 0, standby.summary["errors"]
+    qualities = {name: tag["quality"] for name, tag in standby.summary["tags"].items()}
+    assert qualities["inclinometer.slope_long"] == qualities["ctd.sample_period_s"] == "good"
+    assert "simulated" not in qualities.values()
+    assert standby.summary["prototype"] is True
+    with contextlib.closing(sqlite3.connect(standby.run_dir / "store.sqlite")) as store:
+        assert store.execute("SELECT prototype FROM run").fetchall() == [(1,)]
+    with contextlib.closing(sqlite3.connect(standby.run_dir / "knowledge.sqlite")) as knowledge:
+        assert knowledge.execute("SELECT prototype FROM origin").fetchall() == [(1,)]
+    wires = standby.folder / "wires.jsonl"
+    head = json.loads(wires.read_text(encoding="ascii").partition("\n")[0])
+    assert (head["system"], head["prototype"]) == ("observatory", True)
+    import_capture(wires, tmp_path / "ctd.jsonl", url=str(load_system("observatory").buses["line1"].endpoint))
+    with RecordingReader(tmp_path / "ctd.jsonl") as recording:
+        assert recording.header.prototype
+    assert "of an emulator" in shown(tmp_path / "ctd.jsonl"), "and a replay of it says so as well"
 
 
 def test_prose_3_STANDBY_at_start_period_0_and_no_samples_taken(standby: Ended) -> None:

@@ -25,7 +25,7 @@ VALUES = "010400000"  # unit 1, function 04 from the first input register on
 def ctd_polls(capture: Path) -> list[float]:
     """When the gateway asked for the sensor's values, in seconds, by its own clock."""
     lines = [json.loads(line) for line in capture.read_text(encoding="ascii").splitlines() if line.endswith("}")]
-    return [x["t_ns"] / 1e9 for x in lines if x["direction"] == "sent" and x["hex"].startswith(VALUES)]
+    return [x["t_ns"] / 1e9 for x in lines if x.get("direction") == "sent" and x["hex"].startswith(VALUES)]
 
 
 def edit(path: Path, old: str, new: str) -> None:

@@ -1,0 +1,165 @@
+"""Two who want to follow one thread over TCP: the first has it as long as it answers, and the second is told."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import Callable, Coroutine
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from thread_rig import SCHEMA, Twin, equal, value
+
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.loop import VirtualLoop
+from emulators.virtual.ports import MemoryNet
+from emulators.virtual.seal import sealed
+from gateway.core.connection import ByteConnection
+from gateway.core.endpoint import Endpoint
+from gateway.core.errors import Unreachable
+from twin.thread_link import Unwelcome
+from twin.thread_tcp import ANSWERS_WITHIN_S, LET_IN_WITHIN_S, TcpDialler, TcpListening
+
+PORTS = itertools.count(7000)
+
+
+class Place:
+    """A plant that is followed at `at`, in virtual time."""
+
+    def __init__(self, folder: Path, clock: VirtualClock, net: MemoryNet) -> None:
+        self.at = Endpoint.parse(f"tcp://127.0.0.1:{next(PORTS)}")
+        self.listening: TcpListening
+        self.net = net
+        self._folder, self._clock = folder, clock
+
+    async def start(self) -> None:
+        self.listening = await TcpListening.start(self.at, self.net.listen_for_clients, [SCHEMA])
+        self.plant = Twin("plant", self._folder, self._clock, lambda: self.listening)
+        await self.plant.start()
+        await self.plant.log(*(value(n) for n in range(20)))
+
+    def follower(self, name: str) -> Twin:
+        return Twin(name, self._folder, self._clock, lambda: TcpDialler(self.at, self.net, [SCHEMA]))
+
+    async def all_there(self, follower: Twin) -> None:
+        async with asyncio.timeout(60):
+            while not await equal(self.plant, follower):
+                await asyncio.sleep(0.1)
+
+
+def played(tmp_path: Path, main: Callable[[Place], Coroutine[Any, Any, None]]) -> None:
+    async def whole() -> None:
+        place = Place(tmp_path, VirtualClock(loop), MemoryNet(loop))
+        await place.start()
+        await main(place)
+        await place.plant.kill()
+
+    loop = VirtualLoop()
+    try:
+        with sealed():
+            loop.run_until_complete(whole())
+    finally:
+        loop.close()
+
+
+def test_the_second_is_refused_while_the_first_answers_and_let_in_when_it_went(tmp_path: Path) -> None:
+    async def main(place: Place) -> None:
+        first, second = place.follower("first"), place.follower("second")
+        await first.start()
+        await place.all_there(first)
+        await second.start()
+        await asyncio.sleep(30)
+        assert second.end.links == 0
+        assert "somebody else follows this thread already: " in second.end.trouble
+        assert place.listening.refused >= 2, "it comes again: perhaps the first one went"
+        assert (first.end.links, first.end.trouble) == (1, ""), "nobody took its place"
+        await place.plant.log(value(20))
+        await place.all_there(first)
+        await first.kill()
+        await place.all_there(second)
+        assert second.end.trouble == ""
+        await second.kill()
+
+    played(tmp_path, main)
+
+
+def test_one_whose_link_was_lost_has_its_place_at_once(tmp_path: Path) -> None:
+    """Its old connection is still there, half open: nobody answers on it, and nobody is asked."""
+
+    async def main(place: Place) -> None:
+        dialler = TcpDialler(place.at, place.net, [SCHEMA])
+        old = await dialler.open()
+        await asyncio.sleep(1)
+        began = asyncio.get_running_loop().time()
+        new = await dialler.open()
+        assert asyncio.get_running_loop().time() - began < 0.1
+        assert place.listening.refused == 0
+        for link in (old, new):
+            await link.aclose()
+
+    played(tmp_path, main)
+
+
+def test_one_that_does_not_answer_any_more_gives_its_place_up(tmp_path: Path) -> None:
+    async def main(place: Place) -> None:
+        dead = await TcpDialler(place.at, place.net, [SCHEMA]).open()  # nobody reads what comes for it
+        await asyncio.sleep(1)
+        began = asyncio.get_running_loop().time()
+        second = place.follower("second")
+        await second.start()
+        await place.all_there(second)
+        assert ANSWERS_WITHIN_S <= asyncio.get_running_loop().time() - began < ANSWERS_WITHIN_S + 3
+        assert place.listening.refused == 0
+        await dead.aclose()
+        await second.kill()
+
+    played(tmp_path, main)
+
+
+def test_a_stranger_that_says_nothing_takes_nobodys_place(tmp_path: Path) -> None:
+    async def main(place: Place) -> None:
+        first = place.follower("first")
+        await first.start()
+        await place.all_there(first)
+        stranger: ByteConnection = await place.net.open_bytes(place.at)
+        await asyncio.sleep(10)
+        assert first.end.links == 1
+        assert stranger.lost is not None
+        await stranger.aclose()
+        await first.kill()
+
+    played(tmp_path, main)
+
+
+def test_a_follower_that_need_not_wait_ends_with_the_reason(tmp_path: Path) -> None:
+    async def main(place: Place) -> None:
+        first = place.follower("first")
+        await first.start()
+        await place.all_there(first)
+        with pytest.raises(Unwelcome, match=r"follows this thread already: .*one at a time; over a broker"):
+            await TcpDialler(place.at, place.net, [SCHEMA]).open()
+        await first.kill()
+
+    played(tmp_path, main)
+
+
+def test_a_listener_that_says_nothing_is_taken_for_one_all_the_same(tmp_path: Path) -> None:
+    """Words may be lost on a bad link, as frames may."""
+
+    async def main(place: Place) -> None:
+        async def silent(client: Any) -> None:
+            with suppress(Unreachable):
+                while True:
+                    await client.read()
+
+        at = Endpoint.parse(f"tcp://127.0.0.1:{next(PORTS)}")
+        listener = await place.net.listen_for_clients(at, silent, 1, lambda address: True, 0.0)
+        began = asyncio.get_running_loop().time()
+        link = await TcpDialler(at, place.net, [SCHEMA]).open()
+        assert asyncio.get_running_loop().time() - began == pytest.approx(LET_IN_WITHIN_S)
+        await link.aclose()
+        await listener.aclose()
+
+    played(tmp_path, main)

@@ -25,6 +25,7 @@ class FaultyCan(CanConnection):
         assert isinstance(inner.inbound, CANConnection)
         super().__init__(inner.inbound, inner.endpoint, inner.max_pending)
         self.inner = inner
+        self._inner_at_once = inner.send_at_once if isinstance(inner, AttachedConnection) else None
         self.node = node
         self._faults = faults
         self._loop = asyncio.get_running_loop()
@@ -43,6 +44,10 @@ class FaultyCan(CanConnection):
 
     async def recv(self) -> CanFrame:
         return await self.inner.recv()
+
+    def send_at_once(self, frame: CanFrame) -> bool:
+        """As `inner` can, while no fault is in: what one makes of a frame may take time."""
+        return self._inner_at_once is not None and not self._faults.active and self._inner_at_once(frame)
 
     async def send(self, frame: CanFrame) -> None:
         pieces = self._struck(Way.REPLY, frame)

@@ -6,7 +6,17 @@ from collections.abc import Callable
 
 from fieldtwin.conformance import canopen_plays as plays
 from fieldtwin.conformance import judges
-from fieldtwin.conformance.canopen_judges import aborts_with, completes, legal_nmt, legal_sync, notices, reconfigures
+from fieldtwin.conformance.canopen_judges import (
+    aborts_with,
+    completes,
+    is_unmoved,
+    legal_nmt,
+    legal_sync,
+    notices,
+    one_a_block,
+    reconfigures,
+    waits_for_each,
+)
 from fieldtwin.conformance.canopen_scene import CanopenCase, CanPlay
 from fieldtwin.conformance.case import Case, Danger, Judge
 
@@ -23,6 +33,8 @@ def _watch(id: str, title: str, clause: str, judge: Judge, must: str) -> Canopen
     return _case(id, title, clause, LOOK, plays.nothing, judge, "watches all of the run", must).on(wants="nothing")
 
 
+RESTART_S = 2.0
+"""How long a master may take to see that a node booted, and to start it."""
 SILENT = _case("CO-000", "no reply", "", READ, plays.nothing, judges.rejects, "is silent", "")
 """No case of the catalogue: how the master's timeout is guessed."""
 BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block upload")  # noqa: E731
@@ -31,10 +43,14 @@ DOWN: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block d
 CASES: tuple[CanopenCase, ...] = (
     _case("CO-001", "toggle bit repeated in a segment", "7.2.4", READ, plays.same_toggle, aborts_with(0x05030000),
           "repeats the toggle bit in the second segment", "abort with 05030000").on(strikes=1),
+    _case("CO-002", "abort amid segments", "7.2.4", READ, plays.aborts_amid, judges.rejects,
+          "gives one segment of a value and then an abort", "take no half of a value; go on").on(strikes=1),
     _case("CO-004", "unknown command specifier", "7.2.4", READ, plays.unknown_command, aborts_with(0x05040001, 0x05040000),
           "answers with E0h", "abort with 05040001, or with 05040000 once it has waited").on(strikes=1),
     _case("CO-005", "a reply for another object", "canopen-stack #132", READ, plays.other_object, judges.rejects,
           "answers for another index", "never take it for the one that was asked for"),
+    _case("CO-006", "write refused", "7.2.4", Danger.WRITE, plays.refuses_write, judges.survives,
+          "aborts a download at once with 06010002", "give it up; go on").on(wants="download"),
     _case("CO-008", "missing index", "7.2.4", READ, plays.no_object, judges.survives, "aborts with 06020000", "go on"),
     _case("CO-013", "segmented total differs from the indicated size", "7.2.4", READ, plays.other_length, judges.rejects,
           "indicates 14 bytes and ends after a few", "refuse the value").on(strikes=1),
@@ -44,46 +60,75 @@ CASES: tuple[CanopenCase, ...] = (
           "leaves out a segment", "acknowledge the last good one").on(holds_good=True)),
     BLOCK(_case("CO-017", "segment lost in the last sub-block", "py #618", READ, plays.loses(-2), judges.accepts,
           "leaves out the last segment but one", "recover").on(holds_good=True)),
+    BLOCK(_case("CO-020", "one acknowledgement a sub-block", "7.2.4", READ, plays.honest, one_a_block,
+          "gives all segments", "acknowledge sub-blocks, no segment").on(strikes=1)),
     BLOCK(_case("CO-021", "switch from block to normal upload", "7.2.4", READ, plays.expedited_instead, judges.accepts,
           "answers a block upload by an expedited one", "take it").on(holds_good=True)),
     DOWN(_case("CO-014a", "block size 0", "CN PR #42", READ, plays.block_size(0), aborts_with(0x05040002),
           "allows no segment of a block download", "abort with 05040002").on(strikes=1)),
     DOWN(_case("CO-014b", "block size 128", "CN PR #42", READ, plays.block_size(128), aborts_with(0x05040002),
           "allows 128 segments of a block download at once", "abort with 05040002").on(strikes=1)),
+    DOWN(_case("CO-018", "early acknowledge of a sub-block", "CN #426", READ, plays.honest, completes,
+          "acknowledges a sub-block behind its second segment", "send the rest, renumbered from 1").on(strikes=1, early=2)),
     DOWN(_case("CO-015b", "block CRC refused", "7.2.4", READ, plays.refuses_crc, judges.survives,
           "says that the check sum of a block download was wrong", "go on").on(strikes=1)),
     DOWN(_case("CO-016b", "segment of a block download lost", "CN #205", READ, plays.honest, completes,
           "does not hear the second segment", "send again from there, renumbered from 1").on(strikes=1, misses=2)),
+    _case("CO-022", "slow segments", "7.2.4", READ, plays.slow_segments, judges.accepts,
+          "takes 0.35 timeouts for each of five steps", "count the timeout from each step, and take the value").on(
+          holds_good=True),
     _case("CO-023", "response after the client's timeout", "catalogue", READ, plays.late, judges.late_same_shape,
           "answers after 1.5 timeouts", "discard it, never pair it with the next request").on(strikes=1),
+    _case("CO-024", "a stale timeout", "canopen-stack #146", READ, plays.unhurried, waits_for_each,
+          "takes 0.6 timeouts for each reply", "never end a transfer by the timeout of the one before").on(strikes=4),
     _case("CO-025", "a responder floods garbage", "py #409", CUT, plays.flood, judges.survives,
           "sends 30 replies that nobody understands, then the right one", "go on, in bounds"),
     _case("CO-026", "SDO shorter than 8 bytes", "CN #584", READ, plays.short, judges.either,
           "leaves out the unused bytes", "ignore it, or take it by option").on(holds_good=True, strikes=2),
     _case("CO-027", "NMT reset during a transfer", "7.3.2.2.1", READ, plays.restarts, judges.survives,
           "does not answer, but boots", "give the transfer up; go on"),
+    _case("CO-028", "SDO in STOPPED", "7.3.2.2.4", CUT, plays.honest, judges.survives,
+          "is STOPPED for 4 s, says so, and answers no SDO", "ask on, in bounds; go on").on(strikes=1, mutes="sdo"),
     _case("CO-029", "expedited without the size bit", "7.2.4", READ, plays.no_size, judges.accepts,
           "leaves the size to the object", "take the object's own length").on(holds_good=True, strikes=4),
+    _case("CO-030", "size 0 transfer", "catalogue", READ, plays.empty, judges.rejects,
+          "answers with no byte at all", "never take it for a number; go on"),
     _case("CO-034", "boot-up storm", "catalogue", CUT, plays.boot_storm, judges.survives, "20 nodes boot at once",
           "go on").on(strikes=1),
     _case("CO-035", "unexpected boot-up", "catalogue", READ, plays.boots, reconfigures,
-          "boots without being told to", "configure and start it again").on(strikes=1),
+          "boots without being told to", "configure and start it again").on(strikes=1, trail_s=RESTART_S),
     _case("CO-036a", "heartbeat lost", "7.2.8", READ, plays.honest, notices,
           "sends no heartbeat for 4 s; all else goes on", "notice it; go on").on(
           strikes=1, mutes="heartbeat", framings=("heartbeat",)),
     _case("CO-036b", "node lost and back", "7.2.8", CUT, plays.honest, judges.survives,
           "says nothing at all for 4 s", "ask on, in bounds; go on").on(strikes=1, mutes="all"),
+    _case("CO-037", "late heartbeat", "7.2.8", READ, plays.honest, is_unmoved,
+          "sends one heartbeat 0.2 s late; all else goes on", "see no event inside its consumer time").on(
+          strikes=1, beat_late_s=0.2, framings=("heartbeat",)),
+    _case("CO-038", "restart while timed out", "CN #636", CUT, plays.honest, reconfigures,
+          "says nothing at all for 4 s, then boots", "configure and start it again; watch on").on(
+          strikes=1, mutes="all", boots=True, trail_s=RESTART_S),
     _case("CO-039a", "heartbeat of length 0", "7.2.8", READ, plays.heartbeat(b""), judges.survives,
           "sends an empty heartbeat", "ignore it"),
     _case("CO-039b", "heartbeat of an unknown state", "7.2.8", READ, plays.heartbeat(b"\x55"), judges.survives,
           "says that its state is 55h", "ignore it"),
+    _case("CO-040", "guarding toggle wrong", "7.2.8", READ, plays.nothing, judges.survives,
+          "repeats the toggle bit of a guard reply", "go on").on(wants="guard request", strikes=1),
     _case("CO-042", "two nodes with one id", "catalogue", READ, plays.twin, judges.rejects,
           "answers twice, with another value the second time", "never take the second for a later request"),
+    _case("CO-043", "PDO too short", "7.5.2.36", READ, plays.short_pdo, judges.rejects,
+          "sends a TPDO of one byte", "take nothing of it"),
+    _case("CO-044", "PDO outside OPERATIONAL", "7.3.2.2.2", READ, plays.pdo_outside, judges.rejects,
+          "says PRE-OPERATIONAL and sends a TPDO", "take nothing of it"),
     _case("CO-052", "EMCY burst", "7.2.7", CUT, plays.emcy_burst, judges.survives, "sends 20 EMCY", "go on").on(strikes=1),
     _case("CO-053", "EMCY shorter than 8 bytes", "7.2.7", READ, plays.emcy_short, judges.survives,
           "sends an EMCY of 3 bytes", "go on"),
+    _case("CO-054", "EMCY 0000h while other errors are active", "7.2.7", READ, plays.emcy_partly_over, judges.survives,
+          "sends two EMCY, and that one of them is over", "go on"),
     _case("CO-060", "extended id with a CANopen number", "catalogue", READ, plays.extended, judges.rejects,
           "answers with a 29-bit identifier", "ignore it"),
+    _case("CO-062", "frames lost", "catalogue", READ, plays.unanswered, judges.survives, "never gets two requests",
+          "time out; the next request is clean"),
     _watch("CO-033", "NMT of another length, node > 127", "7.2.8", legal_nmt, "never send one"),
     _watch("CO-047", "SYNC of the wrong length", "7.2.5", legal_sync, "never send one"),
 )  # fmt: skip

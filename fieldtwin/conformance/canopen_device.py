@@ -55,6 +55,10 @@ class HonestNode:
         self.objects.long = request[0] >> 5 == 5
         return self._server.request(request, now_ns)
 
+    def acknowledge(self, now_ns: int) -> list[bytes]:
+        """What is good of a sub-block of a block download, said before its end."""
+        return self._server.tick(now_ns + TIMEOUT_NS // 2)
+
     @property
     def receiving(self) -> bool:
         """Whether frames are segments of a block download now, whatever stands in them."""

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
 from fieldtwin.conformance.judges import DUTIES, all_of
 from fieldtwin.conformance.observation import Asked, Observation, Sent, Shown, Told, Word
+from gateway.core.clock import NS_PER_S
 
 ABORT, NMT, SYNC, SDO_REQUEST = 0x80, 0x000, 0x080, 0x600
 
@@ -50,6 +53,56 @@ def _noticed(seen: Observation) -> Finding | None:
 
 
 notices = all_of(*DUTIES, _noticed)
+
+
+def _unmoved(seen: Observation) -> Finding | None:
+    """A heartbeat that is a little late is no event: nothing is commanded, no value goes."""
+    moved = any(_id(sent) == NMT for sent in seen.of(Sent, seen.begun_ns))
+    if moved or any(shown.word is Word.NONE for shown in seen.of(Shown, seen.begun_ns)):
+        return inconclusive("it took the node for lost: right only where its consumer time is shorter than that")
+    return None
+
+
+is_unmoved = all_of(*DUTIES, _unmoved)
+
+
+def _waits_for_each(seen: Observation) -> Finding | None:
+    """Every answer came within the timeout of its own request: none may be given up before."""
+    asked = list(seen.of(Asked, seen.begun_ns, seen.over_ns))
+    for one, following in pairwise(asked):
+        told = next(seen.of(Told, one.t_ns, seen.over_ns), None)
+        if told is None or told.good or following.t_ns >= told.t_ns:
+            continue
+        after_s, due_s = (following.t_ns - one.t_ns) / NS_PER_S, (told.t_ns - one.t_ns) / NS_PER_S
+        said = f"asked again {after_s:.2f} s after a request that was answered after {due_s:.2f} s"
+        return (
+            failed(said)
+            if seen.timeout_s
+            else inconclusive(f"{said}: a failure if its timeout is longer: say --timeout")
+        )
+    return None
+
+
+waits_for_each = all_of(*DUTIES, _waits_for_each)
+
+
+def _one_a_block(seen: Observation) -> Finding | None:
+    """A sub-block has one acknowledgement, and a segment has none."""
+    acknowledged = [s for s in seen.of(Sent, seen.begun_ns, seen.over_ns) if s.data[2] & 0xE3 == BLOCK_ACKNOWLEDGED]
+    segments = sum(
+        1 for t in seen.of(Told, seen.begun_ns, seen.over_ns) if t.data[0] & 0x7F and t.data[0] not in _OTHERS
+    )
+    if not acknowledged:
+        return inconclusive("no acknowledgement of a sub-block was seen")
+    if len(acknowledged) * 4 > max(segments, 4):
+        return failed(f"{len(acknowledged)} acknowledgements of {segments} segments")
+    return None
+
+
+BLOCK_ACKNOWLEDGED = 0xA2
+_OTHERS = frozenset((*range(0xC0, 0xE0), ABORT))
+"""First bytes of what is no segment of a block upload."""
+one_a_block = all_of(*DUTIES, _one_a_block)
 
 
 def _restarted(seen: Observation) -> Finding | None:

@@ -7,9 +7,12 @@ from dataclasses import replace
 from fieldtwin.conformance.canopen_scene import CanPlay, CanScene, SayFrame
 from gateway.core.canframe import CanFrame
 
-HEARTBEAT, EMCY = 0x700, 0x080
+HEARTBEAT, EMCY, TPDO1 = 0x700, 0x080, 0x180
+PRE_OPERATIONAL = 0x7F
 LATE = 1.5
 STORM = range(100, 120)
+SLOW = 0.35
+"""Of a timeout, that each step of a slow transfer takes: none is too long, all of them together are."""
 
 
 def nothing(scene: CanScene) -> list[SayFrame]:
@@ -160,3 +163,73 @@ def refuses_crc(scene: CanScene) -> list[SayFrame]:
         return honest(scene)
     mux = scene.memory["mux"].to_bytes(3, "little")
     return [scene.reply(b"\x80" + mux + (0x05040004).to_bytes(4, "little"))]
+
+
+def unanswered(scene: CanScene) -> list[SayFrame]:
+    """The reply, or the request, was lost on the bus."""
+    return []
+
+
+def aborts_amid(scene: CanScene) -> list[SayFrame]:
+    """A segmented upload that the node ends with an abort behind the first segment."""
+    if scene.opens:
+        scene.memory["segments"] = 0
+        return [scene.reply(b"\x41" + scene.request[1:4] + (14).to_bytes(4, "little"))]
+    if "segments" not in scene.memory:
+        return scene.honest()
+    scene.memory["segments"] += 1
+    if scene.memory["segments"] == 1:
+        return [scene.reply(b"\0" + scene.poison.ljust(7, b"\0"))]
+    mux = scene.memory["mux"].to_bytes(3, "little")
+    return [scene.reply(b"\x80" + mux + (0x08000022).to_bytes(4, "little"))]
+
+
+def refuses_write(scene: CanScene) -> list[SayFrame]:
+    """A download of an object that can only be read, refused at once."""
+    if not scene.opens:
+        return honest(scene)
+    return [scene.reply(b"\x80" + scene.request[1:4] + (0x06010002).to_bytes(4, "little"))]
+
+
+def slow_segments(scene: CanScene) -> list[SayFrame]:
+    """A segmented upload, a byte a segment, of which each step takes its time."""
+    word = scene.memory["word"].to_bytes(len(scene.poison), "little")
+    after_s = SLOW * scene.timeout_s
+    if scene.opens:
+        scene.memory["segments"] = 0
+        return [scene.reply(b"\x41" + scene.request[1:4] + len(word).to_bytes(4, "little"), after_s)]
+    at = scene.memory["segments"]
+    if at >= len(word):
+        return scene.honest()
+    scene.memory["segments"] += 1
+    command = (at % 2) << 4 | 6 << 1 | (at == len(word) - 1)
+    return [scene.reply(bytes((command, word[at])) + bytes(6), after_s)]
+
+
+def unhurried(scene: CanScene) -> list[SayFrame]:
+    """Each reply takes more than half of a timeout: two of them one after the other are longer than one."""
+    return [scene.reply(data, 0.6 * scene.timeout_s) for data in scene.true]
+
+
+def empty(scene: CanScene) -> list[SayFrame]:
+    """An upload of no byte at all."""
+    if scene.opens:
+        scene.memory["segments"] = 0
+        return [scene.reply(b"\x41" + scene.request[1:4] + bytes(4))]
+    return [scene.reply(bytes((7 << 1 | 1,)) + bytes(7))]
+
+
+def short_pdo(scene: CanScene) -> list[SayFrame]:
+    return [scene.frame(TPDO1, scene.poison[:1]), *scene.honest()]
+
+
+def pdo_outside(scene: CanScene) -> list[SayFrame]:
+    """The node says that it is PRE-OPERATIONAL, and sends process data all the same."""
+    pdo = (scene.poison * 8)[:8]
+    return [scene.frame(HEARTBEAT, bytes((PRE_OPERATIONAL,))), scene.frame(TPDO1, pdo), *scene.honest()]
+
+
+def emcy_partly_over(scene: CanScene) -> list[SayFrame]:
+    """Two errors, and one of them is over: the error register still says that there is one."""
+    told = (b"\x10\x81\x11", b"\x00\x50\x19", b"\x00\x00\x11")
+    return [*(scene.frame(EMCY, data.ljust(8, b"\0")) for data in told), *scene.honest()]

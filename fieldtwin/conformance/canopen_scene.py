@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from fieldtwin.conformance.case import Case
+from fieldtwin.conformance.case import TRAIL_S, Case
 from gateway.core.canframe import CanFrame
 
 SDO_REPLY = 0x580
@@ -54,13 +54,15 @@ class CanScene:
 
 
 CanPlay = Callable[[CanScene], list[SayFrame]]
-CanWants = Literal["upload", "block upload", "block download", "nothing"]
+CanWants = Literal["upload", "download", "block upload", "block download", "guard request", "nothing"]
 
 
 @dataclass(frozen=True, slots=True)
 class CanopenCase:
     """As `scene.ModbusCase`, of SDO transfers. `misses`: the segment of a block download that the node does not hear, 0 for none;
-    `mutes`: what of the node stays away for `mute_s` from the first strike on: ``heartbeat``, or ``all``."""
+    `early`: the one behind which it acknowledges the sub-block although more were to come; `mutes`: what of the node stays away
+    for `mute_s` from the first strike on: ``heartbeat``, ``all``, or ``sdo``, since it is STOPPED; `boots`: it boots when that
+    is over; `beat_late_s`: its next heartbeat comes so late."""
 
     about: Case
     play: CanPlay
@@ -70,8 +72,12 @@ class CanopenCase:
     framings: tuple[str, ...] = ("can",)
     needs: str = ""
     misses: int = 0
-    mutes: Literal["", "heartbeat", "all"] = ""
+    early: int = 0
+    mutes: Literal["", "heartbeat", "all", "sdo"] = ""
     mute_s: float = 4.0
+    boots: bool = False
+    beat_late_s: float = 0.0
+    trail_s: float = TRAIL_S
 
     def on(self, **changes: object) -> CanopenCase:
         return replace(self, **changes)  # type: ignore[arg-type]

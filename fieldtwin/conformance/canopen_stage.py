@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Collection
 
-from fieldtwin.conformance.canopen_device import BOOT_UP, HonestNode
+from fieldtwin.conformance.canopen_device import BOOT_UP, STOPPED, HonestNode
 from fieldtwin.conformance.canopen_scene import CanopenCase, CanScene, SayFrame
 from fieldtwin.conformance.observation import Asked, Garbled, Sent, Told, Word
 from fieldtwin.conformance.recorder import Recorder
@@ -16,7 +16,10 @@ from gateway.core.errors import ConnectionLost
 from gateway.core.nursery import Nursery
 
 SDO_REQUEST, HEARTBEAT, NMT = 0x600, 0x700, 0x000
-ABORT, UPLOAD, BLOCK_UPLOAD, BLOCK_DOWNLOAD = 0x80, 2, 5, 6
+ABORT, DOWNLOAD, UPLOAD, BLOCK_UPLOAD, BLOCK_DOWNLOAD = 0x80, 1, 2, 5, 6
+_WANTED = {"upload": UPLOAD, "download": DOWNLOAD, "block upload": BLOCK_UPLOAD, "block download": BLOCK_DOWNLOAD}
+_BLOCK_ACKNOWLEDGED = 0xA2
+STOP, RESET_COMMUNICATION, TOGGLE = 0x02, 0x82, 0x80
 BEHIND_S = 0.050
 MASTER = 1
 
@@ -45,6 +48,8 @@ class CanopenStage:
         self._playing: CanopenCase | None = None
         self._memory: dict[str, int] | None = None
         self._muted = ""
+        self._beat_late_s = 0.0
+        self._guarded: dict[int, int] = {}
         self._free_ns = 0
         self._loop = asyncio.get_running_loop()
 
@@ -83,6 +88,8 @@ class CanopenStage:
 
     async def _heard(self, frame: CanFrame) -> None:
         now_ns, node = self.now_ns(), frame.can_id - SDO_REQUEST
+        if frame.remote and not frame.extended and HEARTBEAT < frame.can_id < HEARTBEAT + 0x80:
+            await self._guard(frame.can_id - HEARTBEAT, now_ns)
         if frame.error or frame.extended or frame.remote:
             return
         if not 1 <= node <= 127:
@@ -102,15 +109,16 @@ class CanopenStage:
         server = self._node(node)
         receiving = server.receiving
         opens = not receiving and _opens(request)
-        if opens or (not receiving and request[0] >> 5 == 1):
-            self.recorder.add(Asked(now_ns, MASTER, bytes((node,)) + request))
         if opens:
-            self._memory = self._begun(request, now_ns)
+            self.recorder.add(Asked(now_ns, MASTER, bytes((node,)) + request))
+            self._memory = self._begun(node, request, now_ns)
             server.objects.word = self._word_for(self._memory is not None)
-        if self._muted == "all" or (receiving and self._missed()):
+        elif not receiving and request[0] & 0xE3 == _BLOCK_ACKNOWLEDGED:
+            self.recorder.add(Sent(now_ns, MASTER, (SDO_REQUEST + node).to_bytes(2, "big") + request))
+        if self._muted == "all" or (receiving and self._missed(request)):
             self.last_ns = now_ns
             return
-        true = tuple(server.answer(request, now_ns))
+        true = (*server.answer(request, now_ns), *(self._early(server, now_ns) if receiving else ()))
         case = self._playing
         if case is None or self._memory is None or not true:
             self._send([SayFrame(CanFrame(0x580 + node, d), good=True) for d in true], now_ns)
@@ -123,13 +131,24 @@ class CanopenStage:
         self.last_ns = now_ns
         self._send(case.play(scene), now_ns)
 
-    def _missed(self) -> bool:
+    def _missed(self, segment: bytes) -> bool:
         """Whether the node does not hear this segment of a block download."""
         case, memory = self._playing, self._memory
-        if case is None or memory is None or not case.misses:
+        if case is None or memory is None or not (case.misses or case.early):
             return False
+        if memory.get("deaf") and segment[0] & 0x7F != 1:
+            return True  # the rest of a sub-block that was acknowledged early
+        memory["deaf"] = 0
         memory["segments"] = memory.get("segments", 0) + 1
         return memory["segments"] == case.misses
+
+    def _early(self, server: HonestNode, now_ns: int) -> list[bytes]:
+        """The acknowledgement of a sub-block that is not over."""
+        case, memory = self._playing, self._memory
+        if case is None or memory is None or not case.early or memory.get("segments") != case.early:
+            return []
+        memory["deaf"] = 1
+        return server.acknowledge(now_ns)
 
     def _word_for(self, played: bool) -> int:
         """While odd frames hold the honest word, other transfers keep the one before: it is to come from the odd ones."""
@@ -137,25 +156,36 @@ class CanopenStage:
             return self._words[1] if self._word == self._words[0] else self._words[0]
         return self._word
 
-    def _begun(self, request: bytes, now_ns: int) -> dict[str, int] | None:
+    def _begun(self, node: int, request: bytes, now_ns: int) -> dict[str, int] | None:
         """A transfer begins. What its play keeps in mind, where it is one for the case; it is played to its end."""
         self._playing = case = self._case
         if case is None or self.struck >= self.strikes:
             return None
-        wanted = {"upload": UPLOAD, "block upload": BLOCK_UPLOAD, "block download": BLOCK_DOWNLOAD}.get(case.wants)
-        if request[0] >> 5 != wanted:
+        if request[0] >> 5 != _WANTED.get(case.wants):
             return None
         if case.mutes:
             self._muted = case.mutes
             self.pending += 1
-            self._nursery.start(self._unmute(case.mute_s), "silence")
+            self._nursery.start(self._unmute(case, node), "silence")
+        if case.beat_late_s:
+            self._beat_late_s = case.beat_late_s
+            self.pending += 1
         self.first_ns = self.first_ns or now_ns
         self.struck += 1
         return {"word": self._word, "mux": int.from_bytes(request[1:4], "little")}
 
-    async def _unmute(self, after_s: float) -> None:
-        await asyncio.sleep(after_s)
+    async def _unmute(self, case: CanopenCase, number: int) -> None:
+        node = self._node(number)
+        before = node.state
+        if case.mutes == "sdo":
+            node.command(STOP)
+        await asyncio.sleep(case.mute_s)
         self._muted = ""
+        if case.mutes == "sdo" and node.state == STOPPED:
+            node.state = before
+        if case.boots:
+            node.command(RESET_COMMUNICATION)
+            await self._connection.send(CanFrame(HEARTBEAT + number, bytes((BOOT_UP,))))
         self.last_ns = self.now_ns()
         self.pending -= 1
 
@@ -206,13 +236,33 @@ class CanopenStage:
             if addressed in (0, number) and node.command(specifier):
                 await self._connection.send(CanFrame(HEARTBEAT + number, bytes((BOOT_UP,))))
 
+    async def _guard(self, number: int, now_ns: int) -> None:
+        """A guard request (CiA 301, 7.2.8.2.2.1): the state, with a toggle bit that alternates, but for the case about it."""
+        self.recorder.add(Sent(now_ns, MASTER, (HEARTBEAT + number).to_bytes(2, "big")))
+        node, case = self._node(number), self._case
+        toggle = self._guarded.get(number, 0)
+        if case is not None and case.wants == "guard request" and self.struck < self.strikes:
+            self.first_ns, self.last_ns = self.first_ns or now_ns, now_ns
+            self.struck += 1
+            toggle ^= TOGGLE
+        if self._muted in ("heartbeat", "all"):
+            return
+        self._guarded[number] = toggle ^ TOGGLE
+        await self._connection.send(CanFrame(HEARTBEAT + number, bytes((node.state | toggle,))))
+
     async def _live(self) -> None:
         while True:
             await asyncio.sleep(self._heartbeat_s)
-            if self._muted:
+            if self._beat_late_s:
+                late_s, self._beat_late_s = self._beat_late_s, 0.0
+                await asyncio.sleep(late_s)
+                self.last_ns = self.now_ns()
+                self.pending -= 1
+            if self._muted in ("heartbeat", "all"):
                 continue
             for number, node in list(self._nodes.items()):
-                await self._connection.send(CanFrame(HEARTBEAT + number, bytes((node.state,))))
+                if number not in self._guarded:  # one that is guarded says nothing by itself
+                    await self._connection.send(CanFrame(HEARTBEAT + number, bytes((node.state,))))
 
 
 def _opens(request: bytes) -> bool:
@@ -220,4 +270,4 @@ def _opens(request: bytes) -> bool:
     command = request[0] >> 5
     if command == BLOCK_UPLOAD:
         return request[0] & 3 == 0
-    return command == UPLOAD or (command == BLOCK_DOWNLOAD and request[0] & 1 == 0)
+    return command in (UPLOAD, DOWNLOAD) or (command == BLOCK_DOWNLOAD and request[0] & 1 == 0)

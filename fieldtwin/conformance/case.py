@@ -12,6 +12,9 @@ from enum import Enum
 from fieldtwin.conformance.observation import Observation
 from fieldtwin.report.model import Verdict
 
+TRAIL_S = 0.3
+"""How long a case looks on after the master is back to good, where it does not say otherwise: what comes late is seen."""
+
 
 class Danger(Enum):
     """What a case may do to whatever is behind the master, in rising order."""

@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
-from fieldtwin.conformance.case import Case, Danger, Finding, inconclusive, skipped
+from fieldtwin.conformance.case import TRAIL_S, Case, Danger, Finding, inconclusive, skipped
 from fieldtwin.conformance.observation import Asked, Ended, Habit, Observation, Shown, Told, Word
 from fieldtwin.conformance.probe import Probe
 from fieldtwin.conformance.recorder import Recorder
@@ -24,8 +24,6 @@ STEADY = 3
 """So many polls make a habit."""
 MANY = 1_000_000
 """Strikes of a case that goes on until its value was seen."""
-TRAIL_S = 0.3
-"""How long a case looks on after the master is back to good: what it publishes late is seen."""
 
 
 class Playable(Protocol):
@@ -43,6 +41,8 @@ class Playable(Protocol):
     def framings(self) -> tuple[str, ...]: ...
     @property
     def needs(self) -> str: ...
+    @property
+    def trail_s(self) -> float: ...
 
 
 C = TypeVar("C", bound=Playable)
@@ -257,7 +257,7 @@ class MasterRun(Generic[C]):
         while stage.last_ns > over_ns:  # a transfer under way went on
             over_ns = stage.last_ns
             await self._good_again(over_ns)
-        await asyncio.sleep(TRAIL_S)
+        await asyncio.sleep(case.trail_s)
         until_ns = stage.now_ns()
         events = stage.recorder.since(stage.first_ns)
         seen = Observation(

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from fieldtwin.conformance.case import Case
+from fieldtwin.conformance.case import TRAIL_S, Case
 from fieldtwin.conformance.modbus_device import ModbusWire
 
 
@@ -103,7 +103,7 @@ class ModbusCase:
     """A case with its play. `strikes`: so many requests are misanswered; `holds_good` where the odd frames hold the honest
     word, and go on until it was seen. `framings`: where there is such a thing (``rtu``, ``ascii``, ``tcp``; ``stream`` for
     anything that can be hung up, ``port`` for what can be unplugged, ``lock`` for what can be held). `needs` names an option
-    without which the case makes no sense."""
+    without which the case makes no sense; `trail_s` is how long the case looks on when all is well again."""
 
     about: Case
     play: Play
@@ -112,6 +112,7 @@ class ModbusCase:
     holds_good: bool = False
     framings: tuple[str, ...] = ("rtu", "ascii", "tcp")
     needs: str = ""
+    trail_s: float = TRAIL_S
 
     def on(self, **changes: object) -> ModbusCase:
         return replace(self, **changes)  # type: ignore[arg-type]

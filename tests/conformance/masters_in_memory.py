@@ -126,7 +126,8 @@ async def our_canopen(
                 await canopen.nmt(NmtCommand.START, 5)
             try:
                 raw = await canopen.sdo_upload(5, 0x2000, 0, length=None if block else 4, block=block)
-                publish(str(int.from_bytes(raw[:4], "little")))
+                if len(raw) >= 4:  # an empty one is no number
+                    publish(str(int.from_bytes(raw[:4], "little")))
                 if download:
                     await canopen.sdo_download(5, 0x2100, 0, bytes(range(50)), block=True)
             except FieldtwinError:

@@ -157,6 +157,22 @@ def test_every_case_says_what_it_is(cases: tuple[object, ...]) -> None:
         assert about.role == "master"
 
 
+NOT_OF_MASTERS = {
+    "MB": (*(1, 4), *range(29, 36), *range(38, 51), *(53, 57), *range(58, 64)),
+    "CO": (*(3, 7), *range(9, 13), *(19, 31, 32, 41, 45, 46), *range(48, 52), *range(55, 60), *(61, 63, 64, 65, 66)),
+}
+"""Rows of the catalogues that no case plays; docs/conformance.md says why."""
+
+
+@pytest.mark.parametrize(("prefix", "rows", "cases"), [("MB", 70, CASES), ("CO", 66, CANOPEN_CASES)])
+def test_every_row_of_the_catalogue_is_played_or_is_no_business_of_a_master(
+    prefix: str, rows: int, cases: tuple[object, ...]
+) -> None:
+    played = {int(case.about.id[3:6]) for case in cases}  # type: ignore[attr-defined]
+    assert played.isdisjoint(NOT_OF_MASTERS[prefix])
+    assert played | set(NOT_OF_MASTERS[prefix]) == set(range(1, rows + 1))
+
+
 def test_a_master_that_gives_the_connection_up_needs_no_quarantine() -> None:
     events: list[Event] = [Asked(_at(0), 1, READ), Left(_at(0.2), 1), Came(_at(0.3), 2), *_good()[2:]]
     assert judges.late_same_shape(_seen(*events)).verdict is Verdict.PASSED

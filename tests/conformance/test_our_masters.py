@@ -99,7 +99,7 @@ def test_a_prompt_master_with_several_requests_takes_part_in_the_rest() -> None:
 def test_our_canopen_master_bears_every_hostile_node() -> None:
     results = judge_canopen(our_canopen)
     assert _unpassed(results) == {}
-    assert sum(r.verdict is Verdict.PASSED for r in results.values()) >= 21
+    assert sum(r.verdict is Verdict.PASSED for r in results.values()) >= 32
 
 
 def test_our_block_uploads_bear_lost_segments_and_wrong_check_sums() -> None:

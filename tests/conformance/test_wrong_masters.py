@@ -153,6 +153,92 @@ def test_a_naive_sdo_client_fails_what_it_does_not_look_at() -> None:
     assert results["CO-008"].verdict is Verdict.PASSED
 
 
+def _sdo(
+    *, whole_s: float = 0.0, stale: bool = False, pdo: bool = False, beat_s: float = 0.0, guards: bool = False
+) -> Callable[..., object]:
+    """A careful SDO client with one mistake. `whole_s`: its timeout is for a whole transfer; `stale`: it does not stop the timer
+    of a transfer that is over; `pdo`: it publishes what a TPDO begins with; `beat_s`: it commands a node whose heartbeat is later
+    than that; `guards`: it asks for the state by remote frames, and ends for good when a toggle bit is wrong."""
+
+    async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+        bus, loop = await net.open_can(endpoint, 125_000), asyncio.get_running_loop()
+        toggle: int | None = None
+        due_s = beat_due_s = 0.0
+
+        async def ask(data: bytes, end_s: float) -> bytes:
+            nonlocal toggle, beat_due_s
+            await bus.send(CanFrame(0x605, data.ljust(8, b"\0")))
+            while True:
+                async with asyncio.timeout_at(min(loop.time() + TIMEOUT_S, end_s)):
+                    frame = await bus.recv()
+                if frame.can_id == 0x185 and pdo:
+                    publish(str(int.from_bytes(frame.data[:4], "little")))
+                if frame.can_id == 0x705 and guards and frame.data != b"\0":
+                    if frame.data[0] & 0x80 == toggle:
+                        await asyncio.Event().wait()
+                    toggle = frame.data[0] & 0x80
+                elif frame.can_id == 0x705 and beat_s:
+                    if beat_due_s and loop.time() > beat_due_s:
+                        await bus.send(CanFrame(0, b"\x01\x05"))
+                    beat_due_s = loop.time() + beat_s
+                if frame.can_id == 0x585 and not frame.extended and len(frame.data) == 8:
+                    return frame.data
+
+        async def upload() -> bytes:
+            end_s = loop.time() + (whole_s or 60.0)
+            reply = await ask(b"\x40\x00\x20", min(end_s, due_s) if stale and due_s > loop.time() else end_s)
+            value = reply[4:8] if reply[0] & 0xE3 == 0x43 else b""
+            at = 0
+            while reply[0] == 0x41 and not at & 0x80:
+                segment = await ask(bytes((0x60 | at << 4 & 0x10,)), end_s)
+                if segment[0] >> 5:
+                    return b""
+                value += segment[1 : 8 - (segment[0] >> 1 & 7)]
+                at = 0x80 if segment[0] & 1 else at + 1
+            return value
+
+        while True:
+            if guards:
+                await bus.send(CanFrame(0x705, remote=True, dlc=1))
+            begun_s = loop.time()
+            try:
+                value = await upload()
+                if len(value) == 4:
+                    publish(str(int.from_bytes(value, "little")))
+            except TimeoutError:
+                pass
+            due_s = begun_s + TIMEOUT_S
+            await asyncio.sleep(0.02 if stale else LAZY_S)
+
+    return poll
+
+
+@pytest.mark.parametrize(
+    ("master", "case", "verdict", "says"),
+    [
+        (_sdo(whole_s=TIMEOUT_S), "CO-022", Verdict.FAILED, "were not taken"),
+        (_sdo(stale=True), "CO-024", Verdict.FAILED, "asked again 0.0"),
+        (_sdo(pdo=True), "CO-043", Verdict.FAILED, "published 5, which no honest answer held"),
+        (_sdo(pdo=True), "CO-044", Verdict.FAILED, "published 3333"),
+        (_sdo(beat_s=1.1), "CO-037", Verdict.INCONCLUSIVE, "consumer time is shorter"),
+        (_sdo(beat_s=1.5), "CO-037", Verdict.PASSED, ""),
+        (_sdo(guards=True), "CO-040", Verdict.FAILED, "was not published"),
+        (_sdo(), "CO-040", Verdict.SKIPPED, "it sent no guard request"),
+        (_sdo(), "CO-006", Verdict.SKIPPED, "it sent no download"),
+        (_sdo(), "CO-002", Verdict.PASSED, ""),
+        (_sdo(), "CO-022", Verdict.PASSED, ""),
+        (_sdo(), "CO-024", Verdict.PASSED, ""),
+        (_sdo(), "CO-038", Verdict.INCONCLUSIVE, "configures nothing"),
+    ],
+)
+def test_one_mistake_of_an_sdo_client_is_one_failure(
+    master: Callable[..., object], case: str, verdict: Verdict, says: str
+) -> None:
+    result = judge_canopen(master, case)[case]  # type: ignore[arg-type]
+    assert result.verdict is verdict, result.reason
+    assert says in result.reason
+
+
 def _tcp(request: bytes, *, closes: bool = True, again: bool = False) -> Callable[..., object]:
     """A master on TCP, one connection as long as it lasts. Unless it `closes`, it opens another for every request and leaves the
     old ones; `again`: what nobody answered is sent once more."""

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
 from itertools import pairwise
 
 import pytest
-from support import eventually, run
+from modbus_client_rig import CLOCK, LINE, RTU, Device, answering, wire, with_client
+from support import eventually
 
-from gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint, SerialSettings
 from gateway.core.errors import (
     ConnectionLost,
@@ -22,106 +21,7 @@ from gateway.core.errors import (
     VerifyFailed,
 )
 from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.crc import with_crc
 from gateway.protocols.modbus.framings import Framing
-from gateway.wallclock import WallClock
-
-CLOCK = WallClock()
-LINE = SerialSettings(19200, "8E1")
-RTU = Endpoint.parse("rtu:/dev/ttyS9?baudrate=19200&frame=8E1")
-TCP = Endpoint.parse("tcp://device:502")
-
-
-class MemoryEnd(ByteConnection):
-    """One end of an in-memory duplex wire."""
-
-    peer: MemoryEnd
-
-    async def write(self, data: bytes) -> None:
-        if self.lost is not None:
-            raise ConnectionLost("the wire is cut", where=str(self.endpoint))
-        self.peer.feed(data)
-
-    async def aclose(self) -> None:
-        self.feed_lost(closed_here(self.endpoint))
-        self.peer.feed_lost(ConnectionLost("the peer closed", where=str(self.endpoint)))
-
-
-def wire(framing: Framing) -> tuple[MemoryEnd, MemoryEnd]:
-    rtu = framing == "rtu"
-    ends = [MemoryEnd(RS232Connection() if rtu else TCPConnection(), RTU if rtu else TCP) for _ in range(2)]
-    ends[0].peer, ends[1].peer = ends[1], ends[0]
-    return ends[0], ends[1]
-
-
-class Device:
-    """The far end, by hand: requests are kept with the time they came; a test sends what it likes."""
-
-    def __init__(self, end: MemoryEnd) -> None:
-        self.end = end
-        self.requests: list[tuple[int, bytes]] = []
-        self.answer: Callable[[bytes], Awaitable[None]] | None = None
-
-    async def serve(self) -> None:
-        while True:
-            request = await self.end.read()
-            self.requests.append((CLOCK.monotonic_ns(), request))
-            if self.answer is not None:
-                await self.answer(request)
-
-    async def send(self, text: str) -> None:
-        await self.end.write(bytes.fromhex(text))
-
-    async def send_frame(self, text: str) -> None:
-        await self.end.write(with_crc(bytes.fromhex(text)))
-
-
-def with_client(
-    scenario: Callable[[ModbusClient, Device], Awaitable[None]],
-    framing: Framing = "rtu",
-    serial: SerialSettings | None = LINE,
-    timeout_s: float = 0.06,
-    echo: bool = False,
-) -> None:
-    async def main() -> None:
-        near, far = wire(framing)
-        client = ModbusClient(near, CLOCK, framing=framing, serial=serial, timeout_s=timeout_s, echo=echo)
-        device = Device(far)
-        serving = asyncio.create_task(device.serve())
-        try:
-            await scenario(client, device)
-        finally:
-            serving.cancel()
-            [ended] = await asyncio.gather(serving, return_exceptions=True)
-            await client.aclose()
-        assert isinstance(ended, asyncio.CancelledError | ConnectionLost), "the device stumbled"
-        c = client.counters
-        answered = c.broadcasts + c.replies + c.exceptions + c.timeouts + c.crc_errors + c.desyncs
-        assert c.requests == answered + c.verify_failures + c.abandoned
-
-    run(main())
-
-
-def register_frame(value: int) -> str:
-    return f"01 03 02 {value:04x}"
-
-
-def answering(device: Device, *values: int) -> None:
-    """Answer reads of one register with `values` in turn, at once."""
-    left = list(values)
-
-    async def answer(request: bytes) -> None:
-        if request[0]:
-            await device.send_frame(register_frame(left.pop(0)))
-
-    device.answer = answer
-
-
-def mbap_answer(device: Device) -> Callable[[bytes], Awaitable[None]]:
-    async def answer(request: bytes) -> None:
-        await device.send(f"{request[:2].hex()} 0000 0005 01 03 02 {request[1] * 3:04x}")
-
-    return answer
 
 
 def test_a_read_over_rtu() -> None:
@@ -197,112 +97,6 @@ def test_the_deadline_counts_from_the_end_of_transmission() -> None:
     with_client(scenario, serial=SerialSettings(1200, "8N1"))
 
 
-def test_mb_003_after_a_truncated_reply_the_next_request_is_clean() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        async def truncated(_: bytes) -> None:
-            await device.send("01 03 02")
-
-        device.answer = truncated
-        with pytest.raises(ReplyTimeout, match="3 bytes"):
-            await client.read_registers(1, "holding", 0, 1)
-        answering(device, 5)
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (5,)
-
-    with_client(scenario)
-
-
-def test_mb_012_mb_013_a_late_reply_is_never_given_to_the_next_request() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        with pytest.raises(ReplyTimeout):
-            await client.read_registers(1, "holding", 0, 1)
-        asked_ns = CLOCK.monotonic_ns()
-        second = asyncio.create_task(client.read_registers(1, "holding", 0, 1))
-        await asyncio.sleep(0)  # let it begin its quarantine
-        answering(device, 0x2222)
-        await device.send_frame(register_frame(0x1111))
-        late_ns = CLOCK.monotonic_ns()
-        assert (await second).registers == (0x2222,)
-        assert client.counters.late_bytes == 7
-        assert device.requests[1][0] - late_ns >= 60_000_000 > late_ns - asked_ns  # silent for the whole timeout
-
-    with_client(scenario)
-
-
-def test_mb_013_the_quarantine_learns_the_longest_latency() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        with pytest.raises(ReplyTimeout):
-            await client.read_registers(1, "holding", 0, 1)
-        sent_ns = device.requests[0][0]
-        second = asyncio.create_task(client.read_registers(1, "holding", 0, 1, timeout_s=0.02))
-        loop = asyncio.get_running_loop()
-        sent = loop.create_future()
-        loop.call_later(0.05, lambda: sent.set_result(None))
-        await sent
-        await device.send_frame(register_frame(0x1111))
-        latency_ns = CLOCK.monotonic_ns() - sent_ns
-        with pytest.raises(ReplyTimeout):
-            await second
-        quiet_ns = device.requests[1][0] - sent_ns - latency_ns
-        assert quiet_ns >= latency_ns * 0.95  # the late reply took longer than the timeout
-        timed_out_ns = CLOCK.monotonic_ns()
-        answering(device, 3)
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (3,)
-        assert device.requests[2][0] - timed_out_ns >= latency_ns * 0.95  # though this timeout was only 20 ms
-
-    with_client(scenario)
-
-
-def test_mb_014_a_duplicate_that_comes_between_requests_is_drained() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        answering(device, 1, 2)
-        await client.read_registers(1, "holding", 0, 1)
-        await device.send_frame(register_frame(1))
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (2,)
-        assert client.counters.late_bytes == 7
-
-    with_client(scenario)
-
-
-def test_a_babbling_line_is_reported_and_nothing_is_sent() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        with pytest.raises(ReplyTimeout):
-            await client.read_registers(1, "holding", 0, 1, timeout_s=0.005)
-
-        async def babble() -> None:
-            while True:
-                await device.send("55")
-                await asyncio.sleep(0.001)
-
-        babbling = asyncio.create_task(babble())
-        with pytest.raises(Desync, match="never silent"):
-            await client.read_registers(1, "holding", 0, 1)
-        babbling.cancel()
-        await asyncio.gather(babbling, return_exceptions=True)
-        assert len(device.requests) == 1
-        silent_ns = CLOCK.monotonic_ns()
-        answering(device, 1)
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (1,)
-        assert device.requests[1][0] - silent_ns < 400_000_000  # what babbled did not count as a latency
-
-    with_client(scenario)
-
-
-def test_mb_010_echo_over_the_wire() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        async def echo_and_answer(request: bytes) -> None:
-            await device.end.write(request)
-            if request[0]:
-                await device.send_frame(register_frame(9))
-
-        device.answer = echo_and_answer
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (9,)
-        await client.write_register(0, 1, 2)
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (9,)
-        assert client.counters.late_bytes == 0
-
-    with_client(scenario, echo=True)
-
-
 def test_mb_026_a_broadcast_write_waits_for_nobody_but_leaves_time_to_execute() -> None:
     async def scenario(client: ModbusClient, device: Device) -> None:
         reply = await client.write_registers(0, 0, [7])
@@ -343,68 +137,6 @@ def test_unit_0_on_tcp_is_a_unit_like_any_other() -> None:
     with_client(scenario, framing="mbap")
 
 
-def test_mb_056_on_tcp_a_late_reply_is_discarded_without_quarantine() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        with pytest.raises(ReplyTimeout):
-            await client.read_registers(1, "holding", 0, 1, timeout_s=0.02)
-        await device.send("0001 0000 0005 01 03 02 dead")
-        device.answer = mbap_answer(device)
-        asked_ns = CLOCK.monotonic_ns()
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (6,)
-        assert device.requests[1][0] - asked_ns < 20_000_000
-        assert client.counters.late_bytes == 11
-
-    with_client(scenario, framing="mbap")
-
-
-def test_mb_056_a_reply_that_came_before_its_request_is_no_reply() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        await device.send("0001 0000 0005 01 03 02 dead")
-        with pytest.raises(ReplyTimeout):
-            await client.read_registers(1, "holding", 0, 1, timeout_s=0.02)
-
-    with_client(scenario, framing="mbap")
-
-
-@pytest.mark.parametrize("framing", ["rtu", "mbap"])
-def test_cancelling_never_pairs_a_reply_with_the_next_request(framing: Framing) -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        first = asyncio.create_task(client.read_registers(1, "holding", 0, 1))
-        await eventually(lambda: len(device.requests) == 1)
-        first.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await first
-        second = asyncio.create_task(client.read_registers(1, "holding", 0, 1))
-        await asyncio.sleep(0)
-        if framing == "rtu":
-            answering(device, 0x2222)
-            await device.send_frame(register_frame(0x1111))
-            assert (await second).registers == (0x2222,)
-        else:
-            device.answer = mbap_answer(device)
-            await device.send("0001 0000 0005 01 03 02 dead")
-            assert (await second).registers == (6,)
-        assert client.counters.abandoned == 1
-        assert client.counters.late_bytes > 0
-
-    with_client(scenario, framing=framing)
-
-
-def test_cancelling_one_that_waits_for_its_turn_sends_nothing() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        first = asyncio.create_task(client.read_registers(1, "holding", 0, 1))
-        second = asyncio.create_task(client.read_registers(1, "holding", 9, 1))
-        await eventually(lambda: len(device.requests) == 1)
-        second.cancel()
-        await device.send_frame(register_frame(4))
-        assert (await first).registers == (4,)
-        with pytest.raises(asyncio.CancelledError):
-            await second
-        assert client.counters.requests == 1
-
-    with_client(scenario)
-
-
 def test_many_callers_are_served_one_at_a_time() -> None:
     async def scenario(client: ModbusClient, device: Device) -> None:
         async def answer(request: bytes) -> None:
@@ -439,27 +171,6 @@ def test_errors_are_counted_and_say_where(frame: str, error: type[FieldtwinError
         assert getattr(client.counters, counter) == 1
         answering(device, 6)
         assert (await client.read_registers(1, "holding", 0, 1)).registers == (6,)
-
-    with_client(scenario)
-
-
-def test_mb_002_the_rest_of_a_damaged_reply_does_not_reach_the_next_request() -> None:
-    async def scenario(client: ModbusClient, device: Device) -> None:
-        async def damaged(_: bytes) -> None:
-            await device.send("01 03 02 00 00 00")
-
-        device.answer = damaged
-        first = asyncio.create_task(client.read_registers(1, "holding", 0, 1))
-        await eventually(lambda: len(device.requests) == 1)
-        await device.send("00 99 88 77")
-        with pytest.raises(CrcError):
-            await first
-        damaged_ns = CLOCK.monotonic_ns()
-        await device.send("66 55")
-        answering(device, 6)
-        assert (await client.read_registers(1, "holding", 0, 1)).registers == (6,)
-        assert client.counters.late_bytes == 5
-        assert device.requests[1][0] - damaged_ns >= 20_000_000  # as long as a USB adapter may hold the rest back
 
     with_client(scenario)
 

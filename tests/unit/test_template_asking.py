@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
-from test_template import own_system, packed, with_python
+from template_rig import own_system, packed, with_python
 
 from fieldtwin.cli.main import cli
 from fieldtwin.running.template_here import Stranger, agree, system_file

@@ -2,7 +2,7 @@
 
 Start order: process image, field side, PLC, gateway, far end. Stop order is the reverse, with safe outputs in between and
 the counters of both sides read when nothing is on the wire any more. A process that dies does not end the run: the others show
-what they make of it, and the run's verdict is no.
+what they make of it, and the run's verdict is no. The thread's, which only watches, is started again.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from fieldtwin.running.oracle import Oracle
 from fieldtwin.running.reloading import Reloaded, reload
 from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
+from fieldtwin.running.thread_return import ThreadReturn
 from gateway.core.control import ControlClient
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, Unreachable, UsageError
@@ -83,6 +84,7 @@ class RunSession(Started):
         self.outputs_confirmed_safe: bool | None = None
         self.thread_place = ""
         self.thread_status: dict[str, Any] | None = None
+        self.thread_return: ThreadReturn | None = None
         self.started_ns = 0
         self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
         self.stopped = asyncio.Event()
@@ -169,8 +171,26 @@ class RunSession(Started):
         )
         client = await self._start_child("thread", "twin.plant_thread", self._write("thread.json", config))
         self.thread_place = str((await client.call("get"))["place"])
+        if not self.lent:  # where it is found again, had it been free to choose a port
+            config = msgspec.structs.replace(config, place=self.thread_place)
+        self._keep_thread(config)
         if self.lent in self.far:
             self.thread_place = f"{MODEM}{self.far[self.lent]}"
+
+    def _keep_thread(self, config: PlantThreadConfig) -> None:
+        def another() -> Child:
+            path = self._write("thread.json", config)
+            self.children["thread"] = Child("thread", "twin.plant_thread", path, self.instance.dir)
+            return self.children["thread"]
+
+        def came(client: ControlClient) -> None:
+            self._clients["thread"] = client
+
+        self.thread_return = ThreadReturn(
+            self.children["thread"], another, came, lambda error: self.note_error(str(error))
+        )
+        self._stack.push_async_callback(self.thread_return.end)
+        self._nursery.start(self.thread_return.run(), "thread's process")
 
     def _field_config(self, run_dir: Path) -> FieldConfig:
         from twin.field_process import FieldConfig

@@ -8,7 +8,9 @@ from __future__ import annotations
 import json
 import os
 import signal
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from procs import (
@@ -23,6 +25,7 @@ from procs import (
     no_tracebacks,
     wait_for,
 )
+from stores import log_of, own
 
 pytestmark = pytest.mark.slow
 
@@ -68,6 +71,39 @@ def held_by_file(audit: Path) -> list[float]:
     """The values of the writes that were confirmed, by the audit log."""
     entries = [json.loads(line) for line in audit.read_text(encoding="utf-8").splitlines()]
     return [e["new"] for e in entries if e["action"] == "write" and e["result"] == "done"]
+
+
+@pytest.mark.long
+def test_a_threads_process_that_is_killed_is_there_again_and_its_twin_misses_nothing(tmp_path: Path) -> None:
+    """Whoever watches holds nothing up, and is not held up: a plant of which nobody keeps anything is a loss each second."""
+    args = (*PROTOTYPE, "--instance", "t", "--thread", "tcp://127.0.0.1:0")
+    with fieldtwin(tmp_path, *args) as run:
+        thread = run.control("t", "thread")
+        place, first = thread("get")["place"], run.pid_of("t", "thread")
+        twin = ("twin", "observatory", "--from", place, "--instance", "tt", "--json")
+        with fieldtwin(tmp_path, *twin, "--command", "1", name="twin") as its:
+            wait_for(lambda: thread("get")["sent_through"] > 20, 20, its.err)
+            os.kill(first, signal.SIGKILL)
+            wait_for(lambda: not alive(first), 5, "it is gone")
+            wait_for(lambda: answered(thread, "place") == place, 10, "another one, at the same place")
+            assert run.pid_of("t", "thread") != first
+            wait_for(lambda: answered(thread, "sent_through") > 60, 20, "and the twin has found it")
+            its.signal(signal.SIGINT)
+            assert its.wait(10) == 0, its.err
+        run.signal(signal.SIGINT)
+        assert run.wait(6) == 1
+    assert [error.partition(" (")[0] for error in run.summary["errors"]] == ["thread: ended with signal 9"]
+    here, there = (tmp_path / name / "knowledge.sqlite" for name in ("t", "tt"))
+    known = log_of(there, own(here, "plant"))
+    assert len(known) > 60
+    assert known == log_of(here, own(here, "plant"))[: len(known)]
+
+
+def answered(asking: Asking, key: str) -> Any:
+    """What is said under that key; 0 while nobody answers."""
+    with suppress(OSError):
+        return asking("get")[key] or 0
+    return 0
 
 
 def test_a_killed_gateway_turns_the_plcs_inputs_bad(tmp_path: Path) -> None:

@@ -130,8 +130,8 @@ def _verdict_table(report: Report) -> Markup:
             el(
                 "tr", el("td", pill(scenario.verdict)), el("td", name, cls="name"), about,
                 el("td", _why(scenario), cls="long check"),
-                el("td", f"{passed}/{len(scenario.checks)}", cls="num"), el("td", ", ".join(scenario.requirements)),
-                el("td", _time(scenario.simulated_s), cls="num"), el("td", _time(scenario.took_s), cls="num"),
+                el("td", f"{passed}/{len(scenario.checks)}" if scenario.checks else "", cls="num"), el("td", ", ".join(scenario.requirements)),
+                el("td", _time(scenario.simulated_s) if scenario.simulated_s else "", cls="num"), el("td", _time(scenario.took_s), cls="num"),
                 id=None if scenario.verdict.bad else f"s{number}",
             )
         )  # fmt: skip

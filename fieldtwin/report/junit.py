@@ -63,11 +63,9 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult) -> None:
         suite, "testcase", classname=clean(f"{system}.{target}" if target else system), name=clean(scenario.title),
         time=f"{scenario.took_s:.3f}",
     )  # fmt: skip
-    if scenario.file:
-        case.set("file", clean(scenario.file))
-    if scenario.line:
-        case.set("line", str(scenario.line))
     facts = [(name, value) for name in ("case", "role", "danger") if (value := getattr(scenario, name))]
+    if scenario.file:  # no attribute: Jenkins' xUnit plugin skips whole files for that
+        facts.append(("file", f"{scenario.file}:{scenario.line}" if scenario.line else scenario.file))
     facts += [("requirement", id) for id in scenario.requirements]
     facts += [("trace hash", scenario.trace_hash)] if scenario.trace_hash else []
     _properties(case, facts)

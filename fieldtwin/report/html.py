@@ -125,13 +125,15 @@ def _verdict_table(report: Report) -> Markup:
         if scenario.verdict.bad:
             name = el("a", scenario.title, href=f"#s{number}")
         passed = sum(c.verdict is Verdict.PASSED for c in scenario.checks)
+        checks = f"{passed}/{len(scenario.checks)}" if scenario.checks else ""
+        simulated = _time(scenario.simulated_s) if scenario.simulated_s else ""
         about = [el("td", getattr(scenario, column)) for column in columns]
         rows.append(
             el(
                 "tr", el("td", pill(scenario.verdict)), el("td", name, cls="name"), about,
                 el("td", _why(scenario), cls="long check"),
-                el("td", f"{passed}/{len(scenario.checks)}" if scenario.checks else "", cls="num"), el("td", ", ".join(scenario.requirements)),
-                el("td", _time(scenario.simulated_s) if scenario.simulated_s else "", cls="num"), el("td", _time(scenario.took_s), cls="num"),
+                el("td", checks, cls="num"), el("td", ", ".join(scenario.requirements)),
+                el("td", simulated, cls="num"), el("td", _time(scenario.took_s), cls="num"),
                 id=None if scenario.verdict.bad else f"s{number}",
             )
         )  # fmt: skip

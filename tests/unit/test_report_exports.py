@@ -62,7 +62,7 @@ def test_junit_tells_a_failure_and_how_to_run_it_again() -> None:
     assert failure.get("message") == "4 failed at 13.300 s: pressure <good>; expected good; got bad (a.yaml:31)"
     assert failure.text is not None
     assert failure.text.endswith("reproduce: fieldtwin test a.yaml --seed 7")
-    assert [p.get("value") for p in case.findall("./properties/property")] == ["R-1", "R-2"]
+    assert [p.get("value") for p in case.findall("./properties/property")] == ["a.yaml:12", "R-1", "R-2"]
 
 
 def test_junit_never_passes_what_was_not_judged() -> None:
@@ -74,7 +74,7 @@ def test_junit_never_passes_what_was_not_judged() -> None:
         ("fieldtwin.skipped", "5 skipped: set a value; because target compose cannot set_value"),
         ("fieldtwin.inconclusive", "late"),
     ]
-    assert [child.tag for child in passed] == ["system-out"]
+    assert [child.tag for child in passed] == ["properties", "system-out"]
 
 
 @given(st.text(max_size=40))
@@ -204,7 +204,7 @@ KNOWN = {
     "testcase": {"name", "classname", "time", "group"},
     "properties": set(),
     "property": {"name", "value"},
-    **dict.fromkeys(("failure", "error", "skipped"), {"type", "message"}),
+    **{key: {"type", "message"} for key in ("failure", "error", "skipped")},
     "system-out": set(),
 }
 """Elements and attributes of junit-10.xsd, the schema by which Jenkins' xUnit plugin refuses files; properties of test cases are

@@ -231,9 +231,8 @@ class OutputImage:
             self._forced = bool(self.forces.outputs)
             but = {o.index: Quality.SIMULATED for o in self._plain if o.tag in self.forces.outputs}
             self._same = False
-        same, self._same = self._same, False
         try:
-            self.writer.publish_columns(values, _GOOD, _NO_REASON, now_ns, messages, but=but, same=same)
+            self.writer.publish_columns(values, _GOOD, _NO_REASON, now_ns, messages, but=but, same=self._same)
         except NotEncodable as e:
             values[self.writer.shape.index[e.tag]] = None  # so that stopping can publish what is left
             owner = next((output.owner for output in self.outputs if output.tag == e.tag), "?")

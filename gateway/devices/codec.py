@@ -20,7 +20,8 @@ _FORMATS = {
     "int8": ">b", "uint8": ">B", "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q",
     "uint64": ">Q", "float32": ">f", "float64": ">d",
 }  # fmt: skip
-_STRUCTS = {kind: struct.Struct(form) for kind, form in _FORMATS.items()}
+_UNPACK = {kind: struct.Struct(form).unpack for kind, form in _FORMATS.items()}
+_GOOD, _NO_REASON = Quality.GOOD, Reason.NONE  # an Enum's members are slow to look up
 
 
 def reorder(data: bytes, order: str) -> bytes:
@@ -42,16 +43,18 @@ def decode(tag: Tag, data: bytes, t_ns: int) -> TagValue:
     Not a number, a digit that is none and a sentinel are bad values and never good ones; a value outside the profile's range
     is uncertain.
     """
+    if tag.type in _UNPACK:  # most are numbers
+        return _decode_number(tag, data if tag.order == "ABCD" else reorder(data, tag.order), data, t_ns)
     if tag.type == "string":
         swapped = tag.order in ("BADC", "DCBA")  # characters change places within a register, registers never do
         text = (
             (reorder(data, "BADC") if swapped else data).split(b"\0", 1)[0].decode("ascii", errors="replace").rstrip()
         )
-        return TagValue(text, Quality.GOOD, Reason.NONE, t_ns, data)
+        return TagValue(text, _GOOD, _NO_REASON, t_ns, data)
     if tag.type == "bytes":
-        return TagValue(data, Quality.GOOD, Reason.NONE, t_ns, data)
+        return TagValue(data, _GOOD, _NO_REASON, t_ns, data)
     if tag.type == "bool":
-        return TagValue(bool(int.from_bytes(data)), Quality.GOOD, Reason.NONE, t_ns, data)
+        return TagValue(bool(int.from_bytes(data)), _GOOD, _NO_REASON, t_ns, data)
     return _decode_number(tag, reorder(data, tag.order), data, t_ns)
 
 
@@ -59,25 +62,26 @@ def _decode_number(tag: Tag, ordered: bytes, data: bytes, t_ns: int) -> TagValue
     """The value of the big-endian bytes `ordered`, which were `data` on the wire."""
     if tag.sentinels and int.from_bytes(ordered) in tag.sentinels:
         return TagValue(None, Quality.BAD, Reason.SENTINEL, t_ns, data)
-    number = _number(tag, ordered)
+    unpack = _UNPACK.get(tag.type) if tag.bits is None else None
+    number = unpack(ordered)[0] if unpack is not None else _odd_number(tag, ordered)
     if number is None or not math.isfinite(number):
         return TagValue(None, Quality.BAD, Reason.NOT_A_NUMBER, t_ns, data)
-    value = _scaled(tag, number)
+    value = (
+        number if tag.scale == 1.0 and tag.offset == 0.0 else number * tag.scale + tag.offset
+    )  # whole ones stay whole
     if tag.range is not None and not tag.range[0] <= value <= tag.range[1]:
         return TagValue(value, Quality.UNCERTAIN, Reason.OUT_OF_RANGE, t_ns, data)
-    return TagValue(value, Quality.GOOD, Reason.NONE, t_ns, data)
+    return TagValue(value, _GOOD, _NO_REASON, t_ns, data)
 
 
-def _number(tag: Tag, ordered: bytes) -> int | float | None:
-    """The raw number of big-endian bytes; None where they are none (a BCD digit above 9)."""
+def _odd_number(tag: Tag, ordered: bytes) -> int | None:
+    """Decimal digits, or some bits, of big-endian bytes; None for digits that are none (a BCD digit above 9)."""
     if tag.type.startswith("bcd"):
         digits = ordered.hex()
         return int(digits) if digits.isdigit() else None
-    if tag.bits is not None:
-        low, high = tag.bits
-        return int.from_bytes(ordered) >> low & (1 << (high - low + 1)) - 1
-    number: int | float = _STRUCTS[tag.type].unpack(ordered)[0]
-    return number
+    assert tag.bits is not None
+    low, high = tag.bits
+    return int.from_bytes(ordered) >> low & (1 << (high - low + 1)) - 1
 
 
 def apply_scale(tag: Tag, value: TagValue, exponent: TagValue | None) -> TagValue:
@@ -130,10 +134,3 @@ def _packed(kind: str, number: float) -> bytes:
             raise OverflowError(number)
         return packed
     return struct.pack(_FORMATS[kind], round(number))
-
-
-def _scaled(tag: Tag, number: float) -> float:
-    """Engineering units; whole numbers stay whole where nothing is scaled."""
-    if tag.scale == 1.0 and tag.offset == 0.0:
-        return number
-    return number * tag.scale + tag.offset

@@ -29,6 +29,7 @@ from gateway.runtime.audit import AuditLog
 from gateway.runtime.learnt import LearntFile, describe_learnt
 from gateway.runtime.reconfigure import reconfigure
 from gateway.runtime.status import describe
+from gateway.runtime.taken import TakenFile
 from gateway.store.exchange_log import ExchangeLog
 from gateway.wallclock import WallClock, run
 from twin.mapping import MappedConnector, mapping_from_json
@@ -91,6 +92,8 @@ class GatewayProcess:
         try:
             ecs = EmbeddedControlSystem(system)
             with attached(ecs.layout, run_dir / "image") as image:
+                # What emulators did or taught is no fact about the devices of a plant.
+                of = "" if self._config.mapping is None else ".prototype"
                 self._gateway = ecs.gateway(
                     connector,
                     self._clock,
@@ -100,11 +103,10 @@ class GatewayProcess:
                     allow_writes=self._config.allow_writes,
                     free_ports=self._config.mapping is not None,
                     lent=self._config.lent,
+                    taken=TakenFile(run_dir / f"taken{of}.json"),
                 )
-                # What emulators teach is no fact about the devices of a plant.
-                kept = "learnt.json" if self._config.mapping is None else "learnt.prototype.json"
                 drivers = [d for d in self._gateway.drivers.values() if isinstance(d, RegisterDriver)]
-                self._learnt = LearntFile(run_dir / kept, drivers, system.buses)
+                self._learnt = LearntFile(run_dir / f"learnt{of}.json", drivers, system.buses)
                 self._learnt.load()
                 self._watching = TagWatch(self._gateway.tags, self._clock)
                 await self._serve(run_dir / "gateway.sock")

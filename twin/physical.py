@@ -25,6 +25,7 @@ from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
 from gateway.runtime.tags import TagTable
+from gateway.runtime.taken import TakenFile
 from gateway.store.exchange_log import ExchangeLog
 from plc.binding import BoundProgram, InputBinding, image_for
 from plc.config import PlcConfig, ProgramConfig, TaskSpec
@@ -263,13 +264,14 @@ class EmbeddedControlSystem:
         true_silences: bool | None = None,
         listen: Listen = TcpListener.open,
         lent: Sequence[str] = (),
+        taken: TakenFile | None = None,
     ) -> Gateway:
         """The gateway with its drivers. Which wires `connector` opens, and where `listen` lets clients in, nobody from here
-        on knows."""
+        on knows. `taken` keeps which commands need not be handed on again; None: nobody comes after it."""
         config = gateway_config(
             self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences, lent=lent
         )
-        return Gateway(config, connector, clock, image, audit, log, listen)
+        return Gateway(config, connector, clock, image, audit, log, listen, taken)
 
     def command_lists(self, clock: Clock) -> dict[str, frozenset[str]]:
         """What the driver of each device can ask of it."""

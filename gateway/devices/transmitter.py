@@ -46,8 +46,10 @@ class TransmitterDriver(RegisterDriver):
         self._outbox: Box = self.profile.outbox
         self._incoming = incoming
         self._seen = 0
-        self._emitted = b""
+        self.emitted = b""
         """The whole inbox as it was when its message was emitted."""
+        self.taken_before = b""
+        """The same of a message that was taken from here before this driver was there, and perhaps not acknowledged."""
         self._unconfirmed: tuple[int, DATA] | None = None
         """What was written under which sequence, until the device confirms it."""
         self._sent = 0
@@ -68,14 +70,18 @@ class TransmitterDriver(RegisterDriver):
     async def synchronise(self) -> None:
         """After (re)connecting: learn from the device what was taken on either side, so that nothing is done twice.
 
-        What was emitted here and is not acknowledged stays so; what was written and whose reply was lost was sent.
+        What was emitted here and is not acknowledged stays so, and so does what was taken before; what was written and whose
+        reply was lost was sent.
         """
         unit, inbox = self.config.address, self._inbox.at
         held = await self.client.read_registers(unit, "holding", inbox.address, inbox.count)
         inbox_ack = await self._word(self._inbox.ack.address)
         self._sent = await self._word(self._outbox.at.address)
         outbox_ack = await self._word(self._outbox.ack.address)
-        emitted = bool(self.to_acknowledge) and held.raw == self._emitted
+        if self.taken_before and held.raw == self.taken_before:
+            self.emitted, self.to_acknowledge = held.raw, held.registers[0]
+        self.taken_before = b""
+        emitted = bool(self.to_acknowledge) and held.raw == self.emitted
         self._seen = held.registers[0] if emitted else inbox_ack
         self.to_acknowledge = self._seen if self._seen != inbox_ack else 0
         self.outbox_free = self._sent == outbox_ack
@@ -112,7 +118,7 @@ class TransmitterDriver(RegisterDriver):
                 where=f"{self.config.where} {box.at}",
             )
         self._seen = self.to_acknowledge = sequence
-        self._emitted = reply.raw
+        self.emitted = reply.raw
         self.received += 1
         return [self._incoming(reply.raw[4 : 4 + length])]
 

@@ -28,6 +28,7 @@ from gateway.runtime.modbus_bus import ModbusBus
 from gateway.runtime.outputs import Output, OutputWriter
 from gateway.runtime.serve import ServeConfig, TagServer
 from gateway.runtime.tags import TagTable
+from gateway.runtime.taken import TakenFile
 from gateway.store.exchange_log import ExchangeLog
 
 PLC_GRACE_NS = 10 * NS_PER_S
@@ -89,6 +90,7 @@ class Gateway:
         audit: AuditLog,
         log: ExchangeLog,
         listen: Listen = TcpListener.open,
+        taken: TakenFile | None = None,
     ) -> None:
         self.config = config
         self.clock = clock
@@ -116,6 +118,7 @@ class Gateway:
                 allow_writes=config.allow_writes,
                 remote=config.remote,
                 lent=d.config.name in config.lent,
+                taken=taken,
             )
             for d in self.drivers.values()
             if isinstance(d, TransmitterDriver)

@@ -1,6 +1,7 @@
 """Between a transmitter's mailboxes and the control logic: acknowledge what was consumed, send when there is room.
 
-A mailbox is acknowledged only when the PLC has consumed its message, so a command survives a gateway that dies in between.
+A mailbox is acknowledged only when the PLC has consumed its message, so a command survives a gateway that dies in between. That
+it was consumed is kept before it is acknowledged, so that the successor of a gateway that died then does not hand it on again.
 A plant whose switch says `local` takes no commands: they are acknowledged, refused and on record. Mailboxes that are lent to a
 digital thread are its own: here nothing is read from them, and nothing written.
 """
@@ -17,6 +18,7 @@ from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.mailboxes import Mailboxes
 from gateway.runtime.modbus_bus import ModbusBus
+from gateway.runtime.taken import TakenFile
 
 RETRY_NS = 1000 * NS_PER_MS
 
@@ -33,8 +35,11 @@ class MailboxPump:
         allow_writes: bool,
         remote: bool,
         lent: bool = False,
+        taken: TakenFile | None = None,
     ) -> None:
         self.driver = driver
+        self._taken = taken or TakenFile(None)
+        driver.taken_before = self._taken.of(driver.config.name)
         self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=64)
         if not lent:
             driver.emitter.subscribe(self.inbox)
@@ -42,6 +47,7 @@ class MailboxPump:
         self.remote = remote
         """The plant's switch; it may be thrown at any time."""
         self._boxes = Mailboxes(driver, bus, self._ended)
+        self._bus = bus
         self._audit = audit
         self._allow_writes = allow_writes
         self._lent = lent
@@ -89,6 +95,7 @@ class MailboxPump:
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
         """Start the next exchange. `all_consumed` says that the PLC has consumed everything that it was given."""
+        self._keep(all_consumed)
         if now_ns < self._next_ns or not self._allow_writes or not self._boxes.ready:
             return
         if self.driver.to_acknowledge and all_consumed and not self.inbox.queue:
@@ -100,6 +107,16 @@ class MailboxPump:
             elif self._on_record("outbox", self.driver.consumer.queue[0].data.hex(), now_ns):
                 self._sending = 1
                 self._boxes.send(now_ns)
+
+    def _keep(self, all_consumed: bool) -> None:
+        """Whether the message that lies in the inbox was taken. Before the device is there nobody knows what lies in it."""
+        driver, name = self.driver, self.driver.config.name
+        with suppress(Unreachable):  # then it may come twice
+            if driver.to_acknowledge:
+                if all_consumed and not self.inbox.queue:
+                    self._taken.note(name, driver.emitted)
+            elif self._taken.of(name) and self._bus.online(driver):
+                self._taken.note(name, b"")
 
     def _on_record(self, tag: str, new: object, now_ns: int) -> bool:
         """Note the write before it happens; without a record it waits and is tried again."""

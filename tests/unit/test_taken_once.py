@@ -1,0 +1,174 @@
+"""A gateway that dies between taking a command and acknowledging it: its successor acknowledges, and hands nothing on twice."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+from gateway_rig import LAN, PROFILES, FieldBus, running_bus
+from support import eventually, run
+
+from emulators.modbus.unit import ModbusUnit
+from emulators.models.mailbox_modem import ModemPair
+from gateway.core.errors import Unreachable
+from gateway.core.profile import load_profile
+from gateway.core.values import COMMAND, RESPONSE
+from gateway.devices.config import DeviceConfig
+from gateway.devices.transmitter import TransmitterDriver
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.mailbox_pump import MailboxPump
+from gateway.runtime.modbus_bus import Job
+from gateway.runtime.tags import TagTable
+from gateway.runtime.taken import TakenFile
+from gateway.wallclock import WallClock
+
+PROFILE = load_profile(PROFILES / "modem-mailbox.yaml")
+POLL = {"inbox": 20}
+
+
+class Life:
+    """One life of a gateway's side of a modem. `taken`: what the control logic was handed and consumed."""
+
+    def __init__(self, pump: MailboxPump) -> None:
+        self.pump = pump
+        self.taken: list[bytes] = []
+
+    def consume(self) -> None:
+        self.taken += [item.data for item in self.pump.inbox.drain()]
+
+    async def offered(self) -> None:
+        """Something came, for the control logic."""
+        await eventually(lambda: bool(self.pump.inbox.queue))
+
+    async def acknowledged(self) -> None:
+        def all_is() -> bool:
+            self.tick()
+            return not self.pump.driver.to_acknowledge
+
+        await eventually(all_is)
+        self.tick()
+
+    def tick(self, consumed: bool = True) -> None:
+        self.pump.tick(WallClock().monotonic_ns(), consumed)
+
+
+@asynccontextmanager
+async def life(modems: ModemPair, folder: Path, *, writes: bool, file: TakenFile | None = None) -> AsyncIterator[Life]:
+    """`writes` False: it dies before it acknowledges anything."""
+    drivers: list[TransmitterDriver] = []
+
+    def make(tags: TagTable) -> list[TransmitterDriver]:
+        drivers.append(TransmitterDriver(DeviceConfig("modem", PROFILE, "bus", 1, poll=POLL), tags))
+        return drivers
+
+    clock = WallClock()
+    audit = AuditLog(folder / "audit.jsonl", clock)
+    try:
+        async with running_bus(make, FieldBus({1: ModbusUnit(modems.near)}), LAN) as r:  # type: ignore[arg-type]
+            kept = file or TakenFile(folder / "taken.json")
+            made = Life(MailboxPump(drivers[0], r.bus, audit, allow_writes=writes, remote=True, taken=kept))
+            await eventually(lambda: r.bus.online(drivers[0]))
+            yield made
+    finally:
+        audit.close()
+
+
+async def command(modems: ModemPair, payload: bytes) -> None:
+    """The far end sends it."""
+    drivers: list[TransmitterDriver] = []
+
+    def make(tags: TagTable) -> list[TransmitterDriver]:
+        drivers.append(TransmitterDriver(DeviceConfig("far", PROFILE, "bus", 1), tags, incoming=RESPONSE))
+        return drivers
+
+    async with running_bus(make, FieldBus({1: ModbusUnit(modems.far)}), LAN) as r:  # type: ignore[arg-type]
+        await eventually(lambda: r.bus.online(drivers[0]))
+        drivers[0].consumer.observe(COMMAND(payload))
+        done: list[object] = []
+        r.bus.submit(Job(drivers[0], drivers[0].send, done.append))
+        await eventually(lambda: done == [None])
+
+
+def modem_pair() -> ModemPair:
+    return ModemPair(PROFILE, bytes_per_s=1e6, latency_s=0.0, loss=0.0, seed=1)
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_command_that_was_consumed_is_not_handed_on_again(tmp_path: Path, kept: bool) -> None:
+    async def main() -> None:
+        modems = modem_pair()
+        await command(modems, b"\0\7")
+        async with life(modems, tmp_path, writes=False) as first:
+            await first.offered()
+            first.consume()
+            first.tick()
+            assert first.taken == [b"\0\7"]
+        if not kept:
+            (tmp_path / "taken.json").unlink()
+        async with life(modems, tmp_path, writes=True) as second:
+            if not kept:  # at least once is what there is without it
+                await second.offered()
+                second.consume()
+                assert second.taken == [b"\0\7"]
+            await second.acknowledged()
+            second.consume()
+            assert second.taken == ([] if kept else [b"\0\7"])
+            await command(modems, b"\0\7")  # the same again is another one
+            await second.offered()
+        assert TakenFile(tmp_path / "taken.json").of("modem") == b"", "what is acknowledged is forgotten"
+
+    run(main())
+
+
+def test_a_command_that_nobody_consumed_is_handed_on(tmp_path: Path) -> None:
+    async def main() -> None:
+        modems = modem_pair()
+        await command(modems, b"\0\7")
+        async with life(modems, tmp_path, writes=True) as first:
+            await first.offered()
+            first.tick()
+            first.consume()
+            first.tick(consumed=False)  # it was handed to the process image, and no program looked there yet
+            await asyncio.sleep(0)
+        async with life(modems, tmp_path, writes=True) as second:
+            await second.offered()
+
+    run(main())
+
+
+def test_what_was_taken_from_a_modem_that_began_anew_is_of_no_account(tmp_path: Path) -> None:
+    """Its first message has the number and the words of the first one before: it is another command."""
+
+    async def main() -> None:
+        before, after = modem_pair(), modem_pair()
+        await command(before, b"\0\7")
+        async with life(before, tmp_path, writes=False) as first:
+            await first.offered()
+            first.consume()
+            first.tick()
+        assert TakenFile(tmp_path / "taken.json").of("modem")
+        async with life(after, tmp_path, writes=True) as second:
+            second.tick()
+            await command(after, b"\0\7")
+            await second.offered()
+
+    run(main())
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"modem": 3}', '{"modem": "xy"}', "\x00"])
+def test_a_file_that_is_none_of_ours_is_as_good_as_none(tmp_path: Path, text: str) -> None:
+    (tmp_path / "taken.json").write_text(text)
+    file = TakenFile(tmp_path / "taken.json")
+    assert file.of("modem") == b""
+    file.note("modem", b"\1\2")
+    assert TakenFile(tmp_path / "taken.json").of("modem") == b"\1\2"
+    assert (tmp_path / "taken.json").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_disk_that_refuses_is_said(tmp_path: Path) -> None:
+    file = TakenFile(tmp_path / "nowhere" / "taken.json")
+    with pytest.raises(Unreachable, match="cannot write what was taken"):
+        file.note("modem", b"\1")

@@ -49,6 +49,8 @@ class SqliteKnowledge:
         """Origins of others of which the store says whose they are."""
         self._names: dict[str, int] = {}
         self._texts: dict[int, str] = {}
+        self._unsure = False
+        """Whether the numbers of names and origins have to be looked up again before anything is written under them."""
 
     @classmethod
     async def open(cls, path: Path, *, max_bytes: int = 0, offload: Offload | None = None) -> SqliteKnowledge:
@@ -82,6 +84,7 @@ class SqliteKnowledge:
         self._origins = dict(self._db.execute("SELECT name, id FROM origin").fetchall())
         self._names = dict(self._db.execute("SELECT text, id FROM event_name").fetchall())
         self._texts = {i: text for text, i in self._names.items()}
+        self._unsure = False
 
     async def _in_thread(self, work: Work) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._thread, work)
@@ -89,11 +92,14 @@ class SqliteKnowledge:
     async def _do(self, work: Callable[[], T]) -> T:
         def translated() -> T:
             try:
+                if self._unsure:
+                    self._learn()
                 return work()
             except Exception as e:
+                # What was just added may not be there. SQLite itself takes a transaction back when the disk is full.
+                self._unsure = True
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
-                    self._learn()  # what was just added is not there
                 raise self._translated(e) from e
 
         done: T = await self._offload(translated)
@@ -250,9 +256,11 @@ class SqliteKnowledge:
 
     def _text(self, number: int) -> str:
         """A name that another process added."""
-        (text,) = self._db.execute("SELECT text FROM event_name WHERE id = ?", (number,)).fetchone()
-        self._texts[number] = text
-        return str(text)
+        row = self._db.execute("SELECT text FROM event_name WHERE id = ?", (number,)).fetchone()
+        if row is None:
+            raise FileInvalid(f"damaged: there are events of name {number}, and no such name", path=str(self.path))
+        self._texts[number] = str(row[0])
+        return str(row[0])
 
     # -- bounds -----------------------------------------------------------------------------------------------------------
 

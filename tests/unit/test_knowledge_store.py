@@ -379,6 +379,41 @@ def test_a_store_at_its_bound_says_so_keeps_what_it_has_and_goes_on_when_there_i
     run(main())
 
 
+def test_names_that_came_first_when_the_disk_was_full_are_there_when_it_is_not(tmp_path: Path) -> None:
+    """SQLite itself takes back what did not fit, the name of a tag or of an origin with it: nobody may think that it is there."""
+
+    async def main() -> None:
+        store = await SqliteKnowledge.open(tmp_path / "k.db", max_bytes=64 * 4096, offload=in_place)
+        origin = await own(store)
+        known = [Event(0, 1, Kind.VALUE, "known", 1.5)] * 400
+        fresh = [Event(0, 1, Kind.VALUE, "fresh", 2.5), Event(0, 1, Kind.VALUE, "later", 3.5)]
+
+        async def until_full() -> None:
+            while True:
+                await store.append(origin, known)
+
+        with pytest.raises(StoreFull):
+            await until_full()
+        for _ in range(3):  # each alone is too much
+            with pytest.raises(StoreFull):
+                await store.append(origin, [*fresh, *known])
+            with pytest.raises(StoreFull):
+                await store.keep(
+                    "plant:other", [e._replace(sequence=n) for n, e in enumerate(known, 1)], system="other"
+                )
+        await store.forget(origin, 1000)
+        last = await store.append(origin, fresh)
+        await store.keep("plant:other", [fresh[1]._replace(sequence=1)], system="other")
+        await store.aclose()
+        store = await SqliteKnowledge.open(tmp_path / "k.db", offload=in_place)
+        assert [e.name for e in await store.read(origin, last - 1, 9)] == ["fresh", "later"]
+        assert await store.origins("other") == {"plant:other": False}
+        assert [e.name for e in await store.read("plant:other", 1, 9)] == ["later"]
+        await store.aclose()
+
+    run(main())
+
+
 def test_nothing_that_was_acknowledged_is_lost_when_the_process_is_killed(tmp_path: Path) -> None:
     """It says each number when `append` has returned; killed at once, at least so many are there, whole and without holes."""
     program = (

@@ -297,9 +297,20 @@ def test_prose_8_a_prototype_can_serve_as_the_digital_twin_itself() -> None:
 )
 def test_prose_9_virtual_context_is_recorded_data_or_a_simulation(name: str) -> None:
     system = load_system(name)
-    for device in load_prototype(system).devices.values():
+    prototype = load_prototype(system)
+    for device in prototype.devices.values():
         form = device.form
         assert [form.recording, form.simulation, form.model].count(None) == 2, device.name
+        if form.recording is not None:
+            assert device.recording is not None
+            with RecordingReader(device.recording) as recording:
+                held = recording.rows() if recording.header.kind == "signals" else recording.exchanges()
+                assert next(iter(held), None) is not None, "there is something in it"
+        elif form.simulation is not None:
+            steps = prototype.form.simulations[form.simulation]
+            assert steps.formulas or steps.python, "it computes something"
+        else:
+            assert form.model == "mailbox" or device.profile.protocol, "what its own profile says"
 
 
 def test_prose_9_a_recording_from_the_field_goes_back_into_CI(tmp_path: Path) -> None:

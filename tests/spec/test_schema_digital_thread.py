@@ -137,7 +137,8 @@ def test_DigitalThread_is_one_connection_each_way(tmp_path: Path) -> None:
             there, back = PTtoDTConnection(near, [], one, CLOCK), DTtoPTConnection(far, [], two, CLOCK)
             thread = DigitalThread(there, back)
             assert (thread.pt_data, thread.dt_data) == (there, back)
-            with pytest.raises(Bug):
-                DigitalThread(back, there)  # type: ignore[arg-type]
+            for wrong in ((back, there), (there, there), (back, back)):
+                with pytest.raises(Bug, match="one connection each way"):
+                    DigitalThread(*wrong)  # type: ignore[arg-type]
 
     run(main())

@@ -252,12 +252,22 @@ def test_Execute_of_a_twin_that_ends_sends_nothing_of_what_it_still_asks_about()
 
 
 def test_DigitalTwin_is_the_shadow_plus_plan_and_execute_and_the_way_back() -> None:
-    twin = Rig().twin
+    rig, shadow = Rig(), DigitalShadow(ReceivingEnd("x"), Hands(), declared=())
+    twin = rig.twin
     assert isinstance(twin, DigitalShadow)
     assert [p.name for p in twin.processes] == ["monitor", "analyze", "plan", "execute"]
+    assert [p.name for p in shadow.processes] == ["monitor", "analyze"]
+    assert not any(hasattr(shadow, name) for name in ("plan", "execute")), "a shadow has no way back"
+    twin.plan.emitter.emit(encode_period(7))
+    twin.execute.execute()
+    (command,) = rig.sent.drain()
     operator = Operator("operator", Hands())
-    assert not hasattr(DigitalShadow(ReceivingEnd("x"), Hands(), declared=()), "execute"), "a shadow has no way back"
     assert isinstance(operator, DTDigitalThreadProcess)
+    operator.command(command)
+    (event,) = operator.collect()
+    assert (event.kind, event.value) == (Kind.COMMAND, encode_period(7).data), (
+        "what Plan emits is what the thread is given"
+    )
 
 
 def test_DigitalTwin_changes_of_the_model_reach_the_plant_and_those_of_the_plant_the_model_without_a_user() -> None:

@@ -40,7 +40,8 @@ class Objects:
 
     def whole(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """The live value of an integer object."""
-        return int(self.number(index, subindex, default))
+        number = self._data.decoded((index, subindex))
+        return int(default if number is None else number)
 
     def factory(self, index: int, subindex: int = 0, default: Number = 0) -> Number:
         """The value that the device left the factory with."""

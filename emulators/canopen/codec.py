@@ -21,6 +21,8 @@ REAL64 = 0x11
 _SIGNED = {0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
 _UNSIGNED = {0x05: 8, 0x06: 16, 0x07: 32, 0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
 _REAL = {REAL32: struct.Struct("<f"), REAL64: struct.Struct("<d")}
+_LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
+"""What `struct` calls signed integers of so many bytes; in capitals the others."""
 _TIME_BYTES = {0x0C: 6, 0x0D: 6}
 """TIME_OF_DAY and TIME_DIFFERENCE: 48 bits on the wire, opaque here."""
 
@@ -83,14 +85,17 @@ def held_encoder(data_type: int) -> Callable[[int | float], bytes]:
     if bounds is None:
         return partial(encode, data_type)
     (low, high), size, signed = bounds, _INTEGER_BYTES[data_type], data_type in _SIGNED
+    letter = _LETTERS.get(size)
+    pack: Callable[[int], bytes] = partial(int.to_bytes, length=size, byteorder="little", signed=signed)
+    if letter is not None:
+        pack = struct.Struct("<" + (letter if signed else letter.upper())).pack
 
     def encode_held(number: int | float) -> bytes:
-        if number.__class__ is not int:
-            if not math.isfinite(number):
-                return encode(data_type, 0 if math.isnan(number) else bounds[number > 0])
-            number = round(number)
-        whole = low if number < low else high if number > high else number
-        return whole.to_bytes(size, "little", signed=signed)
+        try:
+            whole = round(number)
+        except (OverflowError, ValueError):  # without bounds, or no number
+            whole = 0 if math.isnan(number) else bounds[number > 0]
+        return pack(low if whole < low else high if whole > high else whole)
 
     return encode_held
 

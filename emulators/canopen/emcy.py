@@ -65,6 +65,10 @@ class Emergency(Service):
             self._tell_active()
             self._emit(bytes([0, 0, self._update_register(), 0, 0, 0, 0, 0]), now_ns)
 
+    @property
+    def waits(self) -> bool:
+        return self._core.data.has(0x1014)
+
     def owns(self, index: int) -> bool:
         return index in (0x1003, 0x1014, 0x1015)
 

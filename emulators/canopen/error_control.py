@@ -42,6 +42,10 @@ class HeartbeatProducer(Service):
     def __init__(self, core: Core) -> None:
         self._core = core
 
+    @property
+    def waits(self) -> bool:
+        return self._core.data.has(0x1017)
+
     def owns(self, index: int) -> bool:
         return index == 0x1017
 
@@ -90,6 +94,10 @@ class HeartbeatConsumer(Service):
     def lost(self) -> tuple[int, ...]:
         """Node ids whose heartbeat is missing."""
         return tuple(sorted(node for node, watched in self._watched.items() if watched.lost))
+
+    @property
+    def waits(self) -> bool:
+        return bool(self._subs())
 
     def owns(self, index: int) -> bool:
         return index == 0x1016

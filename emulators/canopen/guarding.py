@@ -27,6 +27,10 @@ class NodeGuarding(Service):
         self._toggle = 0
         self._guarded = False
 
+    @property
+    def waits(self) -> bool:
+        return self._core.data.has(0x100C)
+
     def owns(self, index: int) -> bool:
         return index in (0x100C, 0x100D, 0x1017)
 

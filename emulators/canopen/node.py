@@ -140,7 +140,7 @@ class CanopenNode:
         view.add(self._sdo)
         self._services = (self._sdo, *services)
         # Most services never wait for a time; those that do are asked with every frame and every tick.
-        self._timed = tuple(s for s in self._services if type(s).tick is not Service.tick)
+        self._timed = tuple(s for s in self._services if type(s).tick is not Service.tick and s.waits)
         self._wakers = tuple(s for s in self._timed if s is not self._behaviour)
         if self._behaviour is not None:
             self._behaviour.connect(core, self._emergency, self._tpdos.changed)

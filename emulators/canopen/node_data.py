@@ -109,7 +109,8 @@ class NodeData:
             self._sized(key, raw)
         self._live[key] = bytes(raw)
         self._decoded.pop(key, None)
-        self.version += index < 0x2000
+        if index < 0x2000:
+            self.version += 1
         return True
 
     def put_number(self, index: int, subindex: int, value: int) -> None:

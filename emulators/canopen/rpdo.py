@@ -54,6 +54,10 @@ class Rpdos(Service):
         self._wrote = wrote
         self._rpdos = [_Rpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
+    @property
+    def waits(self) -> bool:
+        return bool(self._rpdos)
+
     def owns(self, index: int) -> bool:
         return _FIRST <= index < _FIRST + 2 * MAPPING_OFFSET
 

@@ -185,6 +185,11 @@ class Service:
     """The hooks; each does nothing by default. `check_*` raise `SdoAborted` to refuse."""
 
     @property
+    def waits(self) -> bool:
+        """Whether it can ever be due: a data sheet without its objects makes that impossible, for good."""
+        return True
+
+    @property
     def due_ns(self) -> int:
         """When `tick` has something to do next. Asked for after all that happens: a service that waits for one time keeps it
         as an attribute of this name."""

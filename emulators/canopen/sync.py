@@ -34,6 +34,10 @@ class Sync(Service):
         self._counter = 1
         self._was_stopped = False
 
+    @property
+    def waits(self) -> bool:
+        return self._core.data.has(CYCLE)
+
     def owns(self, index: int) -> bool:
         return index in (COB_ID, CYCLE, WINDOW, OVERFLOW)
 

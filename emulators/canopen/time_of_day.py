@@ -64,6 +64,10 @@ class TimeService(Service):
         self._core.note(now_ns, "time", COB_ID, 0, time.to_bytes())
         self._schedule(now_ns)
 
+    @property
+    def waits(self) -> bool:
+        return bool(self._period_ns)
+
     def owns(self, index: int) -> bool:
         return index == COB_ID
 

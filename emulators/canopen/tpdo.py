@@ -58,6 +58,10 @@ class Tpdos(Service):
         """The version of the values that `_event_ns` follows from; -1 once something here changed."""
         self._tpdos = [_Tpdo(PdoParameters(core.data, index)) for index in pdo_indices(core.data, _FIRST)]
 
+    @property
+    def waits(self) -> bool:
+        return bool(self._tpdos)
+
     def owns(self, index: int) -> bool:
         return _FIRST <= index < _FIRST + 2 * MAPPING_OFFSET
 

@@ -74,6 +74,7 @@ class BusRunner:
         monitored: bool = True,
     ) -> None:
         self._loop = asyncio.get_running_loop()
+        self._time = self._loop.time
         self._bus = CanBus(
             bitrate, instant=not paced, queue_frames=queue_frames, max_nodes=max_nodes, monitored=monitored
         )
@@ -93,7 +94,7 @@ class BusRunner:
 
     def now_ns(self) -> int:
         """The loop's clock in ns."""
-        return int(self._loop.time() * NS_PER_S)
+        return int(self._time() * NS_PER_S)
 
     def join(self, port: BusPort, name: str = "", *, listen_only: bool = False) -> int:
         """The port's node number. Raises `EndpointBusy` when the bus is full, or why the bus closed."""
@@ -162,11 +163,14 @@ class BusRunner:
             port.on_bus_closed(error)
 
     def _schedule(self, now_ns: int | None = None) -> None:
+        news = self._bus.has_news
+        due_ns = None if news else self._bus.next_event_ns()
+        if (due_ns is None and not news) or self._closed is not None:
+            return
         if now_ns is None:
             now_ns = self.now_ns()
-        due_ns = now_ns if self._bus.has_news else self._bus.next_event_ns()
-        if due_ns is None or self._closed is not None:
-            return
+        if due_ns is None:
+            due_ns = now_ns
         if self._timer is not None:
             if self._due_ns <= due_ns:
                 return  # it will look again then

@@ -213,7 +213,8 @@ class Attempts:
                 self.change(number, end_ns, node.faults.sent)
             if not node.queue:
                 self.stop_waiting(number)
-                self.forget_if_done(number)
+                if node.left:
+                    self.forget_if_done(number)
 
     # -- error states ---------------------------------------------------------------------------------------------
 

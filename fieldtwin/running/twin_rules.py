@@ -6,7 +6,7 @@ what_if: {horizon: 30min, require: ["quality(ctd.pressure) == 'good'"]}    # ask
 rules:
   - {when: outside, of: ctd.pressure, period_s: 1}      # an event: sample every second
   - {when: inside, of: ctd.pressure, period_s: 60}
-  - {when: stale, period_s: 0, what_if: false}          # of anything; nobody is asked
+  - {when: stale, of: ctd.pressure, period_s: 60, what_if: false}      # nobody is asked
 ```
 """
 

@@ -145,6 +145,9 @@ def test_DigitalTwin_begins_again_where_it_ended() -> None:
     rig.twin.recall([status(1), value(200.0)])
     assert rig.give(value(201.0)) == [], "the model has that period"
     assert rig.twin.digital_model.variables["ctd.pressure"].value == 201.0
+    rig.twin.recall([status(60), value(200.0)])
+    assert rig.give(value(201.0)) == [1], "it died between what it found and what it would have commanded"
+    assert [(v.finding, v.again) for v in rig.twin.verdicts.drain()][-1] == ("outside", True)
 
 
 @given(x=PERIODS, before=PERIODS)

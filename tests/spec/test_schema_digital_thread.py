@@ -49,8 +49,9 @@ async def end(folder: Path, name: str) -> AsyncIterator[tuple[ThreadEnd, Knowled
 def test_DigitalThreadProcess_is_of_one_twin_or_the_other() -> None:
     with pytest.raises(Bug):
         DigitalThreadProcess("neither", CLOCK)
-    for kind in (PTDigitalThreadProcess, DTDigitalThreadProcess):
+    for kind, side in ((PTDigitalThreadProcess, "physical"), (DTDigitalThreadProcess, "digital")):
         assert issubclass(kind, DigitalThreadProcess)
+        assert kind.side == side
         assert not kind("new", CLOCK).knowledge, "empty after Init"
 
 

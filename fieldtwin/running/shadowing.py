@@ -80,6 +80,8 @@ class Shadowing:
         self.on_trouble: Callable[[str, str], None] = lambda where, text: None
         """Told what is wrong with the thread or the store, and with an empty text when that is over."""
         self._troubles: dict[str, str] = {}
+        self._recalled = ""
+        """Whose log it began with, of those in the store."""
         self._end: ThreadEnd | None = None
 
     def _make(self, system: System) -> DigitalShadow:
@@ -129,18 +131,21 @@ class Shadowing:
             await store.aclose()
 
     async def _recall(self, store: KnowledgeStore) -> None:
-        """Begin with what was known of this plant when the shadow ended, if it was there before."""
-        newest: dict[tuple[int, str], Event] = {}
-
-        def take(events: Sequence[Event]) -> None:
-            for event in events:
-                key = (event.kind, event.name)
-                if event.kind in ABOUT_THE_PLANT and (key not in newest or newest[key].t_ms <= event.t_ms):
-                    newest[key] = event
-
+        """Begin with what was known of this plant when the shadow ended, if it was there before: by the log that tells the
+        newest, and by no other."""
+        newest_ms = 0
+        last: dict[tuple[int, str], Event] = {}
         for origin in await store.origins(self._system.name):
+            told: dict[tuple[int, str], Event] = {}
+
+            def take(events: Sequence[Event], told: dict[tuple[int, str], Event] = told) -> None:
+                told.update({(e.kind, e.name): e for e in events if e.kind in ABOUT_THE_PLANT})
+
             await recall(store, origin, take)
-        self.shadow.recall(newest.values())
+            latest_ms = max((event.t_ms for event in told.values()), default=0)
+            if latest_ms > newest_ms:
+                newest_ms, last, self._recalled = latest_ms, told, origin
+        self.shadow.recall(last.values())
 
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"ready": bool(self.origins) and self._end is not None and self._end.connected}

@@ -106,7 +106,7 @@ class Twinning(Shadowing):
 
     async def _beside(self, nursery: Nursery, store: KnowledgeStore) -> None:
         if self._asking is not None:
-            await self._asking.recall(store, list(await store.origins(self._system.name)))
+            await self._asking.recall(store, [self._recalled] if self._recalled else [])
             nursery.start(self._asking.run(), "what if")
 
     def _step(self, writer: KnowledgeWriter) -> None:

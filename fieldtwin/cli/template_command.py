@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich import box
 from rich.markup import escape
-from rich.table import Table
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import json_option, profiles_option
@@ -152,7 +150,8 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
         talk.print("its control logic was not looked at")
     if not same:
         there = f"{manifest.software.version}, modules {manifest.software.modules_sha256[:12]}"
-        talk.print(f"it was packed by other software: {there}; here is {__version__}, modules {modules_hash()[:12]}")
+        here_is = f"{__version__}, modules {modules_hash()[:12]}"
+        talk.print(f"it was packed by other software: {there}; here is {here_is}", soft_wrap=True)
     return 0
 
 
@@ -197,12 +196,10 @@ def _style(line: str) -> str:
 
 def _print_files(manifest: Manifest) -> None:
     data.print(f"{manifest.system}: template {manifest.id[:16]}, fieldtwin {manifest.software.version}", soft_wrap=True)
-    table = Table(box=box.SIMPLE, pad_edge=False)
-    for name in ("kind", "file", "bytes", "SHA-256"):
-        table.add_column(name, justify="right" if name == "bytes" else "left", no_wrap=name != "file", overflow="fold")
-    for file in manifest.files:
-        table.add_row(file.document or file.kind, escape(file.path), f"{file.bytes:,}", file.sha256[:12])
-    data.print(table)
+    data.print(f"  {'SHA-256':12}  {'bytes':>13}  {'kind':17}  file")
+    for file in manifest.files:  # the path comes last and whole: somebody copies it
+        words = f"  {file.sha256[:12]}  {file.bytes:13,}  {file.document or file.kind:17}  {escape(file.path)}"
+        data.print(words, soft_wrap=True, highlight=False)
 
 
 def _described(manifest: Manifest) -> dict[str, Any]:

@@ -32,8 +32,9 @@ POLL = {"inbox": 20}
 class Life:
     """One life of a gateway's side of a modem. `taken`: what the control logic was handed and consumed."""
 
-    def __init__(self, pump: MailboxPump) -> None:
+    def __init__(self, pump: MailboxPump, field: FieldBus) -> None:
         self.pump = pump
+        self.field = field
         self.taken: list[bytes] = []
 
     def consume(self) -> None:
@@ -69,7 +70,7 @@ async def life(modems: ModemPair, folder: Path, *, writes: bool, file: TakenFile
     try:
         async with running_bus(make, FieldBus({1: ModbusUnit(modems.near)}), LAN) as r:  # type: ignore[arg-type]
             kept = file or TakenFile(folder / "taken.json")
-            made = Life(MailboxPump(drivers[0], r.bus, audit, allow_writes=writes, remote=True, taken=kept))
+            made = Life(MailboxPump(drivers[0], r.bus, audit, allow_writes=writes, remote=True, taken=kept), r.field)
             await eventually(lambda: r.bus.online(drivers[0]))
             yield made
     finally:
@@ -152,7 +153,9 @@ def test_what_was_taken_from_a_modem_that_began_anew_is_of_no_account(tmp_path: 
         assert TakenFile(tmp_path / "taken.json").of("modem")
         async with life(after, tmp_path, writes=True) as second:
             second.tick()
+            second.field.unplug()  # it comes while nobody looks
             await command(after, b"\0\7")
+            second.field.plugged = True
             await second.offered()
 
     run(main())

@@ -210,8 +210,10 @@ class MapBank(RegisterBank):
 
     def peek(self, table: Table, address: int) -> int:
         """The device's own view of a cell, whatever its access. Raises `IllegalAddress` where there is none."""
-        self._require(self._declared, table, range(address, address + 1), "read")
-        return self._cells[table][address]
+        try:
+            return self._cells[table][address]
+        except KeyError:
+            raise IllegalAddress("no cell that can be read", where=f"{table}:{address}") from None
 
     def poke(self, table: Table, address: int, *values: int) -> None:
         """The device sets its own cells, read-only ones included. Raises `IllegalAddress` or `IllegalValue`."""

@@ -118,7 +118,8 @@ class MailboxModem(RegisterBank):
         sequence, length = self._cells.peek("holding", at.address), self._cells.peek("holding", at.address + 1)
         if sequence == self._accepted:
             return  # the same message again: its writer did not see our reply
-        words = [self._cells.peek("holding", a) for a in range(at.address + 2, at.end)]
+        first = at.address + 2
+        words = [self._cells.peek("holding", a) for a in range(first, first + (length + 1) // 2)]
         self._accepted = sequence
         self._pending = b"".join(w.to_bytes(2) for w in words)[:length]
 

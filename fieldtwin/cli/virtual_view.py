@@ -144,7 +144,8 @@ def _shrink(options: Options, failed: SeedResult) -> None:
         return
     path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
     title = f"what failed with seed {failed.seed}"
-    text = as_scenario(title, options.system, failed.seed, options.duration_s, faults, result.errors)
+    scripted = options.scripted
+    text = as_scenario(title, options.system, failed.seed, options.duration_s, faults, result.errors, scripted)
     write_text(path, text)
     data.print(f"seed {failed.seed} takes {len(faults)} of its faults: {path}", soft_wrap=True, markup=False)
 

@@ -32,22 +32,33 @@ def smallest(items: Sequence[T], fails: Callable[[Sequence[T]], bool], most_runs
 
 
 def as_scenario(
-    title: str, system: str, seed: int, duration_s: float, faults: Sequence[dict[str, Any]], why: Sequence[str]
+    title: str,
+    system: str,
+    seed: int,
+    duration_s: float,
+    faults: Sequence[dict[str, Any]],
+    why: Sequence[str],
+    commands: Sequence[tuple[float, int]] = (),
 ) -> str:
-    """The faults as a scenario file: put in, lived through, and all well again behind them."""
+    """The faults as a scenario file: put in, lived through, and judged as the run was. `commands`: when (s) the far end commanded
+    which period."""
     lines = [
         "# Shrunk from a run that failed:",
         *(f"#   {line}" for line in why),
         f"scenario: {_quoted(title)}",
         f"system: {_quoted(system)}",
         f"seed: {seed}",
-        "needs: [inject_fault]",
+        "judge: run",
         "steps:",
     ]
     for fault in faults:
         inside = ", ".join(f"{key}: {_quoted(value)}" for key, value in fault.items())
         lines.append(f"  - fault: {{{inside}}}")
-    lines.append(f"  - pause: {duration_s:g}s")
+    now_s = 0.0
+    for at_s, period_s in sorted(commands):
+        lines += [f"  - pause: {at_s - now_s:g}s", f"  - send: {{period_s: {period_s}}}"]
+        now_s = at_s
+    lines.append(f"  - pause: {duration_s - now_s:g}s")
     return "\n".join(lines) + "\n"
 
 

@@ -97,6 +97,7 @@ class VirtualBench(Started):
             Can.SEE_WIRE,
             Can.SEE_HELD,
             Can.EXACT_TIME,
+            Can.JUDGE_RUN,
         }
     )
 

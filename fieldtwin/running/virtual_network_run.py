@@ -39,6 +39,11 @@ class VirtualNetworkOptions:
         """The run of these options."""
         return VirtualNetworkRun(self)
 
+    @property
+    def scripted(self) -> list[tuple[float, int]]:
+        """When (s) the far end commands which period."""
+        return [(one.at_s, one.period_s) for one in self.commands]
+
 
 class VirtualNetworkRun(DrivenRun):
     """One run. `summary()` afterwards."""

@@ -60,6 +60,11 @@ class VirtualOptions:
     prototype: bool = True
     field_host: str = ""
 
+    @property
+    def scripted(self) -> list[tuple[float, int]]:
+        """When (s) the far end commands which period."""
+        return [(one.at_s, one.period_s) for one in (script(self.commands, self.duration_s) if self.commands else ())]
+
     def make(self) -> VirtualRun:
         """The run of these options."""
         return VirtualRun(self)

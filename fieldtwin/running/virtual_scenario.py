@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from emulators.virtual.seal import sealed
 from fieldtwin.report.coverage import Collector
 from fieldtwin.report.machines import machines_of
 from fieldtwin.report.model import ScenarioResult, Verdict
+from fieldtwin.running.run_judge import RunJudge
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.scenarios.about import result_of
@@ -19,6 +21,7 @@ from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner
 from fieldtwin.scenarios.trace import Trace, open_sink
 from gateway.core.errors import FieldtwinError
+from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 from twin.prototype_file import load_prototype
 
@@ -28,6 +31,7 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
     prototype = load_prototype(scenario.system, prototype_of(scenario)) if scenario.network is None else None
     own = prototype.seed if prototype is not None else scenario.network.seed if scenario.network is not None else 0
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else own
+    judge = RunJudge(scenario, prototype) if scenario.form.judge is not None else None
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
     loop = VirtualLoop()
@@ -41,12 +45,12 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
         async def main() -> ScenarioResult:
             if scenario.network is not None:
                 async with VirtualNetwork(scenario.network, loop, Path(folder), trace, seed=chosen) as whole:
-                    return await Runner(scenario, whole.bench).run()
+                    return await _judged(scenario, Runner(scenario, whole.bench), judge, whole.systems)
             assert prototype is not None
             async with VirtualBench(
                 scenario.system, prototype, loop, Path(folder), trace, seed=chosen, probes=scenario.probes
             ) as bench:
-                return await Runner(scenario, bench).run()
+                return await _judged(scenario, Runner(scenario, bench), judge, {"": bench})
 
         try:
             with sealed():
@@ -65,6 +69,19 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),
     )
+
+
+async def _judged(
+    scenario: Scenario, runner: Runner, judge: RunJudge | None, benches: Mapping[str, VirtualBench]
+) -> ScenarioResult:
+    """The scenario, and besides it what a run is judged by, if it says so."""
+    if judge is None:
+        return await runner.run()
+    judge.attach(benches)
+    async with Nursery() as nursery:
+        nursery.start(judge.watch(), "judge")
+        result = await runner.run()
+    return await judge.finish(result)
 
 
 def reproduce(scenario: Scenario, *more: str) -> str:

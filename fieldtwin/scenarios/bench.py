@@ -26,6 +26,8 @@ class Can(Enum):
     EXACT_TIME = "exact_time"
     """Lateness of the host never shows."""
     PROBE = "probe"
+    JUDGE_RUN = "judge_run"
+    """What a run is judged by (`judge: run`): every value that was published as good is compared with what its device held."""
 
 
 @dataclass(frozen=True, slots=True)

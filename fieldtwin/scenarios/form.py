@@ -191,6 +191,8 @@ def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
     asked = [Can(need) for need in form.needs]
     if form.probes:
         asked.append(Can.PROBE)
+    if form.judge is not None:
+        asked.append(Can.JUDGE_RUN)
     if any(isinstance(one, WireForm) for one in form.never) or any(one.wire is not None for one in form.rate):
         asked.append(Can.SEE_WIRE)
     asked += [need for step in form.steps for need in needs_of(step)]

@@ -356,7 +356,7 @@ class Runner:
     def _judges(self) -> bool:
         """Whether anything in it could have failed."""
         form = self.scenario.form
-        whole = (form.always, form.never, form.within, form.rate, form.cycle)
+        whole = (form.always, form.never, form.within, form.rate, form.cycle, form.judge)
         return any(whole) or any(step.expect is not None or step.wait is not None for step in form.steps)
 
     def _on_event(self, event: Event) -> None:

@@ -125,6 +125,8 @@ class ScenarioForm(_Form):
     within: list[Within] = []
     rate: list[Rate] = []
     cycle: list[Cycle] = []
+    judge: Literal["run"] | None = None
+    """Besides, by what a run in virtual time is judged by."""
     probes: dict[str, ProbeForm] = {}
     steps: list[Step] = Field(min_length=1, max_length=10_000)
 

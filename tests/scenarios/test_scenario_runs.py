@@ -188,6 +188,21 @@ def test_what_expects_nothing_has_not_passed(tmp_path: Path) -> None:
     assert "expects nothing" in result.reason
 
 
+BITS = "  - fault: {id: bits, name: corrupt-bits, device: modem, function: 3, from: 1s, until: 3s}\n"
+"""Nobody can notice them: Modbus TCP has no check sum."""
+
+
+@pytest.mark.parametrize(("steps", "verdict"), [("", Verdict.PASSED), (BITS, Verdict.FAILED)])
+def test_a_scenario_can_be_judged_as_a_run_is(tmp_path: Path, steps: str, verdict: Verdict) -> None:
+    result = run(tmp_path, f"{steps}  - send: {{period_s: 1}}\n  - pause: 12s\n", "judge: run\n")
+    assert result.verdict is verdict, result.reason
+    check = result.checks[-1]
+    assert (check.number, check.verdict, check.where) == ("judge", verdict, f"{tmp_path / 'x.scenario.yaml'}:3")
+    if verdict is Verdict.FAILED:
+        assert "were never held by their device" in result.reason
+        assert "modem." in check.got
+
+
 def test_a_time_that_is_none_is_named_where_it_stands(tmp_path: Path) -> None:
     with pytest.raises(FileInvalid, match="a time") as e:
         load_scenario(written(tmp_path, "  - expect: {tag: ctd.pressure, quality: bad, within: 3 sec}\n"))

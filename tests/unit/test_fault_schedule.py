@@ -57,7 +57,10 @@ def test_it_ends_after_so_many_runs() -> None:
 
 def test_a_schedule_reads_as_a_scenario_again() -> None:
     fault = {"id": "f1", "name": "silence", "device": "ctd", "from": 1.5, "until": 3.0, "probability": 0.5}
-    file = parse(as_scenario('it "fails"', "observatory.yaml", 7, 60.0, [fault], ["a wrong value"]), "x.yaml")
+    commands = [(6.0, 1), (45.0, -1)]
+    file = parse(as_scenario('it "fails"', "observatory.yaml", 7, 60.0, [fault], ["a wrong value"], commands), "x.yaml")
     assert file.data["scenario"] == 'it "fails"'
-    assert file.data["steps"] == [{"fault": fault}, {"pause": "60s"}]
+    assert file.data["judge"] == "run"
+    sent = [{"pause": "6s"}, {"send": {"period_s": 1}}, {"pause": "39s"}, {"send": {"period_s": -1}}, {"pause": "15s"}]
+    assert file.data["steps"] == [{"fault": fault}, *sent]
     assert parse_fault(file.data["steps"][0]["fault"]).until_s == 3.0

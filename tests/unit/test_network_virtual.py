@@ -132,6 +132,9 @@ def test_what_a_failing_seed_takes_is_left_and_is_a_scenario_of_the_network(
     assert "published values were never held by their device" in result.stdout
     scenario = load_scenario(tmp_path / "ocean_network-seed1.scenario.yaml")
     assert [step.fault["id"] for step in scenario.form.steps if step.fault] == ["bits"]
+    again = run_virtual(scenario)
+    assert again.verdict is Verdict.FAILED
+    assert "published values were never held by their device" in again.reason
 
 
 def test_faults_of_a_system_and_of_the_water_are_put_in_where_they_are_aimed(tmp_path: Path) -> None:

@@ -1,0 +1,81 @@
+"""`judge: run` of a scenario in virtual time: what `fieldtwin run --virtual` is judged by, besides what the scenario expects.
+
+Every value that was published as good is compared with what its device held inside its age; no exchange may be lost, no scan
+stopped; and where every fault was over for a minute, all must be well again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
+from fieldtwin.running.driven import PIECE_S
+from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from fieldtwin.scenarios.form import Scenario
+from gateway.core.clock import NS_PER_S
+from twin.network_faults import placed_all
+from twin.prototype_file import Prototype
+
+MOST_TOLD = 5
+TITLE = "what a run in virtual time is judged by"
+
+
+class _Judged(VirtualRun):
+    disturbed = True
+    """What a program should do, the scenario says."""
+
+
+class RunJudge:
+    """`attach`, then `watch` in a task of its own, and `finish` when the scenario is over."""
+
+    def __init__(self, scenario: Scenario, prototype: Prototype | None) -> None:
+        faults = tuple(
+            {"id": f"step {n}", **step.fault} for n, step in enumerate(scenario.form.steps, 1) if step.fault is not None
+        )
+        if scenario.network is None:
+            assert prototype is not None
+            files = {"": (scenario.system.path, prototype.path)}
+            placed = {"": faults}
+        else:
+            files = {name: (m.system.path, m.prototype.path) for name, m in scenario.network.members.items()}
+            placed = placed_all(scenario.network, faults)
+        self._runs = {
+            name: _Judged(
+                VirtualOptions(
+                    str(system), 0.0, profiles=scenario.profiles, prototype_file=file, faults=placed.get(name, ())
+                )
+            )
+            for name, (system, file) in files.items()
+        }
+        self._benches: Mapping[str, VirtualBench] = {}
+        self._where = scenario.line("judge")
+
+    def attach(self, benches: Mapping[str, VirtualBench]) -> None:
+        """From now on what happens is judged. One system has the name ``""``."""
+        self._benches = benches
+        for name, run in self._runs.items():
+            run.attach(benches[name])
+
+    async def watch(self) -> None:
+        """Often enough that no journal forgets; until cancelled."""
+        while True:
+            for name, run in self._runs.items():
+                run.judge(self._benches[name])
+            first = next(iter(self._benches.values()))
+            await first.sleep_until_s(first.now_s() + PIECE_S)
+
+    async def finish(self, result: ScenarioResult) -> ScenarioResult:
+        """The scenario's result, failed where the run is no good."""
+        errors = []
+        for name, run in self._runs.items():
+            await run.finish(self._benches[name])
+            errors += [f"{name}: {error}" if name else error for error in run.summary()["errors"]]
+        now_ns = round(next(iter(self._benches.values())).now_s() * NS_PER_S)
+        verdict = Verdict.FAILED if errors else Verdict.PASSED
+        expected, got = ("no error", "; ".join(errors[:MOST_TOLD])) if errors else ("", "")
+        check = CheckResult("judge", TITLE, verdict, now_ns, 0, expected, got, where=self._where)
+        ended = verdict if result.verdict is Verdict.PASSED else result.verdict
+        reason = f"{TITLE}: {errors[0]}" if errors and result.verdict is Verdict.PASSED else result.reason
+        return replace(result, verdict=ended, reason=reason, checks=(*result.checks, check))

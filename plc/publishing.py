@@ -173,9 +173,10 @@ class OutputImage:
         if taken is self._room_for:  # a reader gives the same columns as long as nothing in them changes
             return
         self._room_for = taken
+        sent = self.writer.last_sequence
         for output, outbox in self.outboxes:
             got = taken[output.taken] if output.taken is not None else 0
-            outbox.outstanding = self.writer.last_sequence(output.tag) - (got if isinstance(got, int) else 0)
+            outbox.outstanding = sent(output.tag) - (got if isinstance(got, int) else 0)
 
     def collect(self, now_ns: int, scan: int, programs: Mapping[str, Seen]) -> None:
         """Take the values of `programs` as they are; changes are remembered with what the program saw."""

@@ -30,9 +30,9 @@ class _Held:
 
     def was(self, raw: bytes, from_ns: int, to_ns: int) -> bool:
         """Whether it was `raw` at any time between, both ends included: what ended at `from_ns` was so at that instant."""
-        first = max(0, bisect_left(self.times_ns, from_ns) - 1)
-        last = bisect_right(self.times_ns, to_ns)
-        return raw in self.raws[first:last]
+        first = bisect_left(self.times_ns, from_ns)
+        last = bisect_right(self.times_ns, to_ns, first)
+        return raw in self.raws[first - 1 if first else 0 : last]
 
     def forget(self, before_ns: int) -> None:
         gone = bisect_right(self.times_ns, before_ns) - 1
@@ -60,8 +60,11 @@ class AgeOracle:
 
     def judge(self, emulated: frozenset[str]) -> None:
         """Compare what is waiting. Tags of devices that are not `emulated` are nobody's to judge."""
+        judged: dict[str, bool] = {}
         for now_ns, tag, raw, value, source_ns in self._waiting:
-            if tag.partition(".")[0] not in emulated:
+            if tag not in judged:
+                judged[tag] = tag.partition(".")[0] in emulated
+            if not judged[tag]:
                 continue
             self.checked += 1
             held = self._held.get(tag)

@@ -49,6 +49,7 @@ class _Region:
         self._words = self._memory[:8].cast("Q")
         self._rings = {ring.spec.name: ring for ring in shape.rings}
         self._slots = tuple(shape.slot_offset(n) for n in range(SLOTS))
+        self._slot_bytes = CHECK.size + shape.body.size
 
     def release(self) -> None:
         """Let go of the memory, so that a map can be closed. Afterwards the object is of no use."""
@@ -58,9 +59,9 @@ class _Region:
     def _slot(self, counter: int) -> bytes | None:
         """Publication `counter`, verified, without its check sum; None if it is not, or no longer, there."""
         at = self._slots[counter % SLOTS]
-        copy = self._memory[at : at + CHECK.size + self.shape.body.size].tobytes()
-        body = copy[CHECK.size :]
-        if zlib.crc32(body) != CHECK.unpack_from(copy)[0] or int.from_bytes(body[:8], "little") != counter:
+        (check,) = CHECK.unpack_from(self._memory, at)  # overwritten between this line and the next, the two do not fit
+        body = self._memory[at + CHECK.size : at + self._slot_bytes].tobytes()
+        if zlib.crc32(body) != check or int.from_bytes(body[:8], "little") != counter:
             return None
         return body
 
@@ -73,8 +74,8 @@ class RegionWriter(_Region):
         super().__init__(memory, shape)
         self._copy = bytearray(CHECK.size + shape.body.size)
         self._body = memoryview(self._copy)[CHECK.size :]
-        self._packed: tuple[list[Scalar | None], bytes, bytes] | None = None
-        """The columns that stand in `_body`, packed."""
+        self._packed = False
+        """Whether `_body` has values, qualities and reasons as they were published last."""
         self._last = {ring.spec.name: 0 for ring in shape.rings}
         self.counter = int(self._words[0])
         if self.counter:
@@ -129,9 +130,9 @@ class RegionWriter(_Region):
         a cycle brings nothing, and then they are not looked at.
         """
         stamps = self._stamps(times_ns)
-        if same and not messages and self._packed is not None:
-            return self._commit(stamps, now_ns, 0)
-        return self._publish(list(values), bytes(qualities), bytes(reasons), stamps, now_ns, messages, RegionFlag.NONE)
+        if same and not messages and self._packed:
+            return self._commit(stamps, now_ns, _UNFLAGGED)
+        return self._publish(values, qualities, reasons, stamps, now_ns, messages, _UNFLAGGED)
 
     def publish_columns(
         self,
@@ -151,7 +152,7 @@ class RegionWriter(_Region):
         `same`: `values`, `quality`, `reason` and `but` are what the caller published last; then they are not looked at.
         """
         count = len(values)
-        if same and not messages and self._packed is not None:
+        if same and not messages and self._packed:
             return self._commit(now_ns.to_bytes(8, "little", signed=True) * count, now_ns, flags)
         marks, reasons = bytes([quality]) * count, bytes([reason]) * count
         if but:
@@ -163,7 +164,7 @@ class RegionWriter(_Region):
             marks = bytes([Quality.BAD if v is None else m for v, m in zip(values, marks, strict=True)])
             reasons = bytes([Reason.NEVER_READ if v is None else reason for v in values])
         stamps = now_ns.to_bytes(8, "little", signed=True) * count
-        return self._publish(list(values), marks, reasons, stamps, now_ns, messages, flags)
+        return self._publish(values, marks, reasons, stamps, now_ns, messages, flags)
 
     def _stamps(self, times_ns: Sequence[int]) -> bytes:
         try:
@@ -178,9 +179,9 @@ class RegionWriter(_Region):
 
     def _publish(
         self,
-        values: list[Scalar | None],
-        marks: bytes,
-        reasons: bytes,
+        values: Sequence[Scalar | None],
+        marks: bytes | bytearray,
+        reasons: bytes | bytearray,
         stamps: bytes,
         now_ns: int,
         messages: Mapping[str, Sequence[tuple[int, bytes]]] | None,
@@ -195,13 +196,9 @@ class RegionWriter(_Region):
                 where=f"region {shape.layout.name}",
             )
         last = self._check_messages(messages) if messages else self._last
-        for ring in shape.rings:
-            values[ring.index] = last[ring.spec.name]
-        columns = (values, marks, reasons)
-        if columns != self._packed:
-            self._packed = None
-            self._pack(values, marks, reasons)
-            self._packed = columns
+        self._packed = False  # should it fail
+        self._pack(values, last, marks, reasons)
+        self._packed = True
         if messages:
             self._write_messages(messages)
             self._last = last
@@ -219,19 +216,27 @@ class RegionWriter(_Region):
         self.counter = counter
         return counter
 
-    def _pack(self, values: list[Scalar | None], marks: bytes, reasons: bytes) -> None:
-        plain = values
-        if None in values:
-            plain, marked, at = values.copy(), bytearray(marks), -1
-            for _ in range(values.count(None)):
-                at = values.index(None, at + 1)
+    def _pack(
+        self,
+        values: Sequence[Scalar | None],
+        last: Mapping[str, int],
+        marks: bytes | bytearray,
+        reasons: bytes | bytearray,
+    ) -> None:
+        """Put the columns into `_body`, with `last` as the messages' sequences."""
+        shape, plain = self.shape, list(values)
+        for ring in shape.rings:
+            plain[ring.index] = last[ring.spec.name]
+        if None in plain:
+            marks, at = bytearray(marks), -1
+            for _ in range(plain.count(None)):
+                at = plain.index(None, at + 1)
                 plain[at] = 0
-                marked[at] |= _NO_VALUE
-            marks = bytes(marked)
+                marks[at] |= _NO_VALUE
         try:
-            self.shape.columns.pack_into(self._body, self.shape.columns_at, *plain, marks, reasons)
+            shape.columns.pack_into(self._body, shape.columns_at, *plain, marks, reasons)
         except (struct.error, TypeError, OverflowError) as e:
-            raise self._not_encodable(values) from e
+            raise self._not_encodable(plain) from e
 
     def _check_messages(self, messages: Mapping[str, Sequence[tuple[int, bytes]]]) -> dict[str, int]:
         last = dict(self._last)

@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
+from emulators.virtual.chance import seeded
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.seal import sealed
 from fieldtwin.scenarios.trace import Trace, open_sink
@@ -72,6 +73,7 @@ class DrivenRun(ABC):
             self.trace = Trace(TRACE_KEPT, open_sink(self._trace_file) if self._trace_file else None)
             stack.callback(self.trace.close)
             stack.callback(loop.close)
+            stack.enter_context(seeded(self.seed))
             with sealed():
                 main = loop.create_task(self._main(loop, folder), name="run")
                 main.add_done_callback(lambda _: loop.stop())

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+from emulators.virtual.chance import seeded
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.seal import sealed
 from fieldtwin.report.coverage import Collector
@@ -53,7 +54,7 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
                 return await _judged(scenario, Runner(scenario, bench), judge, {"": bench})
 
         try:
-            with sealed():
+            with seeded(chosen), sealed():
                 result = loop.run_until_complete(main())
         except FieldtwinError as e:
             error = str(e)

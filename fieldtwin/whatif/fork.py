@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from emulators.virtual.chance import seeded
 from emulators.virtual.loop import VirtualLoop
 from emulators.virtual.seal import sealed
 from fieldtwin.running.shore import Shore
@@ -110,7 +111,7 @@ class _ForkRun:
             run_dir = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-what-if-")))
             stack.callback(loop.close)
             retain_for(self.fork.state, run_dir)
-            with sealed():
+            with seeded(self.fork.seed or 0), sealed():
                 try:
                     loop.run_until_complete(self._main(loop, run_dir))
                 except FieldtwinError as e:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import datetime
+import random
 import re
 import socket
 import subprocess
@@ -19,6 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from emulators.virtual.chance import seeded
 from emulators.virtual.clock import VirtualClock
 from emulators.virtual.loop import START_NS, Deadlock, Escape, VirtualLoop
 from emulators.virtual.seal import sealed
@@ -382,3 +384,17 @@ def test_a_task_that_will_not_end_keeps_no_loop_open() -> None:
     loop.run_until_complete(main())
     loop.close()
     assert loop.is_closed()
+
+
+def test_the_chance_of_everybody_is_the_seed_s_while_a_run_lasts() -> None:
+    numpy = pytest.importorskip("numpy")
+    random.seed(99)
+    before = random.getstate()
+    seen = []
+    for seed in (7, 7, 8):
+        with seeded(seed):
+            seen.append((random.random(), float(numpy.random.random())))
+    assert seen[0] == seen[1]
+    assert seen[0][0] != seen[2][0]
+    assert seen[0][1] != seen[2][1]
+    assert random.getstate() == before

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fieldtwin.cli.check_cases import only_of
 from fieldtwin.cli.check_device_command import canopen, modbus
 from fieldtwin.cli.options import Duration, json_option
 from gateway.core.endpoint import Endpoint
@@ -20,13 +21,12 @@ from gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
     from emulators.modbus.bank import Table
-    from fieldtwin.conformance.case import About, Case
+    from fieldtwin.conformance.case import Case
     from fieldtwin.conformance.results import CaseResult
 
 DANGERS = ("observe", "read", "write", "disrupt")
 _HELD = re.compile(r"^(holding|input|coil|discrete):(\d{1,5})$")
 _OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$")
-_RANGE = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 
 
 @click.group("check")
@@ -292,25 +292,6 @@ def _list(cases: list[Case], as_json: bool) -> int:
     else:
         print_cases(cases)
     return 0
-
-
-def only_of(text: str | None, cases: Sequence[About]) -> frozenset[str]:
-    """``MB-013,15a`` as ids; an unknown one is `UsageError` with the nearest."""
-    from difflib import get_close_matches
-
-    chosen = set()
-    known = {case.id for case in cases} | {case.row for case in cases}
-    prefix = cases[0].id[:3]
-    for part in (text or "").split(","):
-        if not part.strip():
-            continue
-        match = _RANGE.match(part.strip())
-        id = f"{(match[1] or prefix).upper()}{int(match[2]):03}{match[3].lower()}" if match else part.strip()
-        if id not in known:
-            near = get_close_matches(id, known, 1)
-            raise UsageError(f"no case {part.strip()!r}", expected=near[0] if near else "an id such as " + cases[0].id)
-        chosen.add(id)
-    return frozenset(chosen)
 
 
 def _words(text: str) -> tuple[int, int, int]:

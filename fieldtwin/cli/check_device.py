@@ -79,7 +79,7 @@ class Check:
     def plan(self, cases: Sequence[DeviceCase[Any]], has: set[str], writes: bool) -> Plan:
         """What may be played. Reads the waivers too: a wrong file is said before anything is sent."""
         from fieldtwin.checking.run import Plan
-        from fieldtwin.cli.check_command import only_of
+        from fieldtwin.cli.check_cases import only_of
         from fieldtwin.conformance.case import Danger
         from fieldtwin.conformance.waivers import Waivers, load_waivers
 

@@ -8,20 +8,16 @@ the bits that fit are kept, as the standard says. TIME counts ms as a number, LT
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from plc.st import tree as t
 from plc.st import types as ty
-from plc.st.scope import Value
-
-if TYPE_CHECKING:
-    from plc.st.expressions import Expressions
+from plc.st.scope import Compiling, Value
 
 _NAMES: dict[str, ty.Type] = {**ty.ELEMENTARY, "STRING": ty.String(254), "WSTRING": ty.String(254, wide=True)}
 _DIGITS = {32: 7, 64: 15}
 
 
-def conversion(name: str) -> Callable[[Expressions, t.Call], Value] | None:
+def conversion(name: str) -> Callable[[Compiling, t.Call], Value] | None:
     """The conversion of that name (in capitals), None if there is none."""
     if name == "TRUNC":
         return lambda x, call: _convert(x, call, None, ty.DINT, cut=True)
@@ -36,11 +32,11 @@ def conversion(name: str) -> Callable[[Expressions, t.Call], Value] | None:
     return None
 
 
-def _made(source: ty.Type | None, target: ty.Type, cut: bool) -> Callable[[Expressions, t.Call], Value]:
+def _made(source: ty.Type | None, target: ty.Type, cut: bool) -> Callable[[Compiling, t.Call], Value]:
     return lambda x, call: _convert(x, call, source, target, cut)
 
 
-def _convert(x: Expressions, call: t.Call, source: ty.Type | None, target: ty.Type, cut: bool) -> Value:
+def _convert(x: Compiling, call: t.Call, source: ty.Type | None, target: ty.Type, cut: bool) -> Value:
     (expr,) = x.positional(call, 1)
     value = x.value(expr)
     kind = ty.plain(value.type)

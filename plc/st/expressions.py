@@ -11,7 +11,7 @@ from plc.st import tree as t
 from plc.st import types as ty
 from plc.st import values
 from plc.st.literals import Malformed, constant
-from plc.st.scope import Environment, Parameter, Signature, Symbol, Value, Writer, by_reference
+from plc.st.scope import Environment, Parameter, Signature, Symbol, Value, Writer, by_reference, wrapped
 from plc.st.standard import FUNCTIONS
 
 MAX_DEEP = 80
@@ -522,15 +522,6 @@ def _of_reals(op: str, a: str, b: str) -> str:
 
 def _into(p: Parameter, signature: Signature) -> str:
     return f"{p.name} of {signature.name}"
-
-
-def wrapped(code: str, kind: ty.Elementary) -> str:
-    """`code` brought back into the width of `kind`."""
-    if kind.kind == "real":
-        return f"_v.real({code})" if kind.bits == 32 else f"({code})"
-    if kind.low < 0:
-        return f"(({code} + {-kind.low} & {kind.high - kind.low}) - {-kind.low})"
-    return f"({code} & {kind.high})"
 
 
 def _literal(value: float, kind: ty.Type) -> str:

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 from gateway.core.errors import FileInvalid
 from plc.st import types as ty
 from plc.st.source import shortened
-from plc.st.tree import Pos
+from plc.st.tree import Call, Expr, Pos
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +89,33 @@ class Environment:
         near = get_close_matches(name.lower(), [k.lower() for k in known], 1)
         nearest = next((k for k in known if near and k.lower() == near[0]), "")
         self.fail(pos, f"{what} {name!r} is not declared", hint=f"did you mean {nearest}?" if nearest else "")
+
+
+class Compiling(Protocol):
+    """What a standard function is compiled with: the compiler of expressions (`expressions.Expressions`), as it sees it."""
+
+    env: Environment
+    symbols: dict[str, Symbol]
+    program_inputs: set[str]
+
+    def value(self, expr: Expr) -> Value: ...
+
+    def known(self, expr: Expr, result: float) -> Value: ...
+
+    def coerced(self, value: Value, target: ty.Type, pos: Pos, what: str = "") -> str: ...
+
+    def condition(self, expr: Expr, what: str) -> str: ...
+
+    def positional(self, call: Call, least: int, most: int | None = None) -> list[Expr]: ...
+
+
+def wrapped(code: str, kind: ty.Elementary) -> str:
+    """`code` brought back into the width of `kind`."""
+    if kind.kind == "real":
+        return f"_v.real({code})" if kind.bits == 32 else f"({code})"
+    if kind.low < 0:
+        return f"(({code} + {-kind.low} & {kind.high - kind.low}) - {-kind.low})"
+    return f"({code} & {kind.high})"
 
 
 class Writer:

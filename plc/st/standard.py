@@ -7,18 +7,14 @@ MSG_SEND (a message is a STRING with one character a byte).
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from plc.st import tree as t
 from plc.st import types as ty
 from plc.st import values
 from plc.st.conversions import conversion
-from plc.st.scope import Value
+from plc.st.scope import Compiling, Value, wrapped
 
-if TYPE_CHECKING:
-    from plc.st.expressions import Expressions
-
-Function = Callable[["Expressions", t.Call], Value]
+Function = Callable[[Compiling, t.Call], Value]
 MANY = 1000
 _MATH = {
     "SQRT": "sqrt", "LN": "log", "LOG": "log10", "EXP": "exp", "SIN": "sin", "COS": "cos", "TAN": "tan", "ASIN": "asin",
@@ -48,14 +44,14 @@ class _Library:
 FUNCTIONS = _Library()
 
 
-def _number(x: Expressions, expr: t.Expr, *kinds: str) -> Value:
+def _number(x: Compiling, expr: t.Expr, *kinds: str) -> Value:
     value = x.value(expr)
     if not ty.is_kind(value.type, *kinds):
         x.env.fail(expr.pos, "an argument", expected=" or ".join(kinds), got=str(value.type))
     return value
 
 
-def _meeting(x: Expressions, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
+def _meeting(x: Compiling, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
     """All arguments in the type in which they meet."""
     found = [x.value(e) for e in exprs]
     kind = found[0].type
@@ -74,7 +70,7 @@ def _meeting(x: Expressions, exprs: list[t.Expr]) -> tuple[list[str], ty.Type]:
 
 
 @FUNCTIONS.add(*_MATH)
-def _of_real(x: Expressions, call: t.Call) -> Value:
+def _of_real(x: Compiling, call: t.Call) -> Value:
     expr = x.positional(call, 1)[0]
     value = _number(x, expr, "real", "int")
     name = _MATH[call.ref.name.upper()]
@@ -90,7 +86,7 @@ def _of_real(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("ATAN2")
-def _atan2(x: Expressions, call: t.Call) -> Value:
+def _atan2(x: Compiling, call: t.Call) -> Value:
     a, b = (_number(x, e, "real", "int") for e in x.positional(call, 2))
     if {a.type, b.type} == {ty.REAL}:
         return Value(f"_v.real(_v.math.atan2({a.code}, {b.code}))", ty.REAL)
@@ -98,7 +94,7 @@ def _atan2(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("EXPT")
-def _expt(x: Expressions, call: t.Call) -> Value:
+def _expt(x: Compiling, call: t.Call) -> Value:
     a, b = x.positional(call, 2)
     return x.value(t.Binary(call.pos, "**", a, b))
 
@@ -109,7 +105,7 @@ _OPERATORS = {
 
 
 @FUNCTIONS.add(*_OPERATORS)
-def _operator(x: Expressions, call: t.Call) -> Value:
+def _operator(x: Compiling, call: t.Call) -> Value:
     """Operators by their function's name (Tables 29 and 33): ADD and MUL of two or more, comparisons of two."""
     name = call.ref.name.upper()
     first, *rest = x.positional(call, 2, MANY if name in ("ADD", "MUL") else None)
@@ -120,9 +116,7 @@ def _operator(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("ABS")
-def _abs(x: Expressions, call: t.Call) -> Value:
-    from plc.st.expressions import wrapped
-
+def _abs(x: Compiling, call: t.Call) -> Value:
     value = _number(x, x.positional(call, 1)[0], "int", "real", "duration")
     kind = ty.plain(value.type)
     if isinstance(kind, ty.Elementary):
@@ -132,19 +126,19 @@ def _abs(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("MIN", "MAX")
-def _extreme(x: Expressions, call: t.Call) -> Value:
+def _extreme(x: Compiling, call: t.Call) -> Value:
     codes, kind = _meeting(x, x.positional(call, 2, MANY))
     return Value(f"{call.ref.name.lower()}({', '.join(codes)})", kind)
 
 
 @FUNCTIONS.add("LIMIT")
-def _limit(x: Expressions, call: t.Call) -> Value:
+def _limit(x: Compiling, call: t.Call) -> Value:
     (low, value, high), kind = _meeting(x, x.positional(call, 3))
     return Value(f"min(max({value}, {low}), {high})", kind)
 
 
 @FUNCTIONS.add("SEL")
-def _sel(x: Expressions, call: t.Call) -> Value:
+def _sel(x: Compiling, call: t.Call) -> Value:
     selector, *choices = x.positional(call, 3)
     condition = x.condition(selector, "SEL")
     (no, yes), kind = _meeting(x, choices)
@@ -152,7 +146,7 @@ def _sel(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("MUX")
-def _mux(x: Expressions, call: t.Call) -> Value:
+def _mux(x: Compiling, call: t.Call) -> Value:
     selector, *choices = x.positional(call, 2, MANY)
     number = _number(x, selector, "int")
     codes, kind = _meeting(x, choices)
@@ -160,12 +154,12 @@ def _mux(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("MOVE")
-def _move(x: Expressions, call: t.Call) -> Value:
+def _move(x: Compiling, call: t.Call) -> Value:
     return x.value(x.positional(call, 1)[0])
 
 
 @FUNCTIONS.add("SHL", "SHR", "ROL", "ROR")
-def _shift(x: Expressions, call: t.Call) -> Value:
+def _shift(x: Compiling, call: t.Call) -> Value:
     what, by = x.positional(call, 2)
     value, count = _number(x, what, "bits"), _number(x, by, "int")
     kind = ty.plain(value.type)
@@ -178,7 +172,7 @@ def _shift(x: Expressions, call: t.Call) -> Value:
 # -- strings ------------------------------------------------------------------------------------------------------------
 
 
-def _string(x: Expressions, expr: t.Expr) -> tuple[str, ty.String]:
+def _string(x: Compiling, expr: t.Expr) -> tuple[str, ty.String]:
     value = x.value(expr)
     if not isinstance(value.type, ty.String):
         x.env.fail(expr.pos, "an argument", expected="a string", got=str(value.type))
@@ -186,13 +180,13 @@ def _string(x: Expressions, expr: t.Expr) -> tuple[str, ty.String]:
 
 
 @FUNCTIONS.add("LEN")
-def _len(x: Expressions, call: t.Call) -> Value:
+def _len(x: Compiling, call: t.Call) -> Value:
     s, kind = _string(x, x.positional(call, 1)[0])
     return Value(f"len({s})", ty.INT if kind.length <= ty.INT.high else ty.DINT)
 
 
 @FUNCTIONS.add("LEFT", "RIGHT")
-def _side(x: Expressions, call: t.Call) -> Value:
+def _side(x: Compiling, call: t.Call) -> Value:
     what, length = x.positional(call, 2)
     (s, kind), n = _string(x, what), _number(x, length, "int").code
     if call.ref.name.upper() == "LEFT":
@@ -201,7 +195,7 @@ def _side(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("MID", "DELETE")
-def _cut(x: Expressions, call: t.Call) -> Value:
+def _cut(x: Compiling, call: t.Call) -> Value:
     what, length, position = x.positional(call, 3)
     s, kind = _string(x, what)
     name = "mid" if call.ref.name.upper() == "MID" else "deleted"
@@ -209,7 +203,7 @@ def _cut(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("CONCAT")
-def _concat(x: Expressions, call: t.Call) -> Value:
+def _concat(x: Compiling, call: t.Call) -> Value:
     parts = [_string(x, e) for e in x.positional(call, 1, MANY)]
     if len({kind.wide for _, kind in parts}) > 1:
         x.env.fail(call.pos, "CONCAT of STRING and WSTRING")
@@ -219,7 +213,7 @@ def _concat(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("INSERT", "REPLACE", "FIND")
-def _within(x: Expressions, call: t.Call) -> Value:
+def _within(x: Compiling, call: t.Call) -> Value:
     name = call.ref.name.upper()
     what, other, *numbers = x.positional(call, {"INSERT": 3, "REPLACE": 4, "FIND": 2}[name])
     (s, kind), (o, other_kind) = _string(x, what), _string(x, other)
@@ -231,12 +225,12 @@ def _within(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("CHR")
-def _chr(x: Expressions, call: t.Call) -> Value:
+def _chr(x: Compiling, call: t.Call) -> Value:
     return Value(f"chr({_number(x, x.positional(call, 1)[0], 'int', 'bits').code} & 255)", ty.String(1))
 
 
 @FUNCTIONS.add("ASC")
-def _asc(x: Expressions, call: t.Call) -> Value:
+def _asc(x: Compiling, call: t.Call) -> Value:
     what, *position = x.positional(call, 1, 2)
     at = _number(x, position[0], "int").code if position else "1"
     return Value(f"_v.code_of({_string(x, what)[0]}, {at})", ty.ELEMENTARY["BYTE"])
@@ -246,19 +240,19 @@ def _asc(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("FIRST_SCAN")
-def _first_scan(x: Expressions, call: t.Call) -> Value:
+def _first_scan(x: Compiling, call: t.Call) -> Value:
     x.positional(call, 0)
     return Value("_c.first_scan", ty.BOOL)
 
 
 @FUNCTIONS.add("SCAN_TIME")
-def _scan_time(x: Expressions, call: t.Call) -> Value:
+def _scan_time(x: Compiling, call: t.Call) -> Value:
     x.positional(call, 0)
     return Value("_c.now_ns", ty.LTIME)
 
 
 @FUNCTIONS.add("IS_GOOD")
-def _is_good(x: Expressions, call: t.Call) -> Value:
+def _is_good(x: Compiling, call: t.Call) -> Value:
     (expr,) = x.positional(call, 1)
     if isinstance(expr, t.Ref) and not expr.selectors:
         symbol = x.symbols.get(expr.name.lower())
@@ -267,7 +261,7 @@ def _is_good(x: Expressions, call: t.Call) -> Value:
     raise x.env.error(expr.pos, "IS_GOOD asks for the quality of an input", expected="a VAR_INPUT of this program")
 
 
-def _messages(x: Expressions, expr: t.Expr, kind: type) -> str:
+def _messages(x: Compiling, expr: t.Expr, kind: type) -> str:
     value = x.value(expr)
     if not isinstance(value.type, kind):
         way = "VAR_INPUT" if kind is ty.MessagesIn else "VAR_OUTPUT"
@@ -276,12 +270,12 @@ def _messages(x: Expressions, expr: t.Expr, kind: type) -> str:
 
 
 @FUNCTIONS.add("MSG_COUNT")
-def _msg_count(x: Expressions, call: t.Call) -> Value:
+def _msg_count(x: Compiling, call: t.Call) -> Value:
     return Value(f"len({_messages(x, x.positional(call, 1)[0], ty.MessagesIn)})", ty.DINT)
 
 
 @FUNCTIONS.add("MSG_AT", "MSG_TIME")
-def _msg_at(x: Expressions, call: t.Call) -> Value:
+def _msg_at(x: Compiling, call: t.Call) -> Value:
     what, at = x.positional(call, 2)
     code = f"_c.message({_messages(x, what, ty.MessagesIn)}, {_number(x, at, 'int').code})"
     if call.ref.name.upper() == "MSG_TIME":
@@ -290,13 +284,13 @@ def _msg_at(x: Expressions, call: t.Call) -> Value:
 
 
 @FUNCTIONS.add("MSG_ROOM", "MSG_MAX")
-def _msg_room(x: Expressions, call: t.Call) -> Value:
+def _msg_room(x: Compiling, call: t.Call) -> Value:
     box = _messages(x, x.positional(call, 1)[0], ty.MessagesOut)
     return Value(f"{box}.{'room' if call.ref.name.upper() == 'MSG_ROOM' else 'max_bytes'}", ty.DINT)
 
 
 @FUNCTIONS.add("MSG_SEND")
-def _msg_send(x: Expressions, call: t.Call) -> Value:
+def _msg_send(x: Compiling, call: t.Call) -> Value:
     what, text, *when = x.positional(call, 2, 3)
     box, (s, kind) = _messages(x, what, ty.MessagesOut), _string(x, text)
     if kind.wide:

@@ -1,0 +1,39 @@
+"""Which cases of a catalogue are meant: ``--only`` of `fieldtwin check`, for masters and devices."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from difflib import get_close_matches
+from typing import Protocol
+
+from gateway.core.errors import UsageError
+
+_ID = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
+
+
+class Named(Protocol):
+    """What has an id, and a row of the catalogue."""
+
+    @property
+    def id(self) -> str: ...
+
+    @property
+    def row(self) -> str: ...
+
+
+def only_of(text: str | None, cases: Sequence[Named]) -> frozenset[str]:
+    """``MB-013,15a`` as ids; an unknown one is `UsageError` with the nearest."""
+    chosen = set()
+    known = {case.id for case in cases} | {case.row for case in cases}
+    prefix = cases[0].id[:3]
+    for part in (text or "").split(","):
+        if not part.strip():
+            continue
+        match = _ID.match(part.strip())
+        id = f"{(match[1] or prefix).upper()}{int(match[2]):03}{match[3].lower()}" if match else part.strip()
+        if id not in known:
+            near = get_close_matches(id, known, 1)
+            raise UsageError(f"no case {part.strip()!r}", expected=near[0] if near else "an id such as " + cases[0].id)
+        chosen.add(id)
+    return frozenset(chosen)

@@ -153,7 +153,7 @@ def test_faults_of_the_water_come_and_go() -> None:
     ("words", "said"),
     [
         (["--plant"], "each of its systems is a plant of its own"),
-        (["--prototype", "--faults", "x.yaml"], "--faults: nothing of a network"),
+        (["--prototype", "--speed", "2"], "--speed: nothing of a network"),
         (["--prototype", "--virtual"], "--virtual needs an end"),
         (["--prototype", "--thread", "tcp://127.0.0.1:7700"], "a port of its own"),
         (["--prototype", "--seed", "3"], "--seed and --trace go with --virtual"),

@@ -72,7 +72,9 @@ class ControlServer:
         try:
             server = await asyncio.start_server(self._serve_tcp, host, port, limit=MAX_LINE)
         except OSError as e:
-            raise Unreachable(f"cannot listen for control: {os_reason(e)}", where=f"{host}:{port}") from e
+            raise Unreachable(
+                f"cannot listen for control: {os_reason(e)}", where=f"{host}:{port}", hint="port 0 takes a free one"
+            ) from e
         self._servers.append(server)
         return int(server.sockets[0].getsockname()[1])
 

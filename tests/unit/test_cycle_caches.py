@@ -77,6 +77,7 @@ STEPS = st.one_of(
     st.tuples(st.just("restate"), st.sampled_from(TAGS), st.sampled_from([None, 10, LIMIT_MS])),
     st.tuples(st.just("message")),
     st.tuples(st.just("untaken"), st.integers(0, 2)),
+    st.tuples(st.just("late"), st.integers(1, 4)),
     st.tuples(st.just("ticks"), st.integers(1, 5)),
 )
 
@@ -89,6 +90,9 @@ def value_of(tag: str, value: Any, quality: Quality, t_ns: int) -> TagValue:
 
 @settings(max_examples=60)
 @given(st.lists(STEPS, max_size=25))
+@example([("ticks", 1), ("put", "d.real", 1.5, Quality.GOOD), ("late", 4), ("ticks", 1)])
+@example([("ticks", 1), ("put", "d.int", 2, Quality.GOOD), ("ticks", 5), ("put", "d.int", None, Quality.GOOD)])
+@example([("ticks", 1), ("message",), ("ticks", 2), ("untaken", 1), ("ticks", 1)])
 def test_inputs_are_what_the_table_holds(steps: list[Any]) -> None:
     kinds = {"d.real": TagKind.REAL, "d.int": TagKind.INT, "d.bool": TagKind.BOOL, "d.fixed": TagKind.INT}
     inputs = [TagSpec(name, kind) for name, kind in kinds.items()]
@@ -116,6 +120,8 @@ def test_inputs_are_what_the_table_holds(steps: list[Any]) -> None:
             queue.observe(DATA(b"a"))
             plc.publish([zero, TagValue(sent, Quality.GOOD)], clock.now_ns, {"m.out": [(0, b"b")]})
             taken += 1
+        elif what == "late":
+            clock.now_ns += args[0] * 10 * MS
         elif what == "untaken":
             exchange.untaken["m.out"] = args[0]
         for _ in range(args[0] if what == "ticks" else 0):
@@ -177,6 +183,7 @@ SCANS = st.one_of(
     [("want", 1.0), ("scans", 2), ("force", 1.0), ("scans", 2), ("force", None)]
 )  # the value is the same all the time
 @example([("want", 1.0), ("scans", 2), ("stop",)])
+@example([("want", 1.0), ("scans", 2), ("arrive", 2), ("scans", 1), ("want", 0.0)])
 @example([("want", 1.0), ("scans", 2), ("hold",), ("send", 6), ("scans", 2), ("taken",)])
 def test_outputs_are_what_the_programs_hold(steps: list[Any]) -> None:
     program = Quiet()

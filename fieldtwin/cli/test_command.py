@@ -7,6 +7,7 @@ import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from rich.markup import escape
@@ -18,6 +19,10 @@ from fieldtwin.cli.talk import data
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.conformance.case import Danger
 from gateway.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from fieldtwin.report.model import Machine
+    from twin.system import System
 
 SUFFIX = ".scenario.yaml"
 _COLOUR = {"passed": "green", "failed": "red", "error": "red", "inconclusive": "yellow", "skipped": "yellow"}
@@ -132,6 +137,7 @@ def command(
         seed,
         reproduce=shlex.join(["fieldtwin", *sys.argv[1:]]),
         versions={"fieldtwin": __version__},
+        machines=_machines([one.system for one in scenarios]) if html else (),
         served=(),
     )
     if junit:
@@ -226,3 +232,11 @@ def _plain(result: object) -> dict[str, object]:
             for c in result.checks
         ],
     }
+
+
+def _machines(systems: list[System]) -> tuple[Machine, ...]:
+    """The state machines of what was under test; of two of one name in different systems the first's."""
+    from fieldtwin.report.machines import machines_of
+
+    different = {system.hash: system for system in reversed(systems)}
+    return tuple({m.variable: m for system in different.values() for m in machines_of(system)}.values())

@@ -215,6 +215,9 @@ def test_reports_are_written(tmp_path: Path) -> None:
     ended = CliRunner().invoke(command, words, standalone_mode=False)
     assert ended.return_value == 0, ended.output
     assert "a test" in (tmp_path / "r.xml").read_text()
+    page = (tmp_path / "r.html").read_text()
+    assert "Transitions of relay.state" in page
+    assert "1 of 6 taken" in page, "what was not is missing: STANDBY to ACTIVE was all"
     (told,) = json.loads(ended.output)
     assert (told["verdict"], told["requirements"]) == ("passed", ["REQ-1"])
     about = {"case": "x", "role": "controller", "danger": "write"}  # ACTIVE sends

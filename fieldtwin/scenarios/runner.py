@@ -82,7 +82,7 @@ class Runner:
         self._never = list(enumerate(scenario.never, 1))
         self._dropped = 0
         self._judged: set[str] = set()
-        """What must always hold and of which everything was known at least once."""
+        """What must always or never hold and of which everything was known at least once."""
         self._stimulus_s = 0.0
         self._sent_s = -PENDING_S
         self._watched: deque[Exchange] = deque()
@@ -273,16 +273,17 @@ class Runner:
     def _look_at_all(self) -> None:
         """What must always and never hold, now. Raises `_Broken`."""
         for number, text, expression, _ in self._always:
-            if number not in self._judged and any(self.bench.reading(name) is None for name in expression.names):
-                continue  # nothing is known of it yet
-            self._judged.add(number)
+            if not self._is_known(number, expression):
+                continue
             if not expression.evaluate(self._look):
                 seen, bound_s = self._seen_of(expression), self._bound(expression)
                 raise _Broken(
                     self._of_lateness(expression.asks_lateness), f"{number}: {text}", seen, bound_s, self._recently()
                 )
         for n, one in self._never:
-            if isinstance(one, Expression) and one.evaluate(self._look):
+            if not isinstance(one, Expression) or not self._is_known(f"never {n}", one):
+                continue
+            if one.evaluate(self._look):
                 seen, bound_s = self._seen_of(one), self._bound(one)
                 raise _Broken(
                     self._of_lateness(one.asks_lateness), f"never {n}: {one.text}", seen, bound_s, self._recently()
@@ -299,6 +300,13 @@ class Runner:
                 if isinstance(one, WireForm) and not (now or before) and self._forbidden(one, exchange):
                     raise _Broken(Verdict.FAILED, f"never {n}: {_said(one)}", exchange.text)
         self._excused = excused
+
+    def _is_known(self, number: str, expression: Expression) -> bool:
+        """Whether all that it names is known, or was before: from then on it is judged."""
+        if number not in self._judged and any(self.bench.reading(name) is None for name in expression.names):
+            return False
+        self._judged.add(number)
+        return True
 
     def _of_lateness(self, asked: bool) -> Verdict:
         """The verdict on a check that asks how late scans are: a plant answers for it, a host that plays one does not."""
@@ -342,8 +350,15 @@ class Runner:
                 verdict, reason = found, f"{number}: nothing was ever known of {', '.join(expression.names)}"
             self.results.append(CheckResult(number, text, found, now_ns, 0, names=tuple(expression.names)))
         for n, one in self._never:
-            text = one.text if isinstance(one, Expression) else _said(one)
-            self.results.append(CheckResult(f"never {n}", text, Verdict.PASSED, now_ns, 0))
+            number = f"never {n}"
+            if isinstance(one, Expression):
+                text, known, about = one.text, number in self._judged, ", ".join(one.names)
+            else:
+                text, known, about = _said(one), self._whole.requests[one.wire] > 0, f"the wire of {one.wire}"
+            found = Verdict.PASSED if known else Verdict.INCONCLUSIVE
+            if not known:
+                verdict, reason = found, f"{number}: nothing was ever known of {about}"
+            self.results.append(CheckResult(number, text, found, now_ns, 0))
         for number, text, seen, known in self._whole.summary():
             found = Verdict.PASSED if known else Verdict.INCONCLUSIVE
             if not known:

@@ -59,6 +59,10 @@ def run(folder: Path, steps: str, head: str) -> ScenarioResult:
         ("cycle: [{changes_of: ctd.sample_count, max: 1.7s}]\n", SILENT, Verdict.FAILED, "none from"),
         ("cycle: [{changes_of: ctd.sample_count, min: 3s}]\n", ACTIVE + "  - pause: 4s\n", Verdict.FAILED, " s, from"),
         ("cycle: [{late: 1ms}]\n", "  - pause: 1s\n", Verdict.PASSED, "looks"),
+        ("never: ['ctd.pressure > 1000']\n", "  - pause: 100ms\n", Verdict.INCONCLUSIVE, ""),
+        ("never: ['inclinometer.slope_long > 1000']\n", "  - pause: 2s\n", Verdict.PASSED, ""),
+        ("never: [{wire: ctd, access: write}]\n", "  - pause: 1ms\n", Verdict.INCONCLUSIVE, ""),
+        ("never: [{wire: ctd, function: 5}]\n", "  - pause: 2s\n", Verdict.PASSED, ""),
         (
             "within: [{after: \"relay.state == 'OFF'\", then: \"quality(ctd.pressure) == 'bad'\", within: 2s}]\n",
             "  - pause: 1s\n",

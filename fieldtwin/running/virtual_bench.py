@@ -184,10 +184,10 @@ class VirtualBench(Started):
         if self._probes is not None and name in self._probes.names:
             return self._probes.reading(name)
         outputs = self.run.plc.outputs.last()
-        if name in outputs and name not in self.run.gateway.tags.names:
+        if name in outputs and name not in self.run.gateway.tags:
             value = self._named(name, outputs[name])
             return None if value is None else Reading(value, "good", "", 0.0, 0)
-        if name not in self.run.gateway.tags.names:
+        if name not in self.run.gateway.tags:
             raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
         now_ns = self.run.clock.monotonic_ns()
         seen = self.run.gateway.tags.current(name, now_ns)

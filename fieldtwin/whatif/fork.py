@@ -203,7 +203,7 @@ class _ForkRun:
         if name == "command_pending":
             return False
         tags = run.gateway.tags
-        if name not in tags.names:
+        if name not in tags:
             outputs = run.plc.outputs.last()
             known = {
                 "value": self._named(name, outputs.get(name)),

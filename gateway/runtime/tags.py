@@ -94,6 +94,9 @@ class TagTable:
     def names(self) -> list[str]:
         return list(self._held)
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._held
+
     def put(self, name: str, value: TagValue) -> None:
         """The newest value of a tag. A good one is journalled when it is another sample or other bytes."""
         try:

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
 
+from emulators.virtual.interrupts import Interrupts
 from emulators.virtual.waiting import waits_at
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import Bug
@@ -104,7 +105,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._sequence = 0
         self._compact_at = _COMPACT_AFTER
         self._tasks = 0
-        self._running = self._stopping = self._closed = False
+        self._running = self._stopping = self._stopped = self._closed = False
         self._handler: Callable[[asyncio.AbstractEventLoop, dict[str, Any]], object] | None = None
         self.unhandled: list[dict[str, Any]] = []
         """What nobody caught, in order: told when the loop's run ends."""
@@ -220,7 +221,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return main.result()
 
     def _on_done(self, future: asyncio.Future[Any]) -> None:
-        self._stopping = True
+        self.stop()
 
     def run_forever(self) -> None:
         """Run until `stop`. Raises `Deadlock` when nothing is left that could happen."""
@@ -229,10 +230,14 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._running = True
         events._set_running_loop(self)
         try:
-            while not self._stopping:
-                self._run_instant()
+            with Interrupts(self._pause) as interrupts:
+                while not self._stopped:
+                    self._stopping = False
+                    interrupts.deliver()
+                    while not self._stopping:
+                        self._run_instant()
         finally:
-            self._stopping = self._running = False
+            self._stopping = self._stopped = self._running = False
             events._set_running_loop(None)
 
     def _run_instant(self) -> None:
@@ -279,6 +284,10 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return "; ".join(told) + (f"; and {more} more" if more > 0 else "")
 
     def stop(self) -> None:
+        self._stopping = self._stopped = True
+
+    def _pause(self) -> None:
+        """Between this callback and the next, look who wants something."""
         self._stopping = True
 
     def is_running(self) -> bool:
@@ -306,16 +315,15 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         self._running = True
         events._set_running_loop(self)
         try:
-            for _ in range(ENDING_INSTANTS):
-                if all(task.done() for task in tasks):
-                    break
-                self._stopping = False
-                with suppress(KeyboardInterrupt, SystemExit):  # what ended the run ends each task that it passes
-                    self._run_instant()
-        except Deadlock:
-            pass
+            with suppress(KeyboardInterrupt, SystemExit, Deadlock), Interrupts(self._pause):
+                for _ in range(ENDING_INSTANTS):
+                    if all(task.done() for task in tasks):
+                        break
+                    self._stopping = False
+                    with suppress(KeyboardInterrupt, SystemExit):  # what ended the run ends each task that it passes
+                        self._run_instant()
         finally:
-            self._stopping = self._running = False
+            self._stopping = self._stopped = self._running = False
             events._set_running_loop(None)
 
     async def shutdown_asyncgens(self) -> None:

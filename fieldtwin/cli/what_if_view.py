@@ -42,13 +42,14 @@ def _table(outcome: Outcome, units: Mapping[str, str]) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 1, 0, 0))
     table.add_column("variable", no_wrap=True)
     table.add_column("unit", no_wrap=True)
-    for column in ("first", "last", "min", "max", "mean", "good of"):
+    for column in ("first", "last", "min", "max", "mean", "new", "bad"):
         table.add_column(column, justify="right", overflow="fold")
     shown = sorted(outcome.variables.items())
     for name, variable in shown[:_SHOWN]:
         v = variable.described()
         numbers = [_number(v.get(key)) for key in ("first", "last", "min", "max", "mean")]
-        table.add_row(name, units.get(name, ""), *numbers, f"{v['good']}/{v['updates']}")
+        bad = v["updates"] - v["good"]
+        table.add_row(name, units.get(name, ""), *numbers, str(v["updates"]), str(bad) if bad else "")
     if len(shown) > _SHOWN:
         table.add_row(f"and {len(shown) - _SHOWN} more: --json")
     return table

@@ -167,13 +167,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
 
     def alarm(self, delay_s: float) -> asyncio.Future[None]:
         """As `sleeper`, in seconds from now (`gateway.core.alarm`). Whoever has it may set it before."""
-        future: asyncio.Future[None] = asyncio.Future(loop=self)
-        self._sequence = sequence = self._sequence + 1
-        now_ns = self.now_ns
-        heappush(self._timers, (now_ns + round(delay_s * NS_PER_S) if delay_s > 0 else now_ns, sequence, future))
-        if sequence >= self._compact_at:
-            self._compact()
-        return future
+        return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
 
     def _compact(self) -> None:
         """Let go of the timers that nobody waits for any more; again when half as many as are left could be over."""

@@ -51,10 +51,8 @@ class Interrupts:
         self._waiting = number
         self._stop()
 
-    def deliver(self) -> bool:
-        """Call the handler of a signal that came, which raises as a rule. False when none came."""
+    def deliver(self) -> None:
+        """Call the handler of a signal that came, if one did: it raises as a rule."""
         number, self._waiting = self._waiting, None
-        if number is None:
-            return False
-        self._handlers[number](number, None)
-        return True
+        if number is not None:
+            self._handlers[number](number, None)

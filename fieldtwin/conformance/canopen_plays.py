@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from fieldtwin.conformance.canopen_scene import CanPlay, CanScene, SayFrame
@@ -19,26 +20,25 @@ def nothing(scene: CanScene) -> list[SayFrame]:
     return []
 
 
-def same_toggle(scene: CanScene) -> list[SayFrame]:
-    """A segmented upload whose second segment has the toggle bit of the first."""
+def _segmented(scene: CanScene, segment: Callable[[int], bytes]) -> list[SayFrame]:
+    """A segmented upload of 14 bytes, announced as such; `segment` gives the reply to the n-th request behind that, from 1."""
     if scene.opens:
         scene.memory["segments"] = 0
         return [scene.reply(b"\x41" + scene.request[1:4] + (14).to_bytes(4, "little"))]
     if "segments" not in scene.memory:
         return scene.honest()
     scene.memory["segments"] += 1
-    last = scene.memory["segments"] > 1
-    return [scene.reply(bytes((0x01 if last else 0x00,)) + scene.poison.ljust(7, b"\0"))]
+    return [scene.reply(segment(scene.memory["segments"]))]
+
+
+def same_toggle(scene: CanScene) -> list[SayFrame]:
+    """A segmented upload whose second segment has the toggle bit of the first."""
+    return _segmented(scene, lambda n: bytes((0x01 if n > 1 else 0x00,)) + scene.poison.ljust(7, b"\0"))
 
 
 def other_length(scene: CanScene) -> list[SayFrame]:
     """A segmented upload that ends before the length that was indicated."""
-    if scene.opens:
-        scene.memory["segments"] = 0
-        return [scene.reply(b"\x41" + scene.request[1:4] + (14).to_bytes(4, "little"))]
-    if "segments" not in scene.memory:
-        return scene.honest()
-    return [scene.reply(bytes((0x01 | (7 - len(scene.poison)) << 1,)) + scene.poison.ljust(7, b"\0"))]
+    return _segmented(scene, lambda n: bytes((0x01 | (7 - len(scene.poison)) << 1,)) + scene.poison.ljust(7, b"\0"))
 
 
 def unknown_command(scene: CanScene) -> list[SayFrame]:
@@ -172,16 +172,13 @@ def unanswered(scene: CanScene) -> list[SayFrame]:
 
 def aborts_amid(scene: CanScene) -> list[SayFrame]:
     """A segmented upload that the node ends with an abort behind the first segment."""
-    if scene.opens:
-        scene.memory["segments"] = 0
-        return [scene.reply(b"\x41" + scene.request[1:4] + (14).to_bytes(4, "little"))]
-    if "segments" not in scene.memory:
-        return scene.honest()
-    scene.memory["segments"] += 1
-    if scene.memory["segments"] == 1:
-        return [scene.reply(b"\0" + scene.poison.ljust(7, b"\0"))]
-    mux = scene.memory["mux"].to_bytes(3, "little")
-    return [scene.reply(b"\x80" + mux + (0x08000022).to_bytes(4, "little"))]
+
+    def segment(n: int) -> bytes:
+        if n == 1:
+            return b"\0" + scene.poison.ljust(7, b"\0")
+        return b"\x80" + scene.memory["mux"].to_bytes(3, "little") + (0x08000022).to_bytes(4, "little")
+
+    return _segmented(scene, segment)
 
 
 def refuses_write(scene: CanScene) -> list[SayFrame]:

@@ -7,13 +7,12 @@ Pure; a function of time only through what is asked.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
-from emulators.codec import decode
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
-from emulators.stated import cells_of
+from emulators.stated import cells_of, merged, raw_of
 from gateway.core.profile import DeviceProfile, Tag
 
 Peek = Callable[[Table, int], int]
@@ -23,12 +22,24 @@ class DistortedRegisters(RegisterBank):
     """`bank` of a device that `profile` describes; `peek` gives one of its cells without being a read. What is read instead is
     noted in `journal` as held."""
 
-    def __init__(self, bank: RegisterBank, peek: Peek, profile: DeviceProfile, journal: HeldJournal) -> None:
-        self.distortions = Distortions()
+    def __init__(
+        self,
+        bank: RegisterBank,
+        peek: Peek,
+        profile: DeviceProfile,
+        journal: HeldJournal,
+        tags: Iterable[Tag] | None = None,
+        distortions: Distortions | None = None,
+    ) -> None:
+        """`tags`: those that are distorted here, and then only by what names them; by default all are, by everything.
+        `distortions` may be shared with whoever distorts the others."""
+        self._named = tags is not None
+        self.distortions = Distortions() if distortions is None else distortions
         self._peek = peek
         self.bank = bank
         self._journal = journal
-        self._tags = [t for t in profile.tags.values() if t.readable and not t.is_text]
+        all_tags = profile.tags.values() if tags is None else tags
+        self._tags = [t for t in all_tags if t.readable and not t.is_text]
         self._scales = {t.name: profile.tags.get(t.scale_by) for t in self._tags if t.scale_by is not None}
         self._noted: set[str] = set()
 
@@ -45,10 +56,10 @@ class DistortedRegisters(RegisterBank):
                 cells[a - address] if 0 <= a - address < count else self._peek(table, a)
                 for a in range(at.address, at.end)
             ]
-            if self.distortions.of(tag.name):
+            if self.distortions.of(tag.name, named=self._named):
                 for cell, content in zip(range(at.address, at.end), self._cells(tag, own, now_ns), strict=True):
                     if address <= cell < address + count:
-                        held[cell - address] = _merged(tag, held[cell - address], content)
+                        held[cell - address] = merged(tag, held[cell - address], content)
             elif tag.name in self._noted:  # it is over: what lies beneath is held again
                 self._noted.discard(tag.name)
                 self._note(tag, own, now_ns)
@@ -63,12 +74,12 @@ class DistortedRegisters(RegisterBank):
     def _cells(self, tag: Tag, own: list[int], now_ns: int) -> list[int]:
         """The cells that the tag has instead of its `own`."""
         by = self._scales.get(tag.name)
-        exponent = 0 if by is None else int(_raw(by, [self._peek(by.registers.table, by.registers.address)]))
-        raw = _raw(tag, own) * tag.scale * 10.0**exponent + tag.offset
-        value = self.distortions.apply(tag.name, raw, now_ns)
+        exponent = 0 if by is None else int(raw_of(by, [self._peek(by.registers.table, by.registers.address)]))
+        raw = raw_of(tag, own) * tag.scale * 10.0**exponent + tag.offset
+        value = self.distortions.apply(tag.name, raw, now_ns, named=self._named)
         if math.isnan(value) and (tag.bits is not None or tag.registers.table in BIT_TABLES):
             return own  # no bits say "no number"
-        cells = [_merged(tag, a, b) for a, b in zip(own, cells_of(tag, value, exponent), strict=True)]
+        cells = [merged(tag, a, b) for a, b in zip(own, cells_of(tag, value, exponent), strict=True)]
         self._noted.add(tag.name)
         self._note(tag, cells, now_ns)
         return cells
@@ -76,22 +87,3 @@ class DistortedRegisters(RegisterBank):
     def _note(self, tag: Tag, cells: Sequence[int], now_ns: int) -> None:
         bits = tag.registers.table in BIT_TABLES
         self._journal.note(tag.name, bytes(cells) if bits else b"".join(c.to_bytes(2, "big") for c in cells), now_ns)
-
-
-def _merged(tag: Tag, own: int, content: int) -> int:
-    """A register with the tag's bits of `content`."""
-    if tag.bits is None:
-        return content
-    low, high = tag.bits
-    mask = (1 << (high - low + 1)) - 1 << low
-    return own & ~mask | content & mask
-
-
-def _raw(tag: Tag, cells: Sequence[int]) -> float:
-    """The number in the tag's cells, before scale and offset."""
-    if tag.registers.table in BIT_TABLES:
-        return cells[0]
-    if tag.bits is not None:
-        low, high = tag.bits
-        return cells[0] >> low & (1 << (high - low + 1)) - 1
-    return float(decode(cells, tag.type, tag.order))

@@ -35,17 +35,23 @@ class Distortions:
     def take_away(self, id: str) -> bool:
         return self._puts.pop(id, None) is not None
 
-    def of(self, tag: str) -> bool:
-        """Whether anything may distort `tag`."""
-        return any(put.tag in ("", tag) for put in self._puts.values())
+    def of(self, tag: str, *, named: bool = False) -> bool:
+        """Return whether anything may distort `tag`; with `named` only what is aimed at this tag, not at all tags."""
+        return any(
+            (put.tag == tag or (put.tag == "" and not named)) and put.fault.on(tag) is not None
+            for put in self._puts.values()
+        )
 
-    def apply(self, tag: str, value: float, now_ns: int) -> float:
-        """The number that the device holds instead of `value`, in engineering units."""
+    def apply(self, tag: str, value: float, now_ns: int, *, named: bool = False) -> float:
+        """The number that the device holds instead of `value`, in engineering units. `named`: as `of`."""
         for put in self._puts.values():
-            if put.tag not in ("", tag) or not in_time(put.active, now_ns):
+            if (put.tag != tag and (put.tag != "" or named)) or not in_time(put.active, now_ns):
+                continue
+            fault = put.fault.on(tag)
+            if fault is None:
                 continue
             if put.since_ns is None:
                 put.since_ns, put.held = now_ns, value
             put.active.struck += 1
-            value = put.fault.distort(value, (now_ns - put.since_ns) / NS_PER_S, put.held, put.active.random)
+            value = fault.distort(value, (now_ns - put.since_ns) / NS_PER_S, put.held, put.active.random)
         return value

@@ -6,10 +6,11 @@ It never knows its driver, nor what carries its wire.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from emulators.codec import decode, encode
+from emulators.codec import encode
 from emulators.context import WhenUsedUp
 from emulators.distortion import Distortions
 from emulators.emulator import emulator_kind
@@ -18,6 +19,7 @@ from emulators.replay.counters import CounterSpan
 from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.requests import parse_request
+from emulators.stated import cells_of, merged, raw_of
 from gateway.core.connection import Connection
 from gateway.core.device import wire
 from gateway.core.errors import FileInvalid, UnknownCommand
@@ -98,10 +100,10 @@ class RecordedDevice(ProfiledReplay):
                 continue
             first = 2 + 2 * (at.address - request.address)
             words = [int.from_bytes(data[i : i + 2]) for i in range(first, first + 2 * at.count, 2)]
-            number = decode(words, tag.type, tag.order)
-            assert not isinstance(number, str)
-            value = self.distortions.apply(tag.name, number * tag.scale + tag.offset, now_ns)
-            words = encode((value - tag.offset) / tag.scale, tag.type, tag.order)
+            value = self.distortions.apply(tag.name, raw_of(tag, words) * tag.scale + tag.offset, now_ns)
+            if math.isnan(value) and tag.bits is not None:
+                continue  # no bits mean "no number"
+            words = [merged(tag, own, cell) for own, cell in zip(words, cells_of(tag, value), strict=True)]
             data[first : first + 2 * at.count] = b"".join(w.to_bytes(2) for w in words)
         return bytes(data)
 

@@ -6,9 +6,10 @@ Pure; encodes for itself, as everything on this side of the wire. It knows neith
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 
-from emulators.codec import encode
+from emulators.codec import decode, encode
 from emulators.modbus.bank import BIT_TABLES, Access, Span, Table
 from emulators.modbus.fifo import MOST_READ, FifoQueues
 from emulators.modbus.file_records import FileRecords
@@ -19,7 +20,7 @@ from gateway.core.profile import DeviceProfile, Effect, Tag
 
 def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
     """An engineering value as the cells that it fills. `exponent` is what the tag's scale-factor register holds. Of a tag that is
-    part of a register: that register with nothing in its other bits."""
+    part of a register: that register with nothing in its other bits. What is too large or too small becomes the limit."""
     at = tag.registers
     if isinstance(value, str):
         return encode(value, tag.type, tag.order, registers=at.count)
@@ -28,8 +29,45 @@ def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
     raw = (value - tag.offset) / (tag.scale * 10.0**exponent)
     if tag.bits is not None:
         low, high = tag.bits
-        return [(round(raw) & (1 << (high - low + 1)) - 1) << low]
+        return [round(min(max(raw, 0), (1 << (high - low + 1)) - 1)) << low]
     return encode(raw, tag.type, tag.order, registers=at.count)
+
+
+def fits(tag: Tag, value: float | str, exponent: int = 0) -> bool:
+    """Whether the cells of `tag` can hold an engineering value to the nearest step, without being cut or limited."""
+    if isinstance(value, str):
+        return len(value.encode("ascii", "replace")) <= 2 * tag.registers.count
+    raw = (value - tag.offset) / (tag.scale * 10.0**exponent)
+    if tag.type in ("float32", "float64") and tag.bits is None:
+        return True
+    if not math.isfinite(raw):
+        return False
+    if tag.registers.table in BIT_TABLES:
+        return raw in (0, 1)
+    if tag.bits is not None:
+        low, high = tag.bits
+        return 0 <= round(raw) < 1 << (high - low + 1)
+    held = decode(encode(raw, tag.type, tag.order, registers=tag.registers.count), tag.type, tag.order)
+    return not isinstance(held, str) and abs(held - raw) <= 1
+
+
+def merged(tag: Tag, own: int, content: int) -> int:
+    """Return the register `own` with the bits of `tag` from `content`."""
+    if tag.bits is None:
+        return content
+    low, high = tag.bits
+    mask = (1 << (high - low + 1)) - 1 << low
+    return own & ~mask | content & mask
+
+
+def raw_of(tag: Tag, cells: Sequence[int]) -> float:
+    """Return the number in the cells of `tag`, before scale and offset."""
+    if tag.registers.table in BIT_TABLES:
+        return cells[0]
+    if tag.bits is not None:
+        low, high = tag.bits
+        return cells[0] >> low & (1 << (high - low + 1)) - 1
+    return float(decode(cells, tag.type, tag.order))
 
 
 def spans_of(profile: DeviceProfile) -> list[Span]:
@@ -58,6 +96,7 @@ def parts_of(profile: DeviceProfile) -> UnitParts:
     names = {number: text.encode("ascii", "replace") for number, text in form.identification.items()}
     return UnitParts(
         server_id=None if form.server_id is None else bytes.fromhex(form.server_id),
+        server_data=bytes.fromhex(form.server_data),
         identification=Identification(names) if names else None,
         files=FileRecords(form.files) if form.files else None,
         fifos=fifos,

@@ -28,6 +28,7 @@ MARKER = "fieldtwin"
 _RUNNER: pytest.StashKey[Runner] = pytest.StashKey()
 _RESULTS: pytest.StashKey[Results] = pytest.StashKey()
 _WIRES: pytest.StashKey[list[Wire]] = pytest.StashKey()
+_OUTCOMES: pytest.StashKey[list[Outcome]] = pytest.StashKey()
 _SHOWN = 20
 
 
@@ -97,12 +98,25 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         from fieldtwin.testing.runner import FieldtwinRefused, FieldtwinUnavailable
 
         try:
-            seen = [str(e) for wire in wires for e in wire.exchanges()]
+            seen = [str(e) for wire in wires for e in wire.exchanges(strays=True)]
         except (FieldtwinRefused, FieldtwinUnavailable) as e:
             seen = [f"not to be had: {e}"]
         left_out = [f"({len(seen) - _SHOWN} before)"] if len(seen) > _SHOWN else []
         report.sections.append(("on the wire", "\n".join(left_out + seen[-_SHOWN:]) or "nothing"))
+    if report.failed and report.when == "call":
+        for outcome in item.stash.get(_OUTCOMES, []):
+            if not outcome.passed:
+                _add_to_text(report, f"scenario {outcome.name}", str(outcome))
     return report
+
+
+def _add_to_text(report: pytest.TestReport, title: str, content: str) -> None:
+    """Add a section to the text of a failure itself, which JUnit files have, too; where pytest made no such text, after it."""
+    add = getattr(report.longrepr, "addsection", None)
+    if add is None:  # --tb=native, or a plugin with a text of its own
+        report.sections.append((title, content))
+    else:
+        add(title, content)
 
 
 # -- fixtures -----------------------------------------------------------------------------------------------------------
@@ -233,7 +247,7 @@ def scenario(request: pytest.FixtureRequest) -> Callable[..., Outcome]:
         from fieldtwin.testing.outcome import run_scenario
 
         config = request.config
-        return run_scenario(
+        outcome = run_scenario(
             _runner(config).command,
             request.node.path.parent / path,
             seed=config.getoption("--fieldtwin-seed") if seed is None else seed,
@@ -241,5 +255,7 @@ def scenario(request: pytest.FixtureRequest) -> Callable[..., Outcome]:
             profiles=[str(p) for p in config.getini("fieldtwin_profiles")],
             trust=config.getoption("--fieldtwin-trust"),
         )
+        request.node.stash.setdefault(_OUTCOMES, []).append(outcome)
+        return outcome
 
     return run

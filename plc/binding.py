@@ -8,14 +8,19 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from gateway.core.errors import FieldtwinError, FileInvalid
 from gateway.core.image import ImageLayout, TagKind, TagSpec, process_image
 from gateway.core.values import Scalar
 from plc.program import Program, Role, Variable
+
+if TYPE_CHECKING:
+    from plc.st.program import StProgram
 
 _SOURCES = "python: module:Class, or FILE.st, or FILE.xml, each with :PROGRAM behind it where it has several"
 _ST_SUFFIXES = (".st", ".xml")
@@ -55,17 +60,21 @@ class BoundProgram:
         return [(v, self.outputs.get(v.name, f"{self.name}.{v.name}")) for v in both]
 
 
-def load_program(source: str, python_path: Sequence[str] = ()) -> Program:
+def load_program(source: str, python_path: Sequence[str] = (), together: dict[Any, Any] | None = None) -> Program:
     """Make the program that `source` names, searching the folders of `python_path` first. Raises `FileInvalid`.
+
+    Programs that run together are made with one `together`, empty at first: programs of one file of Structured Text share
+    its VAR_GLOBAL there.
 
     ``python: module:Class``, or a file of Structured Text (``relay.st``) or a PLCopen export (``plant.xml``), followed by
     ``:NAME`` where it holds several programs.
     """
     language, _, rest = source.partition(":")
+    made: Callable[[], Program]
     if language.strip() == "python":
         made = _python_class(source, rest, python_path)
     else:
-        made = _text_class(source, python_path)
+        made = partial(_text_class(source, python_path), together)
     try:
         return made()
     except FieldtwinError:
@@ -92,7 +101,7 @@ def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Pr
     return found
 
 
-def _text_class(source: str, folders: Sequence[str]) -> type[Program]:
+def _text_class(source: str, folders: Sequence[str]) -> type[StProgram]:
     name, _, program = source.strip().partition(":")
     if not name.lower().endswith(_ST_SUFFIXES):
         raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)

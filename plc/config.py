@@ -14,34 +14,38 @@ import msgspec
 from gateway.core.errors import FileInvalid
 from gateway.core.image import ImageLayout
 from plc.binding import BoundProgram, InputBinding, load_program
+from plc.start import StartPolicy
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramConfig:
-    """A program: its source (`plc.binding.load_program`), its bindings, variable to tag, and its task (the first if empty)."""
+    """A program: its source (`plc.binding.load_program`), its bindings, variable to tag, its task (the first if empty), and
+    how long it waits for its inputs."""
 
     name: str
     source: str
     inputs: dict[str, InputBinding] = field(default_factory=dict)
     outputs: dict[str, str] = field(default_factory=dict)
     task: str = ""
+    start: StartPolicy = field(default_factory=StartPolicy)
 
-    def bind(self, python_path: tuple[str, ...] = ()) -> BoundProgram:
-        """Make the program. Raises `FileInvalid`."""
-        return BoundProgram(self.name, load_program(self.source, python_path), self.inputs, self.outputs)
+    def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
+        """Make the program (`plc.binding.load_program`). Raises `FileInvalid`."""
+        return BoundProgram(self.name, load_program(self.source, python_path, together), self.inputs, self.outputs)
 
 
 @dataclass(frozen=True, slots=True)
 class TaskSpec:
     """A task (IEC 61131-3, 6.8.2): every `interval_ms`, or once at each rising edge of the tag `single`.
 
-    `priority` 0 is the highest.
+    `priority` 0 is the highest. `late_ms`: how late a scan may begin, 0 for that of the PLC.
     """
 
     name: str
     interval_ms: float = 0.0
     priority: int = 10
     single: str = ""
+    late_ms: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

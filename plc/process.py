@@ -9,9 +9,11 @@ Control verbs (gateway.core.control, on the configured Unix socket):
               tags, the names of all
     force     {"tag": ..., "value": ..., "by": ...}: until `unforce` {"tag": ...}, or all with {"all": true}
     pause     execute nothing more, outputs stay; `go` goes on; `step` {"count": n} executes n scans while paused
-    why       {"tag": ...}: which program last changed it, when, and what it saw
+    why       {"tag": ...}: which program last changed it, when, and what it saw; what that program waits for before it starts
+    origin    {"tag": ..., "value": ...}: the program and the line of its source that set the tag to this value
     limits    {"tags": {name: [low, high] or null}}: other limits than those in the image's layout, after a reload
     restart   make the programs anew: {"cold": true} without what is retained
+    sources   which programs' files changed since the PLC read them
     stop      outputs safe, then the process ends
 
 What people do (force to restart) goes on record before it is done; each of these verbs takes "by".
@@ -27,6 +29,7 @@ import asyncio
 import mmap
 import os
 import signal
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +40,7 @@ from plc.acts import Acts
 from plc.config import PlcConfig
 from plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
 from plc.runner import Runner
+from plc.sources import changed
 from plc.tag_view import TagView
 from plc.task import StopReason
 
@@ -65,8 +69,10 @@ class PlcProcess:
                 "go": self._go,
                 "step": self._step,
                 "why": self._why,
+                "origin": self._origin,
                 "limits": self._limits,
                 "restart": self._restart,
+                "sources": self._sources,
             }
         )
         self._realtime = RealtimeReport((), ())
@@ -150,7 +156,14 @@ class PlcProcess:
 
     async def _force(self, args: dict[str, Any]) -> dict[str, Any]:
         tag, value, by = _text(args, "tag"), args.get("value", ""), _by(args)
-        self._runner.force(tag, value, by, record=lambda old, new: self._note("force", args, tag=tag, old=old, new=new))
+        try:
+            self._runner.force(
+                tag, value, by, record=lambda old, new: self._note("force", args, tag=tag, old=old, new=new)
+            )
+        except UsageError as e:
+            with suppress(Unreachable):  # refused with or without a record
+                self._note("refuse", args, tag=tag, new=value, result=str(e))
+            raise
         return {"forces": self._runner.forces.describe(monotonic_ns())}
 
     async def _unforce(self, args: dict[str, Any]) -> dict[str, Any]:
@@ -180,11 +193,16 @@ class PlcProcess:
             raise UsageError("how many scans", expected=f"1 to {MAX_STEPS}", got=repr(count))
         self._runner.check_step()
         self._note("step", args, count=count)
-        self._runner.step(count)
-        return {"steps": count}
+        return {"steps": count, "scans": self._runner.step(count)}
 
     async def _why(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {"changes": self._runner.why(_text(args, "tag"))}
+        tag = _text(args, "tag")
+        return {"changes": self._runner.why(tag), "waits_for": self._runner.waits(tag)}
+
+    async def _origin(self, args: dict[str, Any]) -> dict[str, Any]:
+        value = args.get("value")
+        program, place = self._runner.origin(_text(args, "tag"), value if isinstance(value, int | float) else None)
+        return {"program": program, "place": place}
 
     async def _limits(self, args: dict[str, Any]) -> dict[str, Any]:
         tags = args.get("tags")
@@ -194,6 +212,9 @@ class PlcProcess:
             )
         self._runner.limit({str(tag): tuple(limits) if limits else None for tag, limits in tags.items()})
         return {"limited": len(tags)}
+
+    async def _sources(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"changed": [source.describe() for source in changed(self._runner.sources)]}
 
     async def _restart(self, args: dict[str, Any]) -> dict[str, Any]:
         cold = args.get("cold") is True

@@ -15,10 +15,12 @@ program. Nothing here waits.
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from types import CodeType
 from typing import Any, ClassVar
 
 import msgspec
@@ -45,8 +47,9 @@ class ProgramFailed(FieldtwinError):
         self.program = program
         self.line = line
         self.variable = variable
-        place = f"{path}:{line}" if line else path
-        spot = ", ".join(part for part in (f"program {program}", place, variable) if part)
+        self.place = f"{path}:{line}" if line else path
+        """File and line of the logic that failed, as far as they are known."""
+        spot = ", ".join(part for part in (f"program {program}", self.place, variable) if part)
         super().__init__(message, where=spot)
 
 
@@ -56,6 +59,13 @@ class InputTripped(ProgramFailed):
 
 class ProgramStuck(ProgramFailed):
     """A program did not end its scan: the task stops, its outputs become safe."""
+
+
+class ScanTooLong(FieldtwinError):
+    """Logic ran more loop iterations and calls in one scan than it may: it would not end."""
+
+    exit_code = 1
+    blame = Blame.FILE
 
 
 class ScanStuck(BaseException):
@@ -165,9 +175,48 @@ class Outbox:
         return True
 
 
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A line of a program's source. In a code object it is an instruction, whose line is looked up only when it is shown."""
+
+    path: str = ""
+    line: int = 0
+    code: CodeType | None = None
+    instruction: int = 0
+
+    def __str__(self) -> str:
+        """``pump.st:14``; the path alone where the line is not known, "" where neither is."""
+        path, line = self.path, self.line
+        if self.code is not None:
+            path = self.code.co_filename
+            lines = [place[0] for place in self.code.co_positions()]
+            line = (lines[self.instruction // 2] if self.instruction // 2 < len(lines) else None) or 0
+        return f"{path}:{line}" if line else path
+
+
+class _Assigned:
+    """An output as a class attribute: keeps the value in the instance, and remembers which instruction assigned it.
+
+    It has no ``__get__``, so that reading an output costs what reading any attribute costs.
+    """
+
+    __slots__ = ("name",)
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __set__(self, program: Program, value: object) -> None:
+        program.__dict__[self.name] = value
+        frame = sys._getframe(1)
+        program._assigned[self.name] = frame.f_code, frame.f_lasti
+
+
 class Program(ABC):
     """Base of all programs. A subclass declares variables in its body and overrides `execute`."""
 
+    __slots__ = ("__dict__", "__weakref__", "_assigned")
+    _assigned: dict[str, tuple[CodeType, int]]
+    """By output: the instruction that assigned it last. Not among the variables, which are the program's state."""
     variables: ClassVar[dict[str, Variable]] = {}
     source_path: ClassVar[str] = ""
     """The file that the program was compiled from, where that is not its module's."""
@@ -179,9 +228,13 @@ class Program(ABC):
             name: replace(declared, name=name) for name, declared in vars(cls).items() if isinstance(declared, Variable)
         }
         cls.variables = {**cls.variables, **own}
+        for name, declared in own.items():
+            if declared.role is Role.OUTPUT and declared.kind is not TagKind.MESSAGE:
+                setattr(cls, name, _Assigned(name))
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Program:
         self = super().__new__(cls)
+        self._assigned = {}
         for v in cls.variables.values():
             initial: object = v.initial
             if v.kind is TagKind.MESSAGE:
@@ -193,9 +246,20 @@ class Program(ABC):
     def execute(self, scan: ScanInfo) -> None:
         """One scan: read inputs, set outputs, return. What it raises stops the task."""
 
+    def _whole_state(self, now_ns: int) -> Any:
+        """Return all that the next scans depend on, as something hashable, with moments relative to `now_ns`; None where
+        that is not known, as for logic in Python, which may keep anything anywhere."""
+        return None
+
+    def place(self, name: str) -> Place | None:
+        """The line that assigned output `name` last; None while it has its initial value, or one that was put in."""
+        assigned = self._assigned.get(name)
+        return Place(code=assigned[0], instruction=assigned[1]) if assigned is not None else None
+
     def put(self, name: str, value: Scalar) -> None:
         """Set a variable from outside the logic: what a force does."""
         self.__dict__[name] = value
+        self._assigned.pop(name, None)
 
     def retained(self) -> dict[str, Any]:
         """What a warm start needs: numbers, strings, lists and maps of those by variable."""
@@ -238,6 +302,7 @@ __all__ = [
     "InputTripped",
     "Message",
     "Outbox",
+    "Place",
     "Program",
     "ProgramFailed",
     "ProgramStuck",

@@ -3,6 +3,11 @@
 A `Proof` says what may come in (a finite domain a scan: values, qualities, how much time passes), which part of the program's
 state matters, and the invariants. The program itself runs, scan by scan; nothing is modelled twice. Breadth first, so the way
 to the first violation is a shortest one. Bounded: what was not looked at is said, and is no proof.
+
+A proof is only as good as its key: a key that leaves out what decides ends the search too soon. Structured Text needs no key,
+since all of its state is known. The timers and other blocks of a program always count. A key that is given is tested
+afterwards by random ways through the program without any key: a state that the search has not seen makes the result
+"not proved".
 """
 
 from __future__ import annotations
@@ -12,15 +17,20 @@ from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import product
+from random import Random
 from typing import Any
 
 from gateway.core.clock import NS_PER_MS
+from gateway.core.errors import UsageError
 from gateway.core.image import Message, TagKind
 from gateway.core.values import Quality, Reason, TagValue
+from plc.blocks import FunctionBlock
 from plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
 from plc.states import StateMachine
 
 MAX_STATES = 200_000
+WALKS, WALK_SCANS = 64, 64
+"""Random ways that test a key, and the scans of each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +64,14 @@ class Proof:
 
     `make` makes it; `domain` has for each input the values that a scan may bring (a message input's are payloads, None for
     no message; None for any other is BAD without a value, a `TagValue` one of any quality); `steps_ms` the times between
-    scans; `key` what of the program matters, as something hashable: two states with one key are the same. `clogs`: mailboxes
-    may also be full.
+    scans; `key` what of the program matters, as something hashable: two states with one key are the same. Structured Text
+    needs none: then all of its state matters. `clogs`: mailboxes may also be full.
     """
 
     make: Callable[[], Program]
     domain: Mapping[str, Sequence[Any]]
     invariants: Mapping[str, Invariant]
-    key: Callable[[Any], Hashable]
+    key: Callable[[Any], Hashable] | None = None
     steps_ms: tuple[float, ...] = (10.0,)
     clogs: bool = False
     requirement: Mapping[str, str] = field(default_factory=dict)
@@ -86,7 +96,10 @@ def machine_key(program: StateMachine) -> Hashable:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """`broken`: the invariant that does not hold (or the error that a scan raised), and `way` to it, scan by scan."""
+    """`broken`: the invariant that does not hold (or the error that a scan raised), and `way` to it, scan by scan.
+
+    `reason`: why it is not proved although nothing is broken.
+    """
 
     states: int
     transitions: int
@@ -94,6 +107,12 @@ class Result:
     complete: bool
     broken: str = ""
     way: tuple[Given, ...] = ()
+    reason: str = ""
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a bound of the search was reached, so that a larger one may bring a proof."""
+        return self.reason.startswith("more than")
 
     @property
     def proved(self) -> bool:
@@ -101,16 +120,20 @@ class Result:
 
 
 def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -> Result:
-    """Look at everything reachable, or until something is broken, or the bounds are reached."""
+    """Look at everything reachable, or until something is broken, or the bounds are reached.
+
+    Raises `UsageError` where `domain` and the program's inputs differ, and where a program in Python has no key.
+    """
     choices = proof.choices()
     first = _Point(proof.make(), 0, 0, None, None)
-    seen = {proof.key(first.program)}
+    _check(proof, first.program)
+    seen = {_key(proof, first)}
     waiting = deque([first])
     transitions, depth = 0, 0
     while waiting:
         point = waiting.popleft()
         if point.number >= max_depth:
-            return Result(len(seen), transitions, point.number, complete=False)
+            return Result(len(seen), transitions, depth, complete=False, reason=f"more than {max_depth} scans deep")
         depth = max(depth, point.number + 1)
         for given in choices:
             following = point.after(given)
@@ -118,13 +141,55 @@ def prove(proof: Proof, max_states: int = MAX_STATES, max_depth: int = 10_000) -
             broken = _broken(proof, following, given)
             if broken:
                 return Result(len(seen), transitions, following.number, False, broken, tuple(following.way()))
-            key = proof.key(following.program)
+            key = _key(proof, following)
             if key not in seen:
                 if len(seen) >= max_states:
-                    return Result(len(seen), transitions, depth, complete=False)
+                    return Result(
+                        len(seen), transitions, depth, complete=False, reason=f"more than {max_states} states"
+                    )
                 seen.add(key)
                 waiting.append(following)
-    return Result(len(seen), transitions, depth, complete=True)
+    whole = Result(len(seen), transitions, depth, complete=True)
+    return whole if proof.key is None else _tested(proof, choices, seen, whole)
+
+
+def _check(proof: Proof, program: Program) -> None:
+    inputs = {v.name for v in program.variables.values() if v.role is Role.INPUT}
+    if proof.domain.keys() != inputs:
+        raise UsageError(
+            "the domain of a proof names the program's inputs",
+            expected=", ".join(sorted(inputs)) or "none",
+            got=", ".join(sorted(proof.domain)) or "none",
+        )
+    if proof.key is None and program._whole_state(0) is None:
+        raise UsageError("a proof of a program in Python needs a key", expected="key: what of the program matters")
+
+
+def _key(proof: Proof, point: _Point) -> Hashable:
+    """What tells the state of `point` from others: with a key the blocks still count, and the first scan differs always."""
+    program, now_ns = point.program, point.now_ns
+    if proof.key is None:
+        return point.number == 0, program._whole_state(now_ns)
+    blocks = [v.state(now_ns) for v in vars(program).values() if isinstance(v, FunctionBlock)]
+    return point.number == 0, proof.key(program), tuple(blocks)
+
+
+def _tested(proof: Proof, choices: Sequence[Given], seen: set[Hashable], whole: Result) -> Result:
+    """`whole`, unless a random way without a key breaks an invariant or comes to a state that the search did not see."""
+    random = Random(0)
+    for _ in range(WALKS):
+        point = _Point(proof.make(), 0, 0, None, None)
+        way: list[Given] = []
+        for _ in range(WALK_SCANS):
+            given = random.choice(choices)
+            way.append(given)
+            point = _Point(point.program, point.now_ns + round(given.ms * NS_PER_MS), point.number + 1, None, None)
+            if broken := _broken(proof, point, given):
+                return Result(whole.states, whole.transitions, len(way), False, broken, tuple(way))
+            if _key(proof, point) not in seen:
+                reason = "the key leaves out what decides: two states with one key go on differently"
+                return Result(whole.states, whole.transitions, whole.depth, complete=False, reason=reason)
+    return whole
 
 
 def shown(proof: Proof, way: Sequence[Given]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from gateway.core.image import (
 from gateway.core.values import Quality, Reason, Scalar
 from plc.binding import BoundProgram
 from plc.forces import Forces
-from plc.program import Outbox, ProgramFailed, Variable
+from plc.program import Outbox, Place, ProgramFailed, Variable
 
 Seen = Callable[[], dict[str, Scalar | None]]
 """A program's inputs as it read them, by variable."""
@@ -69,6 +69,8 @@ class Change:
     after: Scalar | None
     inputs: dict[str, Scalar | None]
     forced: bool = False
+    place: Place | None = None
+    """The line of the program that assigned `after`."""
 
     def describe(self, now_ns: int) -> dict[str, Any]:
         """JSON-able."""
@@ -81,6 +83,7 @@ class Change:
             "after": self.after,
             "inputs": self.inputs,
             "forced": self.forced,
+            "place": str(self.place or ""),
         }
 
 
@@ -106,6 +109,8 @@ class OutputImage:
         self._reals = [o.index for o in self.outputs if layout.tags[o.index].kind is TagKind.REAL]
         self._by_tag = {o.tag: o for o in self.outputs}
         self._plain = [o for o in self.outputs if o.outbox is None]
+        self._missing: dict[int, Reason] = {}
+        """Why an output has no value, by its place, where that is not because no program has set it yet."""
         self._same = False
         """Whether what is collected is what was published last, times aside."""
         self._room_for: Sequence[Scalar | None] | None = None
@@ -168,6 +173,14 @@ class OutputImage:
                 if output.tag in forced:
                     output.program.put(output.name, forced[output.tag].value)
 
+    def publish_forces(self) -> None:
+        """From the next publication on forced outputs have their values, although no program runs."""
+        for output in self._plain:
+            force = self.forces.outputs.get(output.tag)
+            if force is not None and self._values[output.index] != force.value:
+                self._values[output.index] = force.value
+                self._same = False
+
     def room(self, taken: Sequence[Scalar | None]) -> None:
         """Learn from INPUTS how far the messages got that were sent."""
         if taken is self._room_for:  # a reader gives the same columns as long as nothing in them changes
@@ -201,11 +214,16 @@ class OutputImage:
             before = values[output.index]
             if value is before or value == before:
                 continue
-            if value != value:  # not a number must not reach a plant
-                value = None
-            if value is not before:
+            if value != value:  # not a number must not reach a plant; the gateway reports it
+                value, broken = None, output.index not in self._missing
+                self._missing[output.index] = Reason.NOT_A_NUMBER
+            else:
+                broken = False
+                self._missing.pop(output.index, None)
+            if value is not before or broken:
                 kept = self.changes.setdefault(output.tag, deque(maxlen=MAX_CHANGES))
-                change = Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None)
+                place = output.program.place(output.name) if force is None else None
+                change = Change(output.tag, now_ns, scan, output.owner, before, value, seen(), force is not None, place)
                 kept.append(change)
                 if self.on_change is not None:
                     self.on_change(change)
@@ -233,12 +251,25 @@ class OutputImage:
             but = {o.index: Quality.SIMULATED for o in self._plain if o.tag in self.forces.outputs}
             self._same = False
         try:
-            self.writer.publish_columns(values, _GOOD, _NO_REASON, now_ns, messages, but=but, same=self._same)
+            self.writer.publish_columns(
+                values, _GOOD, _NO_REASON, now_ns, messages, but=but, same=self._same, missing=self._missing
+            )
         except NotEncodable as e:
             values[self.writer.shape.index[e.tag]] = None  # so that stopping can publish what is left
             owner = next((output.owner for output in self.outputs if output.tag == e.tag), "?")
             raise ProgramFailed(owner, f"{e.message}; expected {e.expected}; got {e.got}", variable=e.tag) from e
         self._same = True
+
+    def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
+        """(program, ``FILE:LINE``) that set `tag` to `value` (None: to something that is not a number), by the changes that are
+        remembered. The line is "" where none of them is that change, and they come from more than one line."""
+        changes = self.changes.get(tag, ())
+        owner = self._by_tag[tag].owner if tag in self._by_tag else ""
+        for change in reversed(changes):
+            if change.after == value and not change.forced:
+                return owner, str(change.place or "")
+        places = {str(change.place or "") for change in changes}
+        return owner, places.pop() if len(places) == 1 else ""
 
     def stop(self, now_ns: int) -> None:
         """Publish that nothing may be acted upon any more: flagged stopped, every tag BAD, values as last."""

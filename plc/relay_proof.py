@@ -1,8 +1,8 @@
 """What is proved of the observatory's relay: SPEC part 1, row ControlLogic, with rulings 1, 2, 5 and 6.
 
 Over every command that matters (its sign is what decides, so -1, 0, 1 and the limits of the type; and what is no command),
-responses that come or not, and mailboxes that are emptied or not. The queue is bounded at three, so that all its fillings
-are seen.
+responses that come or not, and mailboxes that are emptied or not. The queue and the data log are bounded at three, so that
+all their fillings are seen.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from collections.abc import Hashable
 from gateway.core.statemachine import STATE_CODES, delta, encode_period
 from plc.program import ScanInfo
 from plc.prove import Proof
-from plc.relay import Relay
+from plc.relay import DataLog, Relay
 
 _DEPTH = 2
+_LOG_CAPACITY = 3
 _SHORT, _TOO_LONG = b"a", b"b" * 300
 
 
@@ -26,6 +27,7 @@ class Watched(Relay):
     def __init__(self) -> None:
         super().__init__()
         self.response.depth = self.log.depth = _DEPTH
+        self.logic.data_log = DataLog(_LOG_CAPACITY)
         self.sent = 0
         self.logged_before = 0
 
@@ -44,7 +46,7 @@ class Watched(Relay):
         """Counters grow for ever and decide nothing; the sign, the queues' fillings and the mailboxes' do."""
         sign = (self.period_s > 0) - (self.period_s < 0)
         waiting = tuple(response.data for response in self._outgoing.queue)
-        unsent = min(self.logic.data_log.total - self._log_sent, 2 * _DEPTH)
+        unsent = self.logic.data_log.total - self._log_sent
         boxes = tuple((box.outstanding, len(box.pending)) for box in (self.response, self.log))
         return sign, self.state, waiting, unsent, boxes
 

@@ -3,7 +3,8 @@
 Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), as in IEC 61131-3, 6.8.2. They share one
 thread: a task is never interrupted; of those that are due the one with the smallest PRIORITY number goes first, and of equals
 the one that has waited longest. If one stops by itself all stop, with the outputs safe. After a stop by the watchdog or a
-scan that did not end, the programs are made anew and begin warm, at most `max_restarts` times in a row.
+scan that did not end, the programs are made anew and begin warm, at most `max_restarts` times in a row. A program runs only after
+its inputs have been good once (plc.start), also after a restart.
 
 Driven like a `CyclicTask`: by `deadline_ns` and `run_once`, on the wall clock or in virtual time, and never knows which.
 """
@@ -18,7 +19,7 @@ from typing import Any
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
 from gateway.core.image import INPUTS, Image, TagSpec
-from gateway.core.values import Scalar, TagValue
+from gateway.core.values import Quality, Reason, Scalar, TagValue
 from plc.binding import BoundProgram
 from plc.config import PlcConfig, TaskSpec
 from plc.forces import Forces, checked
@@ -26,6 +27,8 @@ from plc.program import Program
 from plc.publishing import Change, OutputImage
 from plc.retain import Retained
 from plc.scan import Scan
+from plc.sources import Source, sources
+from plc.start import InputsMissing, Starts
 from plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
 
 RESTARTABLE = (StopReason.WATCHDOG, StopReason.STUCK)
@@ -34,6 +37,7 @@ STEADY_NS = 60 * NS_PER_S
 _NEVER_NS = 2**62
 _STOPPED = TaskState.STOPPED  # an Enum's members are slow to look up
 _EVENT_MS = 1e9
+_ROUNDING = 1e-9  # intervals such as 0.3 ms are no whole multiples of each other in binary
 
 
 @dataclass
@@ -70,8 +74,11 @@ class Runner:
         self._triggered: list[Entry] = []
         """Those of them that are SINGLE."""
         self.programs: list[BoundProgram] = []
+        self.sources: list[Source] = []
+        """The files that the programs were made from."""
         self.outputs: OutputImage
         self.retained: Retained
+        self.starts: Starts
         self._limits: dict[str, tuple[float, float] | None] = {}
         self._on_change = on_change
         self._image = image
@@ -82,6 +89,8 @@ class Runner:
         self._started_ns = 0
         self._began = False
         self._stopped: Entry | None = None
+        self._ran: Entry | None = None
+        self._stepped = 0
         self._ended: StopReason | None = None
         self._assemble(self._made(), cold=config.cold)
 
@@ -89,7 +98,8 @@ class Runner:
 
     def _made(self) -> list[BoundProgram]:
         """The programs, new. Raises `FileInvalid` also where they no longer fit the process image."""
-        programs = [p.bind(self.config.python_path) for p in self.config.programs]
+        together: dict[Any, Any] = {}  # new with the programs: global variables begin with their initial values, too
+        programs = [p.bind(self.config.python_path, together) for p in self.config.programs]
         for new, old in zip(programs, self.programs, strict=False):
             if _interface(new) != _interface(old):
                 raise FileInvalid(
@@ -100,6 +110,7 @@ class Runner:
     def _assemble(self, programs: list[BoundProgram], cold: bool) -> None:
         config = self.config
         self.programs = programs
+        self.sources = sources(programs, self.sources)
         path = Path(config.retain_path) if config.retain_path else None
         self.retained = Retained(self.programs, path, cold=cold)
         self.outputs = OutputImage(self._image, self.programs, self.forces)
@@ -107,12 +118,28 @@ class Runner:
         specs = config.tasks or (TaskSpec("main", config.cycle_ms),)
         self._check(specs)
         self.entries = []
+        single = {spec.name for spec in specs if spec.single}
+        self.starts = Starts(
+            self._image,
+            [(b, p.start) for b, p in zip(self.programs, config.programs, strict=True)],
+            self.forces,
+            config.heartbeat_limit_ms,
+            [p.name for p in config.programs if (p.task or specs[0].name) in single],
+        )
         for spec in specs:
             mine = [
                 b for b, p in zip(self.programs, config.programs, strict=True) if (p.task or specs[0].name) == spec.name
             ]
-            scan = Scan(self._image, mine, config.heartbeat_limit_ms, self.outputs, outputs_first=config.outputs_first)
-            timing = TaskConfig(_EVENT_MS if spec.single else spec.interval_ms, config.late_ms, config.stop_after)
+            scan = Scan(
+                self._image,
+                mine,
+                config.heartbeat_limit_ms,
+                self.outputs,
+                outputs_first=config.outputs_first,
+                starts=self.starts.all,
+            )
+            cycle_ms = _EVENT_MS if spec.single else spec.interval_ms
+            timing = TaskConfig(cycle_ms, spec.late_ms or config.late_ms, config.stop_after, spec.name)
             self.entries.append(Entry(spec, scan, CyclicTask(scan, timing, self._now_ns, self._guard)))
         self._triggered = [entry for entry in self.entries if entry.single]
 
@@ -172,14 +199,24 @@ class Runner:
                 self._restart_by_itself(self._stopped)
             return
         entry = self.entries[0] if len(self.entries) == 1 else self._next(now_ns)
+        self._look_for_delay(entry)
+        stepped = entry.task.paused and entry.task.steps > 0
+        if self.starts.waiting and (stepped or not self.paused):
+            try:
+                self.starts.look(now_ns)
+            except InputsMissing as e:
+                entry.task.fail(e, StopReason.NOT_STARTED)
+                self._on_stopped(entry)
+                return
         entry.task.run_once()
+        self._ran = entry
         if entry.task.state is _STOPPED:
             self._on_stopped(entry)
             return
         if self._triggered:
             if entry.single:
                 entry.task.deadline_ns = _NEVER_NS
-            self._look_at_triggers(entry.scan)
+            self._look_at_triggers(entry.scan, stepped=stepped)
         if self._in_a_row and now_ns - self._started_ns > STEADY_NS:
             self._in_a_row = 0
         try:
@@ -189,6 +226,18 @@ class Runner:
             entry.task.stop()
             self._on_stopped(entry)
 
+    def _look_for_delay(self, entry: Entry) -> None:
+        """Note which task still ran when `entry` became due: a late scan is not always the fault of the task that is late."""
+        before = self._ran
+        if before is not None and before is not entry:
+            held_up = before.task.ended_ns > entry.task.deadline_ns
+            took_ms = before.task.duration.max_ns / 1e6
+            entry.task.held_up_by = (
+                f"task {before.spec.name} (its longest scan took {took_ms:.3f} ms)" if held_up else ""
+            )
+        else:
+            entry.task.held_up_by = ""
+
     def _next(self, now_ns: int) -> Entry:
         """Of the tasks that are due the one of the highest priority; where none is, the one that will be first."""
         due = [e for e in self.entries if e.task.deadline_ns <= now_ns]
@@ -196,11 +245,15 @@ class Runner:
             return min(self.entries, key=lambda e: e.task.deadline_ns)
         return min(due, key=lambda e: (e.spec.priority, e.task.deadline_ns))
 
-    def _look_at_triggers(self, scan: Scan) -> None:
+    def _look_at_triggers(self, scan: Scan, *, stepped: bool) -> None:
         for entry in self._triggered:
-            now = bool(scan.value(entry.single))
+            value = scan.value(entry.single)
+            if value is None:
+                continue  # not known now: that it was false before it is true again would be a guess
+            now = bool(value)
             if now and not entry.before:
                 entry.task.deadline_ns = self._now_ns()
+                entry.task.steps += stepped
             entry.before = now
 
     def _on_stopped(self, entry: Entry) -> None:
@@ -231,6 +284,7 @@ class Runner:
         self.outputs.release()
         for entry in self.entries:
             entry.scan.release()
+        self.starts.release()
         self._assemble(programs, cold)
         self.pause(paused)
         self.restarts += 1
@@ -266,6 +320,7 @@ class Runner:
 
     def pause(self, on: bool) -> None:
         """Stop executing, or go on; outputs stay as they are, and are still being published."""
+        self._stepped = 0
         for entry in self.entries:
             entry.task.paused, entry.task.steps = on, 0
 
@@ -283,11 +338,27 @@ class Runner:
         if not self.paused:
             raise UsageError("a PLC is stepped while it is paused", hint="pause it first")
 
-    def step(self, count: int) -> None:
-        """While paused, execute `count` scans of each cyclic task. Raises `UsageError` while it is not paused."""
+    def step(self, count: int) -> dict[str, int]:
+        """While paused, execute `count` scans of the fastest cyclic task, and of each other one as many as fall due in that
+        time: of a task of 100 ms beside one of 10 ms every tenth. A task with a trigger runs when a step triggers it.
+
+        The scans of each cyclic task, by its name. Raises `UsageError` while it is not paused.
+        """
         self.check_step()
-        for entry in self.entries:
-            entry.task.steps += 0 if entry.single else count
+        cyclic = [e for e in self.entries if not e.single]
+        base_ms = min(e.spec.interval_ms for e in cyclic)
+        before, self._stepped = self._stepped, self._stepped + count
+        found = {}
+        for entry in cyclic:
+            cycles = entry.spec.interval_ms / base_ms
+            found[entry.spec.name] = int(self._stepped / cycles + _ROUNDING) - int(before / cycles + _ROUNDING)
+            entry.task.steps += found[entry.spec.name]
+        return found
+
+    @property
+    def stepping(self) -> int:
+        """Scans that are still to be executed while paused."""
+        return sum(e.task.steps for e in self.entries) if self._stopped is None and self._ended is None else 0
 
     def force(
         self, tag: str, value: Scalar, by: str = "", record: Callable[[Scalar | None, Scalar], None] | None = None
@@ -320,6 +391,11 @@ class Runner:
             return [(b.program, v) for b in self.programs for v, binding in b.inputs.items() if binding.tag == tag]
         return [(b.program, v.name) for b in self.programs for v, published in b.published() if published == tag]
 
+    def waits(self, tag: str) -> str:
+        """What the program that writes output or local `tag` waits for before it starts; empty where it has started."""
+        owner = next((b.name for b in self.programs if tag in (t for _, t in b.published())), "")
+        return next((start.reason() for start in self.starts.waiting if start.name == owner), "")
+
     def why(self, tag: str) -> list[dict[str, Any]]:
         """The last changes of an output or local, the newest first. Raises `UsageError` for what no program writes."""
         if tag not in self.outputs.last():
@@ -327,16 +403,36 @@ class Runner:
         now_ns = self._now_ns()
         return [change.describe(now_ns) for change in reversed(self.outputs.changes.get(tag, ()))]
 
+    def origin(self, tag: str, value: Scalar | None) -> tuple[str, str]:
+        """`OutputImage.origin`; a path below the system's folder is relative to it."""
+        program, place = self.outputs.origin(tag, value)
+        for folder in self.config.python_path:
+            place = place.removeprefix(folder.rstrip("/") + "/")
+        return program, place
+
+    @property
+    def halted(self) -> bool:
+        """Whether it has stopped, for good or until a restart: then it reads no inputs."""
+        return self._stopped is not None or self._ended is not None
+
+    def _as_read(self, value: TagValue) -> TagValue:
+        """An input as the PLC knows it now: one that nothing reads any more is not good, whatever it was."""
+        if not self.halted:
+            return value
+        return TagValue(value.value, Quality.BAD, Reason.NOT_OPERATIONAL, value.t_ns)
+
     def inputs(self) -> dict[str, TagValue]:
-        return self.entries[0].scan.inputs()
+        return {tag: self._as_read(value) for tag, value in self.entries[0].scan.inputs().items()}
 
     def seen_otherwise(self, tag: str) -> dict[str, TagValue]:
         """Of all tasks: `Scan.seen_otherwise`."""
+        if self.halted:  # no program sees anything
+            return {}
         return {name: seen for entry in self.entries for name, seen in entry.scan.seen_otherwise(tag).items()}
 
     def input(self, tag: str) -> TagValue:
         """`Scan.input` of the first task."""
-        return self.entries[0].scan.input(tag)
+        return self._as_read(self.entries[0].scan.input(tag))
 
     @property
     def gateway_alive(self) -> bool:
@@ -353,9 +449,16 @@ class Runner:
         """JSON-able: the first task's figures as those of the whole, and each task's own."""
         now_ns = self._now_ns()
         shown = self._stopped or self.entries[0]
+        described = shown.task.describe()
+        if described["state"] == "running" and self.starts.waiting:
+            described["state"] = "waiting"
+        if described["state"] == "waiting" and (error := self.starts.error):
+            described["error"] = str(error)
         return {
-            **shown.task.describe(),
+            **described,
+            **self.starts.describe(now_ns),
             "restarts": self.restarts,
+            "stepping": self.stepping,
             "restart_in_ms": max(0.0, (self._restart_ns - now_ns) / 1e6) if self._restart_ns < _NEVER_NS else None,
             "retain": self.retained.describe(),
             "forces": self.forces.describe(now_ns),

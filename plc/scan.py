@@ -7,18 +7,21 @@ When the gateway's heartbeat in the image is older than its limit, or its region
 GATEWAY_DEAD, whatever quality the image shows. Then, and for every input that is BAD by itself, the input's policy
 says what the program sees (`InputBinding.if_bad`). A forced input is SIMULATED, whatever the image shows. Messages are
 events, not states: they are handed over whole, in order, exactly once, whatever the quality of their tag.
+
+A program that has not started (plc.start) is not executed, and nothing of it is published. Messages wait as long as a program
+that takes messages has not started.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import FieldtwinError, FileInvalid
-from gateway.core.image import INPUTS, Image, Message, TagKind, TagSpec
-from gateway.core.values import Quality, Reason, Scalar, TagValue
+from gateway.core.image import INPUTS, Image, Message, RegionReader, TagKind, TagSpec
+from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 from plc.binding import BoundProgram, InputBinding, substitute
 from plc.program import (
     InputTripped,
@@ -28,9 +31,11 @@ from plc.program import (
     Role,
     ScanInfo,
     ScanStuck,
+    ScanTooLong,
     Variable,
 )
 from plc.publishing import OutputImage, find
+from plc.start import ProgramStart
 
 _BAD = int(Quality.BAD)
 MAX_SHOWN, MAX_SHOWN_BYTES = 4, 24
@@ -52,8 +57,8 @@ class _Input:
         self.widen = variable.kind is TagKind.REAL and spec.kind is TagKind.INT
         self.hold = binding.if_bad == "hold"
         self.trip = binding.if_bad == "trip"
-        self.armed = False
-        """Trips only once it was good: at start nothing has been read yet."""
+        self.known: Scalar | None = None
+        """The last value that was not BAD. An input trips only after it had one."""
         self.substitute = substitute(spec, binding.if_bad)
         self.held: tuple[Scalar | None, int] | None = None
 
@@ -65,6 +70,8 @@ class _Input:
             return TagValue(self.substitute, Quality.SUBSTITUTED, seen.reason, seen.t_ns)
         if self.hold and self.held is not None:
             return TagValue(self.held[0], Quality.UNCERTAIN, seen.reason, self.held[1])
+        if seen.value is None and self.known is not None:  # a gateway that was restarted has not read it yet
+            return TagValue(self.known, seen.quality, seen.reason, seen.t_ns)
         return seen
 
 
@@ -73,6 +80,7 @@ class Scan:
 
     `outputs` is the output image of all tasks; without one, the scan has its own. With `outputs_first` a scan begins by
     publishing what the scan before computed: outputs then change at the cycle's start, whatever the logic's length.
+    `starts` says by name which programs may run; without it all may.
     After a restart of the process messages go on behind the last one that OUTPUTS says was consumed. Raises `FileInvalid`
     when a binding's tag is not in the image.
     """
@@ -85,15 +93,24 @@ class Scan:
         outputs: OutputImage | None = None,
         *,
         outputs_first: bool = False,
+        starts: Mapping[str, ProgramStart] | None = None,
     ) -> None:
         self.number = 0
         """Scans executed, the one that runs included."""
+        self._not_run: list[tuple[BoundProgram, ProgramStart]] = []
+        """Programs that have not executed a scan yet, where they have to wait for that."""
+        self._waiting: frozenset[str] = frozenset()
+        """The names of those that had not started when this was last looked at."""
         self.gateway_alive = False
         self.output_image = outputs or OutputImage(image, programs)
         self._outputs_first = outputs_first
         self._limit_ns = int(heartbeat_limit_ms * NS_PER_MS)
         self._programs = tuple(programs)
         self._reader = image.reader(INPUTS)
+        self._onlooker = image.reader(INPUTS)
+        """Reads INPUTS while messages have to stay where they are."""
+        if starts is not None:
+            self._not_run = [(bound, starts[bound.name]) for bound in programs]
         self._plain: list[_Input] = []
         self._messages: list[_Input] = []
         self._between: list[tuple[dict[str, Any], Variable, str]] = []
@@ -130,8 +147,9 @@ class Scan:
             if name in others:
                 value = self.output_image.current(others[name])
                 forced = others[name] in self.output_image.forces.outputs
-                quality = Quality.SIMULATED if forced else Quality.BAD if value is None else Quality.GOOD
-                return TagValue(value, quality)
+                if value is None and not forced:
+                    return NEVER
+                return TagValue(value, Quality.SIMULATED if forced else Quality.GOOD)
             return own[name].apply(self._looked_up(own[name]))
 
         bound.program._lookup = lookup
@@ -143,26 +161,57 @@ class Scan:
         self.number += 1
         if self._outputs_first:
             self.output_image.publish(now_ns)
-        self._read(now_ns)
-        self.output_image.force()
-        info = ScanInfo(now_ns, self.number, self.number == 1)
-        for bound in self._programs:
-            try:
-                bound.program.execute(info)
-            except (
-                Exception,
-                SystemExit,
-                ScanStuck,
-            ) as e:  # the logic is the user's: whatever it raises stops the task
-                raise _failed(bound, e) from e
-        self.output_image.collect(now_ns, self.number, self._seen)
+        if self._not_run:
+            self._execute_started(now_ns)
+        else:
+            self._read(now_ns, self._reader)
+            self.output_image.force()
+            info = ScanInfo(now_ns, self.number, self.number == 1)
+            for bound in self._programs:
+                _run(bound, info)
+            self.output_image.collect(now_ns, self.number, self._seen)
         if not self._outputs_first:
             self.output_image.publish(now_ns)
 
+    def _execute_started(self, now_ns: int) -> None:
+        """A scan of the programs that have started, while others have not, or for the first time."""
+        waiting = self._read_for_started(now_ns)
+        self.output_image.force()
+        first = {bound.name: start for bound, start in self._not_run if start.started}
+        for bound in self._programs:
+            if bound.name not in waiting:
+                _run(bound, ScanInfo(now_ns, self.number, bound.name in first))
+        for start in first.values():
+            start.ran = True
+        seen = {name: of for name, of in self._seen.items() if name not in waiting}
+        self.output_image.collect(now_ns, self.number, seen)
+        self._not_run = [(bound, start) for bound, start in self._not_run if not start.ran]
+
+    def _read_for_started(self, now_ns: int) -> frozenset[str]:
+        """Read the inputs while programs wait, and return their names. Messages stay where they are as long as one that takes
+        messages waits."""
+        waiting = self._waiting = frozenset(bound.name for bound, start in self._not_run if not start.started)
+        held_back = any(item.owner in waiting for item in self._messages)
+        self._read(now_ns, self._onlooker if held_back else self._reader)
+        if held_back:
+            for item in self._messages:
+                item.namespace[item.name] = ()
+        return waiting
+
+    @property
+    def waiting(self) -> bool:
+        """Whether none of the programs has started."""
+        return len(self._not_run) == len(self._programs) > 0 and not any(start.started for _, start in self._not_run)
+
     def hold(self, now_ns: int) -> None:
-        """Instead of a scan while the task is paused: inputs are looked at, outputs stay and are still being published."""
-        self._snapshot = self._reader.snapshot()
-        self.gateway_alive = self._alive(now_ns)
+        """Instead of a scan, while the task is paused or all of its programs wait for their start: inputs are looked at, messages
+        stay where they are, outputs stay and are still being published. A force counts although the program waits."""
+        if self.waiting:
+            self._read_for_started(now_ns)
+            self.output_image.publish_forces()
+        else:
+            self._snapshot = self._onlooker.snapshot()
+            self.gateway_alive = self._alive(now_ns)
         self.output_image.publish(now_ns)
 
     def stop(self, now_ns: int) -> None:
@@ -171,13 +220,14 @@ class Scan:
 
     def release(self) -> None:
         self._reader.release()
+        self._onlooker.release()
 
     def _alive(self, now_ns: int) -> bool:
         snapshot = self._snapshot
         return snapshot.counter > 0 and now_ns - snapshot.t_ns <= self._limit_ns and not snapshot.stopped
 
-    def _read(self, now_ns: int) -> None:
-        snapshot = self._snapshot = self._reader.snapshot()
+    def _read(self, now_ns: int, reader: RegionReader) -> None:
+        snapshot = self._snapshot = reader.snapshot()
         alive = self.gateway_alive = self._alive(now_ns)
         values, qualities = snapshot.values, snapshot.qualities
         for item in self._plain:
@@ -185,7 +235,7 @@ class Scan:
                 value = values[item.index]
                 if item.hold:
                     item.held = value, snapshot.time_ns(item.index)
-                item.armed = True
+                item.known = value
             else:
                 value = self._bad(item)
             if item.widen and value is not None:
@@ -211,7 +261,8 @@ class Scan:
 
     def _bad(self, item: _Input) -> Scalar | None:
         seen = self._seen_at(item.index)
-        if item.trip and item.armed and item.tag not in self.output_image.forces.inputs:
+        tripped = item.trip and item.known is not None and item.owner not in self._waiting
+        if tripped and item.tag not in self.output_image.forces.inputs:
             raise InputTripped(item.owner, f"an input that must not be bad is: {seen.reason}", variable=item.tag)
         return item.apply(seen).value
 
@@ -270,6 +321,14 @@ class Scan:
         }
 
 
+def _run(bound: BoundProgram, info: ScanInfo) -> None:
+    """One scan of a program. Raises `ProgramFailed`."""
+    try:
+        bound.program.execute(info)
+    except (Exception, SystemExit, ScanStuck) as e:  # the logic is the user's: whatever it raises stops the task
+        raise failed(bound, e) from e
+
+
 def _as_text(messages: tuple[Message, ...]) -> str | None:
     """The messages that a scan took, in hex and shortened, for people who ask why; None for none."""
     shown = [m.data[:MAX_SHOWN_BYTES].hex() + ("..." if len(m.data) > MAX_SHOWN_BYTES else "") for m in messages]
@@ -277,7 +336,7 @@ def _as_text(messages: tuple[Message, ...]) -> str | None:
     return ", ".join(shown[:MAX_SHOWN] + more) or None
 
 
-def _failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
+def failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
     """Which program, which line: the innermost line of the program's own file, else the innermost of all."""
     made = type(bound.program)
     own = made.source_path or getattr(sys.modules.get(made.__module__), "__file__", None)
@@ -290,7 +349,8 @@ def _failed(bound: BoundProgram, error: BaseException) -> ProgramFailed:
         tb = tb.tb_next
     if made.source_path and not inside:  # on the way in or out, where no line of the engineer's runs
         path, line = made.source_path, 0
-    if isinstance(error, ScanStuck):
-        return ProgramStuck(bound.name, f"the scan did not end: {error}", path=path, line=line)
+    if isinstance(error, ScanStuck | ScanTooLong):
+        reason = error.message if isinstance(error, ScanTooLong) else str(error)
+        return ProgramStuck(bound.name, f"the scan did not end: {reason}", path=path, line=line)
     text = error.message if isinstance(error, FieldtwinError) else str(error)
     return ProgramFailed(bound.name, f"{type(error).__name__}: {text}", path=path, line=line)

@@ -4,6 +4,7 @@ Deadlines are start + k x cycle and never move. A task that is late runs once an
 still to come: missed periods are skipped and counted, never made up for in a burst.
 
     READY --start--> RUNNING --stop------------------------------> STOPPED (requested)
+                        | ---inputs missing, policy is stop------> STOPPED (not started; plc.start)
                         | ---`stop_after` overruns in a row------> STOPPED (watchdog)
                         | ---a program raises--------------------> STOPPED (failed; `error` says where)
                         | ---a scan does not end-----------------> STOPPED (stuck; `error` says where)
@@ -35,6 +36,9 @@ class Executable(Protocol):
     def hold(self, now_ns: int) -> None: ...
 
     def stop(self, now_ns: int) -> None: ...
+
+    @property
+    def waiting(self) -> bool: ...
 
 
 class Guard(Protocol):
@@ -77,16 +81,18 @@ class StopReason(Enum):
     FAILED = "failed"
     STUCK = "stuck"
     TRIPPED = "tripped"
+    NOT_STARTED = "not started"
 
 
 @dataclass(frozen=True, slots=True)
 class TaskConfig:
     """`cycle_ms` between deadlines; a scan that starts more than `late_ms` after its deadline, or ends after the next one,
-    is an overrun, and `stop_after` overruns in a row stop the task (0: never)."""
+    is an overrun, and `stop_after` overruns in a row stop the task (0: never). `name` is the task's, for messages."""
 
     cycle_ms: float
     late_ms: float = 5.0
     stop_after: int = 3
+    name: str = "main"
 
     def __post_init__(self) -> None:
         if not (self.cycle_ms > 0 and self.late_ms > 0 and self.stop_after >= 0):
@@ -107,8 +113,13 @@ class CyclicTask:
     ) -> None:
         self.config = config
         self.paused = False
-        """While paused each deadline holds the outputs instead of running the logic, but for `steps` scans."""
+        """While paused each deadline holds the outputs instead of running the logic, but for `steps` scans. So it does while none
+        of the task's programs has started."""
         self.steps = 0
+        self.held_up_by = ""
+        """What ran when the next scan became due, set by a runner of several tasks; empty: nothing that it knows of."""
+        self.ended_ns = 0
+        """When the last scan ended."""
         self._guard = guard
         self.state = TaskState.READY
         self.stop_reason = StopReason.NONE
@@ -141,7 +152,7 @@ class CyclicTask:
             raise Bug("a scan of a task that does not run", got=self.state.value)
         began_ns = self._now_ns()
         late_ns = began_ns - self.deadline_ns
-        if self.paused and not self.steps:
+        if (self.paused and not self.steps) or self._scan.waiting:
             self._scan.hold(began_ns)
             self.deadline_ns += ((began_ns - self.deadline_ns) // self._cycle_ns + 1) * self._cycle_ns
             return
@@ -159,7 +170,7 @@ class CyclicTask:
             self._stop(StopReason.STUCK if stuck else StopReason.TRIPPED if tripped else StopReason.FAILED)
             return
         self.scans += 1
-        ended_ns = self._now_ns()
+        ended_ns = self.ended_ns = self._now_ns()
         self.duration.record(ended_ns - began_ns)
         due_ns = self.deadline_ns = self.deadline_ns + self._cycle_ns
         missed = 0
@@ -168,7 +179,7 @@ class CyclicTask:
             self.missed_periods += missed
             self.deadline_ns += missed * self._cycle_ns
         if missed or late_ns > self._late_ns:
-            self._overrun()
+            self._overrun(late_ns, ended_ns - began_ns)
         else:
             self._overruns_in_a_row = 0
 
@@ -188,14 +199,23 @@ class CyclicTask:
         if self.state is not TaskState.STOPPED:
             self._stop(StopReason.REQUESTED)
 
-    def _overrun(self) -> None:
+    def fail(self, error: FieldtwinError, reason: StopReason) -> None:
+        """Stop because of `error`, which did not happen in a scan."""
+        self.error = error
+        self._stop(reason)
+
+    def _overrun(self, late_ns: int, took_ns: int) -> None:
         self.overruns += 1
         self._overruns_in_a_row += 1
         if self.config.stop_after and self._overruns_in_a_row >= self.config.stop_after:
+            config = self.config
+            late = f"{max(0, late_ns) / 1e6:.3f} ms late" + (
+                f" because {self.held_up_by} ran" if self.held_up_by else ""
+            )
             self.error = CheckFailed(
-                "the watchdog stopped the task",
-                expected=f"a scan every {self.config.cycle_ms} ms, at most {self.config.late_ms} ms late",
-                got=f"{self._overruns_in_a_row} overruns in a row, the longest scan {self.duration.max_ns / 1e6:.3f} ms",
+                f"the watchdog stopped task {config.name}",
+                expected=f"a scan every {config.cycle_ms:g} ms, at most {config.late_ms:g} ms late",
+                got=f"{self._overruns_in_a_row} overruns in a row; the last scan began {late}, and took {took_ns / 1e6:.3f} ms",
             )
             self._stop(StopReason.WATCHDOG)
 
@@ -206,11 +226,16 @@ class CyclicTask:
 
     def describe(self) -> dict[str, Any]:
         """JSON-able: state, reason, error, counters, lateness and duration in microseconds."""
+        state = self.state.value
+        if self.running and (self.paused or self._scan.waiting):
+            state = "paused" if self.paused else "waiting"
         return {
-            "state": "paused" if self.running and self.paused else self.state.value,
+            "state": state,
             "stop_reason": self.stop_reason.value,
             "error": str(self.error) if self.error else "",
+            "error_at": getattr(self.error, "place", ""),
             "cycle_ms": self.config.cycle_ms,
+            "late_ms": self.config.late_ms,
             "scans": self.scans,
             "missed_periods": self.missed_periods,
             "overruns": self.overruns,

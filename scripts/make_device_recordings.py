@@ -76,8 +76,18 @@ def rover(r: random.Random, n: int) -> Mapping[str, Value]:
 
 
 def sunspec(r: random.Random, n: int) -> Mapping[str, Value]:
-    """A 10 kW inverter at half its power; the third phase current is not implemented."""
+    """A 10 kW inverter at half its power. The current of the third phase and much else is not implemented."""
+    details = {
+        f"{name}_{i}": 0x8000 - 0x10000
+        for name, n in (("power_details", 6), ("temperature", 4))
+        for i in range(1, n + 1)
+    }
+    details |= {f"dc_details_{i}": 0xFFFF if i in (1, 3) else 0x8000 for i in range(1, 7)}
+    details |= {"event_1": 0, **{f"event_{i}": 0xFFFFFFFF for i in range(2, 7)}}
     return {
+        "sunspec": "SunS", "common_header": 1 << 16 | 66, "options": "", "version": "1.0", "device_address": 126,
+        "pad": 0x8000, "inverter_header": 103 << 16 | 50, "voltage_ll1": 3985, "voltage_ll2": 3981, "voltage_ll3": 3990,
+        "tmp_sf": 0x8000 - 0x10000, "vendor_state": 0xFFFF, "end_header": 0xFFFF0000, **details,
         "manufacturer": "fieldtwin", "model": "synthetic 10k", "serial": "S-0001", "current": 2174, "current_l1": 725,
         "current_l2": 724, "current_l3": 0xFFFF, "a_sf": -2, "voltage_l1": 2301 + r.randint(-5, 5),
         "voltage_l2": 2298 + r.randint(-5, 5), "voltage_l3": 2305, "v_sf": -1, "power": 500 + r.randint(-3, 3), "w_sf": 1,

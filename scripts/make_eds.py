@@ -254,12 +254,13 @@ def io_module() -> Sheet:
 
 
 def drive() -> Sheet:
-    """CiA 402-2 and -3: one axis with profile position and profile velocity mode; PDOs as the profile's defaults."""
+    """CiA 402-2 and -3: one axis with profile, homing and cyclic synchronous modes; PDOs as the profile's defaults."""
     c, s, m = (0x6040, 0, U16), (0x6041, 0, U16), (0x6060, 0, I8)
     return Sheet(
         "drive-cia402", 402, 0x0002, "fieldtwin reference servo drive",
         _notes("servo drive", "CiA 402 (drives and motion control, IEC 61800-7-201 and -301)",
-               "One axis, profile position (1) and profile velocity (3) mode. Positions count in increments, 10,000 a turn."),
+               "One axis. Modes: profile position (1), profile velocity (3), homing (6), cyclic synchronous position (8),",
+               "velocity (9) and torque (10). Positions count in increments, 10,000 a turn; torques in 0.1 % of the rated one."),
         [
             *pdo(0x1400, 0x200, 255, None, [c]),
             *pdo(0x1401, 0x300, 255, None, [c, m]),
@@ -284,19 +285,38 @@ def drive() -> Sheet:
             var(0x6064, "Position actual value", I32, mapped=True),
             var(0x606B, "Velocity demand value", I32, mapped=True),
             var(0x606C, "Velocity actual value", I32, mapped=True),
+            var(0x6065, "Following error window", U32, "rw", "0xFFFFFFFF"),
             var(0x606D, "Velocity window", U16, "rw", 50),
             var(0x606F, "Velocity threshold", U16, "rw", 10),
+            var(0x6071, "Target torque", I16, "rww", 0, mapped=True),
+            var(0x6072, "Max torque", U16, "rw", 1000),
+            var(0x6074, "Torque demand", I16, mapped=True),
             var(0x6077, "Torque actual value", I16, mapped=True),
             var(0x6079, "DC link circuit voltage", U32, mapped=True),
             var(0x607A, "Target position", I32, "rww", 0, mapped=True),
+            var(0x607C, "Home offset", I32, "rw", 0),
             array(0x607D, "Software position limit", I32, "rw", [0, 0]),
             var(0x607F, "Max profile velocity", U32, "rw", 500_000),
             var(0x6081, "Profile velocity", U32, "rww", 50_000, mapped=True),
             var(0x6083, "Profile acceleration", U32, "rw", 100_000),
             var(0x6084, "Profile deceleration", U32, "rw", 100_000),
             var(0x6085, "Quick stop deceleration", U32, "rw", 400_000),
+            var(0x6098, "Homing method", I8, "rw", 37),
+            array(0x6099, "Homing speeds", U32, "rw", [20_000, 2_000]),
+            var(0x609A, "Homing acceleration", U32, "rw", 100_000),
+            var(0x60B0, "Position offset", I32, "rww", 0, mapped=True),
+            var(0x60B1, "Velocity offset", I32, "rww", 0, mapped=True),
+            var(0x60B2, "Torque offset", I16, "rww", 0, mapped=True),
+            record(0x60C2, "Interpolation time period", {
+                1: Sub("Interpolation time period value", U8, "rw", 10), 2: Sub("Interpolation time index", I8, "rw", -3),
+            }),
+            var(0x60C5, "Max acceleration", U32, "rw", 5_000_000),
+            var(0x60C6, "Max deceleration", U32, "rw", 5_000_000),
+            array(0x60E3, "Supported homing methods", I16, "ro", [*range(1, 15), *range(17, 31), 33, 34, 35, 37]),
+            var(0x60F4, "Following error actual value", I32, mapped=True),
+            var(0x60FD, "Digital inputs", U32, mapped=True),
             var(0x60FF, "Target velocity", I32, "rww", 0, mapped=True),
-            var(0x6502, "Supported drive modes", U32, default="0x00000005"),
+            var(0x6502, "Supported drive modes", U32, default="0x000003A5"),
         ],
     )  # fmt: skip
 

@@ -15,7 +15,9 @@ from twin.mape.execute import Bounds, CommandCheck
 from twin.thread_process import PTDigitalThreadProcess
 
 OLD_MS = 10 * 60_000
-"""A command that was under way for longer is not obeyed: what it was meant for is over."""
+"""A command that was under way for longer is not obeyed: what it was meant for is over. Neither is one from so far ahead: its age
+would never count.
+"""
 
 
 class CommandGate(PTDigitalThreadProcess):
@@ -60,6 +62,8 @@ class CommandGate(PTDigitalThreadProcess):
         age_ms = self._clock.utc_ns() // 1_000_000 - event.t_ms
         if age_ms > self._old_ms:
             return f"it is {age_ms // 1000} s old; at most {self._old_ms // 1000} s are obeyed"
+        if age_ms < -self._old_ms:
+            return f"its time is {-age_ms // 1000} s ahead of this clock; at most {self._old_ms // 1000} s are accepted"
         if event.t_ms < self._since_ms:
             return "it is from before this plant's log began, and may have been obeyed then"
         return self._check.objection(command)

@@ -34,11 +34,15 @@ from gateway.store.exchange_log import ExchangeLog
 from gateway.wallclock import WallClock, run
 from twin.mapping import MappedConnector, mapping_from_json
 from twin.physical import EmbeddedControlSystem, attached, gateway_config
+from twin.refusal_places import RefusalPlaces
 from twin.reloading import compare, limits_changed
 from twin.system import System, load_system
 from twin.watching import TagWatch
 
 FLUSH_EVERY_NS = NS_PER_S // 2
+LOOK_EVERY_NS = NS_PER_S // 20
+FLUSH_ROWS = 8
+"""As many rows are stored at once: the PLC keeps what is not stored, and holds 16 of each program."""
 MOST_COMMAND_BYTES = 64
 MOST_CHANGES_TOLD = 20
 PUBLISHED_AT_ONCE = 20_000
@@ -108,7 +112,9 @@ class GatewayProcess:
                 drivers = [d for d in self._gateway.drivers.values() if isinstance(d, RegisterDriver)]
                 self._learnt = LearntFile(run_dir / f"learnt{of}.json", drivers, system.buses)
                 self._learnt.load()
-                self._watching = TagWatch(self._gateway.tags, self._clock)
+                journal = self._gateway.outputs.journal
+                self._places = RefusalPlaces(journal, run_dir / "plc.sock", tap.on_refusal if tap else None)
+                self._watching = TagWatch(self._gateway.tags, self._clock, journal)
                 await self._serve(run_dir / "gateway.sock")
         finally:
             log.close()
@@ -138,6 +144,7 @@ class GatewayProcess:
             async with Nursery() as nursery:
                 running = nursery.start(self._gateway.run(), "gateway")
                 nursery.start(self._flush(), "store")
+                nursery.start(self._places.run(), "lines of refused outputs")
                 stopping = asyncio.ensure_future(self._stop.wait())
                 try:
                     await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
@@ -151,9 +158,14 @@ class GatewayProcess:
             socket.unlink(missing_ok=True)
 
     async def _flush(self) -> None:
-        """Store what was logged, twice a second. A disk that refuses is reported in the status and tried again."""
+        """Store what was logged, twice a second, or sooner if there is much. A disk that refuses is reported and tried again."""
+        flushed_ns = self._clock.monotonic_ns()
         while True:
-            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + FLUSH_EVERY_NS)
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_EVERY_NS)
+            now_ns = self._clock.monotonic_ns()
+            if now_ns - flushed_ns < FLUSH_EVERY_NS and self._gateway.log.waiting < FLUSH_ROWS:
+                continue
+            flushed_ns = now_ns
             try:
                 await asyncio.to_thread(self._gateway.log.flush)
                 self._learnt.save()
@@ -220,7 +232,13 @@ class GatewayProcess:
             changes = await asyncio.to_thread(compare, self._system, new)
             told = [{"where": c.where, "what": str(c), "live": c.live} for c in changes]
             if args.get("check") is True or not all(c.live for c in changes):
-                return {"applied": False, "changes": told, "limits": {}, "hash": self._system.hash}
+                return {
+                    "applied": False,
+                    "changes": told,
+                    "limits": {},
+                    "hash": self._system.hash,
+                    "warnings": new.warnings,
+                }
             limits = await asyncio.to_thread(limits_changed, self._system, new)
             if changes:
                 texts = [str(c) for c in changes]
@@ -231,11 +249,18 @@ class GatewayProcess:
                 )
                 self._reloads, self._changed = self._reloads + 1, texts[:MOST_CHANGES_TOLD]
             self._system = new
-            return {"applied": bool(changes), "changes": told, "limits": limits, "hash": new.hash}
+            return {
+                "applied": bool(changes),
+                "changes": told,
+                "limits": limits,
+                "hash": new.hash,
+                "warnings": new.warnings,
+            }
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""
         safe = await self._gateway.shut_down()
+        await self._places.settle()
         with suppress(Unreachable):  # then it is learnt again
             self._learnt.save()
         status = self._status()

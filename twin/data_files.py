@@ -11,8 +11,10 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from gateway.core.errors import UsageError
+from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import read_input
 
+MAX_BYTES = 8 * 1024 * 1024
 _HERE = Path(__file__).resolve().parent.parent
 """site-packages where a wheel is installed, the checkout otherwise."""
 
@@ -83,8 +85,8 @@ def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
     if path.suffix not in (".yaml", ".yml"):
         return None
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
+        lines = read_input(path, MAX_BYTES).decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError, FileInvalid):
         return None
     return path if any(line.startswith("network:") for line in lines) else None
 

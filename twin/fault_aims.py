@@ -10,7 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from emulators.faults.fault import Aim, Kind
-from emulators.faults.schema import FUNCTIONS_OF, FaultSpec, WrongAim, addressed
+from emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
+from emulators.faults.value_ranges import check_fault
+from emulators.faults.wrong_aim import WrongAim
 from gateway.core.profile import Tag
 from twin.system import System
 
@@ -24,6 +26,7 @@ class Target:
     aim: Aim
     addresses: range | None = None
     functions: frozenset[int] = frozenset()
+    counts: range | None = None
 
 
 def target(system: System, spec: FaultSpec) -> Target:
@@ -37,6 +40,8 @@ def target(system: System, spec: FaultSpec) -> Target:
         tag = tag_of(system, aim.device, aim.register_, "register")
     if kind is Kind.VALUE and tag is not None and tag.is_text:
         raise WrongAim("register", f"{aim.device}.{tag.name} is no number", expected="a tag that is one")
+    if aim.device:
+        check_fault(spec.make(), aim.register_, system.devices[aim.device].profile.tags.values(), aim.device)
     is_can = system.buses[bus].endpoint.is_can
     if kind is not Kind.VALUE and is_can != (kind is Kind.CAN):
         raise WrongAim("name", f"fault {spec.kind.name} is for {kind.value}", got=f"bus {bus!r}")
@@ -47,9 +52,9 @@ def target(system: System, spec: FaultSpec) -> Target:
         return Target(bus, units, aim)
     if tag is not None:
         at = tag.registers
-        return Target(bus, units, aim, range(at.address, at.end), FUNCTIONS_OF[at.table])
+        return Target(bus, units, aim, range(at.address, at.end), FUNCTIONS_OF[at.table], counted(aim.registers))
     addresses, functions = (None, frozenset[int]()) if aim.address is None else addressed(aim.address)
-    return Target(bus, units, aim, addresses, functions)
+    return Target(bus, units, aim, addresses, functions, counted(aim.registers))
 
 
 def tag_of(system: System, device: str, tag: str, key: str = "") -> Tag:

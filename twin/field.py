@@ -7,15 +7,17 @@ that bus behind it. Here the paper's emulators meet the system file; what gatewa
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sized
+from collections.abc import Awaitable, Callable, Mapping, Sized
 from pathlib import Path
 from typing import Any
 
 from emulators.canopen.node import CanopenNode
+from emulators.canopen.remarks import Remark
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
 from emulators.distorted_registers import DistortedRegisters
 from emulators.emulator import EmulatedUnit
+from emulators.endpoints.client_counts import ClientCounts, Difference
 from emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
 from emulators.journal import HeldJournal, share_of
 from emulators.modbus.ascii import AsciiSlave
@@ -25,7 +27,7 @@ from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit, UnitLimits
-from emulators.models.emulated_node import emulated_node
+from emulators.models.emulated_node import NodeOptions, emulated_node
 from emulators.models.mailbox_modem import MailboxModem, ModemPair
 from emulators.models.packet_link import ModemEnd, Untamed
 from emulators.models.register_device import StatedRegisters, add_own_functions
@@ -60,6 +62,8 @@ class FieldDevice:
         self.unit = unit
         self.node = node
         self.journal: HeldJournal = HeldJournal()
+        self.remarks: list[str] = []
+        """What does not fit a node's data sheet, with what to do about it."""
 
     @property
     def command_list(self) -> frozenset[str]:
@@ -81,6 +85,19 @@ class FieldDevice:
         assert self.unit is not None
         c = self.unit.counters
         return {"requests": c.requests, "replies": c.replies, "exceptions": c.exceptions, "broadcasts": c.broadcasts}
+
+
+def _taken(units: Mapping[int, EmulatedUnit | RecordedDevice]) -> tuple[int, int]:
+    """Requests and replies of all units of a line so far."""
+    counters = [unit.counters for unit in units.values()]
+    return sum(c.requests for c in counters), sum(c.replies for c in counters)
+
+
+def _advised(remark: Remark) -> str:
+    """A remark with what the prototype file can say about it."""
+    if remark.by_parameter_value:
+        return f"{remark.text} (`parameter_values: false` starts with the DefaultValues)"
+    return f"{remark.text} (`cia: 402` chooses a model, `cia: none` means it)" if remark.model else remark.text
 
 
 class FieldSide:
@@ -115,6 +132,9 @@ class FieldSide:
         self._ports = ports or OsPorts()
         self._listeners: list[Listening] = []
         self._buses: list[CanPort] = []
+        self._can_ports: dict[str, CanPort] = {}
+        self._clients: dict[str, ClientCounts] = {}
+        self._lines: list[Difference] = []
         self._connections: list[ByteConnection | CanConnection] = []
         self._pairs: dict[str, ModemPair] = {}
         self._water = water or {}
@@ -184,29 +204,47 @@ class FieldSide:
             datagrams = self.faults.on_datagrams(bus.name, await self._ports.datagrams(listen))
             self._listeners.append(datagrams)
             self.listening[bus.name] = datagrams.bound
-            slave = MbapSlave(units)
-            self._nursery.start(serve_udp(datagrams, slave, self._clock, latency_s), f"emulators on {bus.name}")
+            serving = serve_udp(datagrams, MbapSlave(units), self._clock, latency_s, clients=self._counts(bus.name))
+            self._nursery.start(serving, f"emulators on {bus.name}")
         elif plant.is_serial or plant.scheme == "rtu+tcp":
-            line = line_of(plant, units)
-            self.listening[bus.name] = await self._listen(
-                listen, self._behind(bus.name, lambda c: serve_rtu(c, line, self._clock, latency_s, echo=echo)), 1
-            )
+            line, counted = line_of(plant, units), Difference(self._counts(bus.name), lambda: _taken(units))
+            self._lines.append(counted)
+
+            async def serve_line(end: ByteConnection, client: str) -> None:
+                counted.change(client)
+                try:
+                    await serve_rtu(end, line, self._clock, latency_s, echo=echo)
+                finally:
+                    counted.change("")
+
+            self.listening[bus.name] = await self._listen(listen, self._behind(bus.name, serve_line), 1)
         else:
-            self.listening[bus.name] = await self._listen(
-                listen, self._behind(bus.name, lambda c: serve_mbap(c, MbapSlave(units), self._clock, latency_s))
-            )
+            clients = self._counts(bus.name)
+
+            async def serve(end: ByteConnection, client: str) -> None:
+                counts = clients.of(client)
+                counts.open = True
+                try:
+                    await serve_mbap(end, MbapSlave(units, counts=counts), self._clock, latency_s)
+                finally:
+                    counts.open = False
+
+            self.listening[bus.name] = await self._listen(listen, self._behind(bus.name, serve))
         for device in on_it:
             await self._open_far(device, stated_s)
 
-    def _behind(self, bus: str, serve: OnClient) -> OnClient:
-        """`serve` for clients that come through the faults of their bus."""
+    def _counts(self, bus: str) -> ClientCounts:
+        return self._clients.setdefault(bus, ClientCounts())
+
+    def _behind(self, bus: str, serve: Callable[[ByteConnection, str], Awaitable[None]]) -> OnClient:
+        """`serve` for clients that come through the faults of their bus; it is told each client's address."""
 
         async def client(connection: ByteConnection) -> None:
             if self.faults.refuses(bus):
                 return
             end = self.faults.on_bytes(bus, connection)
             try:
-                await serve(end)
+                await serve(end, getattr(connection, "peer", "?"))
             finally:
                 await end.aclose()
 
@@ -236,6 +274,7 @@ class FieldSide:
         port = await self._ports.can_bus(listen, bitrate, paced=bus.pace)
         self._listeners.append(port)
         self._buses.append(port)
+        self._can_ports[bus.name] = port
         self.listening[bus.name] = port.bound
         runner = port.runner
         if runner is not None:
@@ -276,7 +315,8 @@ class FieldSide:
             return self._recorded_unit(config, emulated)
         player = self._signals(emulated)
         bank = SampledSensor(emulated.profile, player, emulated.form.identity)
-        unit = self._emulated_unit(config, bank, player)
+        seen = DistortedRegisters(bank, bank.peek, emulated.profile, bank.journal, bank.own_tags, bank.distortions)
+        unit = self._emulated_unit(config, seen, player)
         device = self.devices[config.name] = FieldDevice(emulated, unit, None)
         device.journal = bank.journal
         self.faults.on_values(config.name, bank.distortions)
@@ -300,7 +340,9 @@ class FieldSide:
 
     def _stated_unit(self, config: DeviceConfig, emulated: EmulatedDevice) -> EmulatedUnit:
         """A device of which nothing is recorded: its profile, and what the prototype file says that its tags hold."""
-        values = {**emulated.form.values, **emulated.form.identity}
+        tags = emulated.profile.tags
+        stated = {name: tags[name].number_of(value) for name, value in emulated.form.values.items()}
+        values = {**stated, **emulated.form.identity}
         now_ns = self._clock.monotonic_ns()
         try:
             if emulated.form.simulation is None:
@@ -348,7 +390,12 @@ class FieldSide:
         recording = self._node_recording(emulated)
         try:
             made = emulated_node(
-                emulated.profile, config.address, recording, self._clock.monotonic_ns(), emulated.form.identity
+                emulated.profile,
+                config.address,
+                recording,
+                self._clock.monotonic_ns(),
+                emulated.form.identity,
+                NodeOptions(emulated.form.cia, emulated.form.parameter_values),
             )
         except UsageError as e:
             raise FileInvalid(
@@ -356,6 +403,7 @@ class FieldSide:
             ) from e
         device = self.devices[config.name] = FieldDevice(emulated, None, made.node)
         device.journal = made.journal
+        device.remarks = [_advised(remark) for remark in made.remarks]
         self.faults.on_values(config.name, made.distortions)
         return made.node
 
@@ -385,6 +433,15 @@ class FieldSide:
             at_end=WhenUsedUp.parse(form.at_end),
         )
 
+    def _clients_by_bus(self) -> dict[str, dict[str, dict[str, int]]]:
+        """By bus and client, the requests that reached a device and their replies; no bus of a kernel, no line of a pty."""
+        for line in self._lines:
+            line.settle()
+        found = {bus: counts.describe() for bus, counts in self._clients.items()}
+        for bus, port in self._can_ports.items():
+            found[bus] = port.stats().get("sdo_clients", {})
+        return found
+
     # -- what others see ------------------------------------------------------------------------------------------------
 
     def status(self) -> dict[str, Any]:
@@ -397,6 +454,7 @@ class FieldSide:
                     "profile": d.emulated.profile.name,
                     "recording": str(d.emulated.recording or d.emulated.form.simulation or d.emulated.form.model),
                     "plays": d.plays,
+                    "remarks": d.remarks,
                     "commands": sorted(d.command_list),
                     "executed": d.executed(),
                     "unlisted": d.unit.unlisted if d.unit is not None else 0,
@@ -406,7 +464,9 @@ class FieldSide:
                 }
                 for name, d in self.devices.items()
             },
+            "clients": self._clients_by_bus(),
             "faults": self.faults.describe(),
+            "struck": self.faults.history.describe(),
             "listening": {bus: str(endpoint) for bus, endpoint in self.listening.items()},
             "far": {device: str(endpoint) for device, endpoint in self.far.items()},
             "links": {

@@ -20,12 +20,14 @@ from emulators.faults.fault import Active, Aim, ValueFault
 from emulators.faults.frames import Framing, Way
 from emulators.faults.schema import FaultSpec, parse_fault
 from emulators.faults.set_value import Form, SetValue
+from emulators.faults.value_ranges import check_value
 from emulators.wires.can_faults import Rule
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, CanConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from twin.fault_aims import tag_of, target
+from twin.fault_history import FaultHistory
 from twin.system import System
 
 MOST = 1_000
@@ -46,6 +48,8 @@ class FieldFaults:
         self._disturb: dict[str, Callable[[Rule], None]] = {}
         self._undisturb: dict[str, Callable[[Rule], None]] = {}
         self._active: dict[str, tuple[FaultSpec, Active, str]] = {}
+        self._set: dict[tuple[str, str], float] = {}
+        self.history = FaultHistory()
 
     # -- where faults can be --------------------------------------------------------------------------------------------
 
@@ -81,8 +85,10 @@ class FieldFaults:
 
     # -- putting in and taking away -------------------------------------------------------------------------------------
 
-    def inject(self, said: Mapping[str, Any]) -> str:
-        """Put a fault in; its id. Raises `UsageError` for what makes no sense, or an id that is in already."""
+    def inject(self, said: Mapping[str, Any], start_ns: int | None = None) -> str:
+        """Put a fault in; its id. Its times count from `start_ns`, by default from the run's start. Raises `UsageError` for what
+        makes no sense, or an id that is in already."""
+        start_ns = self.start_ns if start_ns is None else start_ns
         spec = parse_fault(dict(said), number=len(self._active) + 1)
         if spec.id in self._active:
             raise UsageError(f"the fault {spec.id!r} is in already", hint="clear it first, or give another id")
@@ -90,20 +96,22 @@ class FieldFaults:
             raise UsageError("too many faults at once", expected=f"at most {MOST}")
         fault = spec.make()
         at = target(self._system, spec)
-        until_ns = None if spec.until_s is None else self.start_ns + round(spec.until_s * NS_PER_S)
+        until_ns = None if spec.until_s is None else start_ns + round(spec.until_s * NS_PER_S)
         active = Active(
             spec.id,
             fault,
             at.aim,
             Random(f"{self._seed} {spec.id}"),
-            self.start_ns + round(spec.from_s * NS_PER_S),
+            start_ns + round(spec.from_s * NS_PER_S),
             until_ns,
             units=at.units,
             addresses=at.addresses,
             functions=at.functions,
+            counts=at.counts,
         )
         self._put(spec, active, at.bus)
         self._active[spec.id] = (spec, active, at.bus)
+        self.history.add(active, spec.aim.device or at.bus)
         return spec.id
 
     def _put(self, spec: FaultSpec, active: Active, bus: str) -> None:
@@ -113,6 +121,7 @@ class FieldFaults:
                 raise UsageError(
                     f"what {spec.aim.device} holds cannot be changed", expected="a device that is emulated here"
                 )
+            active.fault.learn(self._system.devices[spec.aim.device].profile.tags.values())
             found.put_in(active, spec.aim.register_)
         elif isinstance(active.fault, BusFault):
             disturb = self._disturb.get(bus)
@@ -144,15 +153,33 @@ class FieldFaults:
         distortions = self._distortions.get(device)
         if distortions is None or found.is_text:
             raise UsageError(f"{device}.{tag} cannot be set", expected="a number of a device that is emulated here")
-        id = f"set {device}.{tag}"
-        distortions.take_away(id)
-        if value is None:
-            return
         if isinstance(value, str):
             raise UsageError(f"{device}.{tag}", expected="a number", got=repr(value))
+        if value is not None:
+            check_value(found, float(value), f"{device}.{tag}")
+        id = f"set {device}.{tag}"
+        distortions.take_away(id)
+        self._set.pop((device, tag), None)
+        if value is None:
+            return
         now_ns = self._clock.monotonic_ns()
         fault = SetValue(Form(value=float(value)))
-        distortions.put_in(Active(id, fault, Aim(), Random(id), now_ns, None), tag)
+        active = Active(id, fault, Aim(), Random(id), now_ns, None)
+        distortions.put_in(active, tag)
+        self.history.add(active, f"{device}.{tag}")
+        self._set[device, tag] = float(value)
+
+    def value_set(self, device: str, tag: str) -> float | None:
+        """The value that `set_value` holds the device at; None where none is set."""
+        return self._set.get((device, tag))
+
+    def values_set(self) -> dict[str, float]:
+        """Each value that is set, by DEVICE.TAG."""
+        return {f"{device}.{tag}": value for (device, tag), value in self._set.items()}
+
+    def ids(self) -> list[str]:
+        """The ids of the faults that are in."""
+        return list(self._active)
 
     def describe(self) -> list[dict[str, Any]]:
         """What is in, and how often it struck."""

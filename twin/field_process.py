@@ -1,7 +1,12 @@
 """The field side's process: ``python -m twin.field_process CONFIG.json``, or inside `fieldtwin emulate SYSTEM`.
 
-Control verbs: ready, get (listening endpoints, counters), held (what the devices really held), stop. On a Unix socket in the
-run directory, and on TCP where asked for, so that a controller elsewhere learns where each plant endpoint's emulator listens.
+Control verbs: ready, get (listening endpoints, counters), held (what the devices really held), fault, clear, set, lease, fresh,
+stop. On a Unix socket in the run directory, and on TCP where asked for, so that a controller elsewhere learns where each plant
+endpoint's emulator listens.
+
+    lease     {"id": ..., "for_s": 10}: open the lease `id` on these devices (`twin.field_leases`); {"renew": true} prolongs it,
+              {"release": true} ends it. `fault` and `set` with "lease": ID are taken out when that lease ends
+    fresh     {"lease": ID}: every device, recording and simulation from its beginning, on the same ports and without a fault
 """
 
 from __future__ import annotations
@@ -20,12 +25,14 @@ from typing import Any
 import msgspec
 
 from emulators.endpoints.acoustic_end import AcousticEnd
+from gateway.core.clock import NS_PER_S
 from gateway.core.control import ControlServer
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, UsageError
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock, run
 from twin.field import FieldSide
+from twin.field_leases import LEASE_S, FieldLeases
 from twin.prototype import DigitalTwinPrototype
 from twin.prototype_file import Prototype, load_prototype
 from twin.system import System, load_system
@@ -81,9 +88,15 @@ class FieldProcess:
 
     def __init__(self, config: FieldConfig) -> None:
         self._config = config
+        self._clock = WallClock()
         self._stop = asyncio.Event()
+        self._fresh_asked = asyncio.Event()
+        self._fresh_done: asyncio.Future[None] | None = None
+        self._lease_changed = asyncio.Event()
+        self._field: FieldSide
+        self._leases: FieldLeases
         self.control_port = 0
-        self._life = secrets.token_hex(8)  # of this process: started again, it has another one, and counts from nothing
+        self._life = secrets.token_hex(8)  # of these devices: made anew, they have another one, and count from nothing
 
     async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
         """Open, call `on_ready`, serve until stopped."""
@@ -95,6 +108,7 @@ class FieldProcess:
                 water[device] = end = await AcousticEnd.open(Path(path), name)
                 stack.push_async_callback(end.aclose)
             self._field = twin.field(run_dir, water=water)
+            self._leases = FieldLeases(self._field.faults)
             return await self._run(run_dir, on_ready)
 
     async def _run(self, run_dir: Path, on_ready: Callable[[FieldSide], None] | None) -> int:
@@ -107,6 +121,8 @@ class FieldProcess:
                 "fault": self._fault,
                 "clear": self._clear,
                 "set": self._set,
+                "lease": self._lease,
+                "fresh": self._fresh,
                 "stop": self._request_stop,
             },
             token=self._config.token,
@@ -133,17 +149,67 @@ class FieldProcess:
 
     async def _serve(self) -> None:
         async with Nursery() as nursery:
-            running = nursery.start(self._field.run(), "field side")
             stopping = nursery.start(self._stop.wait(), "until stopped")
-            await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
-            if running.done():
-                running.result()
+            expiring = nursery.start(self._end_leases(), "leases")
+            while not stopping.done():
+                asked = asyncio.ensure_future(self._fresh_asked.wait())
+                running = asyncio.ensure_future(self._field.run())
+                try:
+                    await asyncio.wait([running, stopping, asked, expiring], return_when=asyncio.FIRST_COMPLETED)
+                    if running.done():
+                        running.result()
+                    if expiring.done():
+                        expiring.result()
+                finally:
+                    asked.cancel()
+                    running.cancel()
+                    await asyncio.gather(asked, running, return_exceptions=True)
+                if self._fresh_asked.is_set() and not stopping.done():
+                    self._fresh_asked.clear()
+                    await self._make_anew()
+
+    async def _end_leases(self) -> None:
+        """Take out what a judge put in as soon as its lease has expired."""
+        while True:
+            self._lease_changed.clear()
+            until_ns = self._leases.until_ns
+            if until_ns is None:
+                await self._lease_changed.wait()
+                continue
+            left_s = (until_ns - self._clock.monotonic_ns()) / NS_PER_S
+            try:
+                async with asyncio.timeout(max(0.0, left_s)):
+                    await self._lease_changed.wait()
+            except TimeoutError:
+                self._leases.expire(self._clock.monotonic_ns())
+
+    async def _make_anew(self) -> None:
+        """The devices again, from the same files, where the old ones listened. What fails ends the process."""
+        old, done = self._field, self._fresh_done
+        twin = resolve(self._config)
+        prototype = _listening_as(twin.prototype, old)
+        self._field = FieldSide(old.system, prototype, Path(self._config.run_dir), self._clock)
+        try:
+            await self._field.open()
+        except BaseException as e:
+            if done is not None and not done.done() and isinstance(e, Exception):
+                done.set_exception(e)
+            raise
+        self._leases.moved_to(self._field.faults)
+        self._life = secrets.token_hex(8)
+        if done is not None and not done.done():
+            done.set_result(None)
 
     async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
         return {"ready": True, "pid": os.getpid()}
 
     async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
-        return {"life": self._life, **self._field.status()}
+        return {
+            "life": self._life,
+            **self._field.status(),
+            "set": self._field.faults.values_set(),
+            "lease": self._leases.describe(self._clock.monotonic_ns()),
+        }
 
     async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
         """At most `HELD_AT_ONCE` entries a device, the oldest first: who wants them all asks again."""
@@ -151,25 +217,80 @@ class FieldProcess:
         return {name: held[:HELD_AT_ONCE] for name, held in self._field.held_since(since).items()}
 
     async def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Put in ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if given."""
-        if isinstance(args.get("start_ns"), int):
-            self._field.faults.start_ns = args["start_ns"]
+        """Put in ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if given. With
+        ``"lease"`` it is taken out when that lease ends."""
+        start_ns = args["start_ns"] if isinstance(args.get("start_ns"), int) else None
         said = args.get("fault")
         if not isinstance(said, dict):
             raise UsageError("a fault", expected='{"name": ..., "device": ...}', got=repr(said)[:60])
-        return {"id": self._field.faults.inject(said), "faults": self._field.faults.describe()}
+        if args.get("lease"):
+            id = self._leases.inject(str(args["lease"]), said, start_ns, self._clock.monotonic_ns())
+        else:
+            id = self._field.faults.inject(said, start_ns)
+        faults = self._field.faults
+        return {"id": id, "number": faults.history.count, "faults": faults.describe()}
 
     async def _clear(self, args: dict[str, Any]) -> dict[str, Any]:
         self._field.faults.clear(str(args.get("id", "")))
         return {"faults": self._field.faults.describe()}
 
     async def _set(self, args: dict[str, Any]) -> dict[str, Any]:
-        self._field.faults.set_value(str(args.get("device", "")), str(args.get("tag", "")), args.get("value"))
-        return {}
+        device, tag, value = str(args.get("device", "")), str(args.get("tag", "")), args.get("value")
+        if args.get("lease"):
+            self._leases.set_value(str(args["lease"]), device, tag, value, self._clock.monotonic_ns())
+        else:
+            self._field.faults.set_value(device, tag, value)
+        return {"number": self._field.faults.history.count}
+
+    async def _lease(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Open, prolong or end a judge's lease; what was in before it was opened is in the answer."""
+        id, for_s, now_ns = str(args.get("id", "")), args.get("for_s", LEASE_S), self._clock.monotonic_ns()
+        if not isinstance(for_s, int | float):
+            raise UsageError("how long a lease lasts", expected="a number of seconds", got=repr(for_s)[:60])
+        if args.get("release") is True:
+            self._leases.release(id)
+        elif args.get("renew") is True:
+            self._leases.renew(id, for_s, now_ns)
+        else:
+            self._leases.open(id, for_s, now_ns)
+        self._lease_changed.set()
+        faults = self._field.faults
+        return {
+            "life": self._life,
+            "lease": self._leases.describe(now_ns),
+            "faults": faults.describe(),
+            "set": faults.values_set(),
+        }
+
+    async def _fresh(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Returns when the new devices listen. Raises `LeaseEnded` or `UsageError`, and nothing has changed."""
+        self._leases.of(str(args.get("lease", "")), self._clock.monotonic_ns())
+        if self._config.water:
+            raise UsageError("devices in a network's water cannot be made anew one system at a time")
+        if self._fresh_done is None or self._fresh_done.done():
+            self._fresh_done = asyncio.get_running_loop().create_future()
+        self._fresh_asked.set()
+        await asyncio.shield(self._fresh_done)
+        return {"life": self._life, "now_ns": self._clock.monotonic_ns()}
 
     async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
         asyncio.get_running_loop().call_later(0.05, self._stop.set)
         return self._field.status()
+
+
+def _listening_as(prototype: Prototype, field: FieldSide) -> Prototype:
+    """`prototype` with every bus and every far modem where `field` has them: free ports were chosen once."""
+    buses = {
+        name: replace(bus, listen=field.listening[name]) if name in field.listening else bus
+        for name, bus in prototype.buses.items()
+    }
+    devices = {
+        name: replace(device, form=device.form.model_copy(update={"far": str(field.far[name])}))
+        if name in field.far
+        else device
+        for name, device in prototype.devices.items()
+    }
+    return replace(prototype, buses=buses, devices=devices)
 
 
 def main(argv: list[str]) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import getpass
 import os
 import re
+import stat
 import tempfile
 from pathlib import Path
 from types import TracebackType
@@ -23,19 +24,42 @@ except ImportError:  # Windows
 else:
     LOCKS = True
 
+TEMPORARY = Path("/tmp")
+
 SOCKET_PATH_MAX = 100
 """A Unix socket's path is at most 107 bytes (sockaddr_un); our longest file name takes some of it."""
 
 
 def runtime_root() -> Path:
-    """Where run directories are made: FIELDTWIN_RUN, else the user's runtime folder, else a folder of theirs in /tmp."""
+    """Where run directories are made: FIELDTWIN_RUN, else the user's runtime folder, else a folder of theirs in /tmp.
+
+    Raises `Unreachable` if the folder in /tmp was created by another user, or other users may write to it.
+    """
     if chosen := os.environ.get("FIELDTWIN_RUN"):
         return Path(chosen)
     if base := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(base) / "fieldtwin"
     if not hasattr(os, "getuid"):  # Windows
         return Path(tempfile.gettempdir()) / f"fieldtwin-{getpass.getuser()}"
-    return Path("/tmp") / f"fieldtwin-{os.getuid()}"
+    folder = TEMPORARY / f"fieldtwin-{os.getuid()}"
+    _refuse_a_strangers(folder)
+    return folder
+
+
+def _refuse_a_strangers(folder: Path) -> None:
+    """Everybody may create a file in /tmp: whoever owns the folder could replace what is made in it, sockets included."""
+    try:
+        found = folder.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o022:
+        raise Unreachable(
+            "the folder of the run directories is not yours alone",
+            where=str(folder),
+            expected="a folder that belongs to you, and that no other user may write to",
+            got=f"{stat.filemode(found.st_mode)}, owner {found.st_uid}",
+            hint="remove it, or set FIELDTWIN_RUN to a folder of yours",
+        )
 
 
 class Instance:
@@ -59,7 +83,8 @@ class Instance:
         try:
             self.dir.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
             self.dir.mkdir(exist_ok=True, mode=0o700)
-            if self.dir.stat().st_uid != os.getuid():
+            found = self.dir.lstat()
+            if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid():
                 raise Unreachable("the run directory belongs to somebody else", where=str(self.dir))
             self._lock = (self.dir / "lock").open("w", encoding="utf-8")
         except OSError as e:

@@ -30,7 +30,9 @@ from gateway.store.exchange_log import ExchangeLog
 from plc.binding import BoundProgram, InputBinding, image_for
 from plc.config import PlcConfig, ProgramConfig, TaskSpec
 from plc.program import Role
+from plc.start import StartPolicy
 from twin.system import System
+from twin.system_schema import StartForm
 
 MESSAGE_DEPTH = 16
 PLC_LOST_CYCLES = 50
@@ -91,9 +93,14 @@ def programs_of(system: System) -> tuple[ProgramConfig, ...]:
             {v: InputBinding(i.tag, i.if_bad) for v, i in form.inputs.items()},
             dict(form.outputs),
             form.task or "",
+            _start_policy(form.start or system.plc.start),
         )
         for name, form in system.plc.programs.items()
     )
+
+
+def _start_policy(form: StartForm) -> StartPolicy:
+    return StartPolicy(float(form.timeout_ms), form.at_timeout)
 
 
 def image_layout(system: System) -> ImageLayout:
@@ -197,7 +204,7 @@ def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfi
         heartbeat_limit_ms=float(gateway_lost_ms(system)),
         python_path=(str(system.path.parent),),
         tasks=tuple(
-            TaskSpec(name, float(form.interval_ms or 0), form.priority, form.single or "")
+            TaskSpec(name, float(form.interval_ms or 0), form.priority, form.single or "", float(form.late_ms or 0))
             for name, form in system.plc.tasks.items()
         ),
         stuck_ms=float(watchdog.stuck_ms or max(MIN_STUCK_MS, 20 * fastest_ms(system))),

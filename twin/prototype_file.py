@@ -102,7 +102,10 @@ def load_prototype(system: System, path: Path | None = None) -> Prototype:
     form = validate(file, PrototypeForm)
     if Path(form.prototype_of).name != system.path.name:
         raise file.error(
-            ("prototype_of",), "this is another system's prototype", expected=system.path.name, got=form.prototype_of
+            ("prototype_of",),
+            "`prototype_of` names a different system file",
+            expected=system.path.name,
+            got=form.prototype_of,
         )
     for name in form.buses:
         if name not in system.buses:
@@ -243,7 +246,11 @@ def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> 
 
 
 def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, profile: DeviceProfile) -> None:
-    """What is said of being busy is said of a Modbus device, and what of registers, of one without a recording."""
+    """What is said of being busy is said of a Modbus device, and what of registers, of one without a recording; what is said of
+    a data sheet, of a CANopen device."""
+    for key, said in (("cia", form.cia is not None), ("parameter_values", not form.parameter_values)):
+        if said and profile.protocol != "canopen":
+            raise file.error((*loc, key), f"`{key}` is about a data sheet (EDS)", expected="a CANopen device")
     if form.busy is not None and profile.protocol != "modbus":
         raise file.error((*loc, "busy"), "nothing of this protocol", expected="a Modbus device")
     if form.values and ((form.model != "profile" and form.simulation is None) or profile.protocol != "modbus"):

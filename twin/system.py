@@ -20,8 +20,10 @@ from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
 from twin.canopen_keys import canopen_bus, canopen_node, check_rpdo1
 from twin.data_files import find
 from twin.modbus_keys import connect_pauses, device_pace, modbus_bus
+from twin.read_back import never_read_back
 from twin.serving import Serving, resolve_serving
-from twin.system_schema import BusForm, CommandsForm, DeviceForm, PlcForm, SystemForm
+from twin.starting import waits_for_its_command
+from twin.system_schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
 
 SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
 """What the gateway can talk over so far."""
@@ -29,7 +31,8 @@ SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
 
 @dataclass(frozen=True)
 class System:
-    """A system, resolved. Dictionaries keep the file's order. `hash` tells one version of the file from another."""
+    """A system, resolved. Dictionaries keep the file's order. `hash` tells one version of the file from another. `warnings` are
+    for the file's author, each with its place in the file."""
 
     name: str
     path: Path
@@ -41,6 +44,8 @@ class System:
     file: YamlFile
     serving: Serving = field(default_factory=Serving)
     commands: CommandsForm = field(default_factory=CommandsForm)
+    warnings: tuple[str, ...] = ()
+    invariants: InvariantsForm = field(default_factory=InvariantsForm)
 
     def devices_on(self, bus: str) -> list[DeviceConfig]:
         """The devices of a bus, in the file's order."""
@@ -72,9 +77,12 @@ def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
         remote=form.remote,
         file=file,
         commands=form.commands,
+        invariants=form.invariants,
+        warnings=never_read_back(file, devices) + waits_for_its_command(file, form.plc, devices),
         serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc)),
     )
     _check_programs(system)
+    _check_write_groups(system)
     return system
 
 
@@ -131,7 +139,8 @@ def _device(
         expect=dict(d.expect),
         stale_after_ms=d.stale_after_ms,
         writable=frozenset(d.writable),
-        safe=dict(d.safe),
+        safe=_safe_outputs(file, loc, d, profile),
+        write_groups={group: tuple(tags) for group, tags in d.write_groups.items()},
         heartbeat=Heartbeat(d.heartbeat.producer_ms, d.heartbeat.consumer_ms) if d.heartbeat else None,
         tpdo1=Tpdo(tuple(d.tpdo1.map), d.tpdo1.event_ms) if d.tpdo1 else None,
         start=d.start,
@@ -151,25 +160,43 @@ def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: D
             raise file.error(
                 (*loc, "poll", group), f"no poll group {group!r}", expected=", ".join(groups), hint=_near(group, groups)
             )
-    mailbox = {"outbox", "inbox_ack"} if profile.inbox else set()
-    for i, tag in enumerate(d.writable):
-        if tag not in mailbox:
-            _writable(file, (*loc, "writable", i), profile, tag)
-    for tag, value in d.safe.items():
-        limits = _writable(file, (*loc, "safe", tag), profile, tag).limits
-        if tag not in d.writable:
-            raise file.error((*loc, "safe", tag), f"{tag!r} has a safe value and is not in `writable`")
-        if limits and not limits[0] <= value <= limits[1]:
-            raise file.error(
-                (*loc, "safe", tag),
-                f"the safe value of {tag!r}",
-                expected=f"{limits[0]:g} to {limits[1]:g}",
-                got=f"{value:g}",
-            )
     for tag in d.expect:
         _known(file, (*loc, "expect", tag), profile, tag)
     for i, tag in enumerate(d.tpdo1.map if d.tpdo1 else []):
         _known(file, (*loc, "tpdo1", "map", i), profile, tag)
+
+
+def _safe_outputs(
+    file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, profile: DeviceProfile
+) -> dict[str, int | float]:
+    """Check `writable` and `safe`. Return the safe value of each tag as a number; the file may give the name of a value."""
+    mailbox = {"outbox", "inbox_ack"} if profile.inbox else set()
+    for i, tag in enumerate(d.writable):
+        if tag not in mailbox:
+            _writable(file, (*loc, "writable", i), profile, tag)
+    numbers: dict[str, int | float] = {}
+    for tag, given in d.safe.items():
+        spot = (*loc, "safe", tag)
+        described = _writable(file, spot, profile, tag)
+        if tag not in d.writable:
+            raise file.error(spot, f"{tag!r} has a safe value and is not in `writable`")
+        value = described.number_of(given)
+        names = [name for _, name in described.values]
+        if isinstance(value, str) or (isinstance(given, bool) and not described.is_bit):
+            raise file.error(
+                spot,
+                f"the safe value of {tag!r}",
+                expected=" or ".join(["true or false" if described.is_bit else "a number", *names]),
+                got=str(given).lower() if isinstance(given, bool) else repr(given),
+                hint=_near(value, names) if isinstance(value, str) else "",
+            )
+        limits = described.limits
+        if limits and not limits[0] <= value <= limits[1]:
+            raise file.error(
+                spot, f"the safe value of {tag!r}", expected=f"{limits[0]:g} to {limits[1]:g}", got=f"{given}"
+            )
+        numbers[tag] = int(value) if isinstance(value, bool) else value
+    return numbers
 
 
 def _known(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, tag: str) -> Tag:
@@ -228,6 +255,27 @@ def _check_programs(system: System) -> None:
             if tag in written:
                 raise system.file.error(spot, f"{tag!r} is written by {written[tag]!r} already")
             written[tag] = name
+
+
+def _check_write_groups(system: System) -> None:
+    """Members are outputs of programs, and in one group only: nothing else may write a member alone."""
+    written = set(_outputs(system.plc))
+    for name, device in system.devices.items():
+        seen: dict[str, str] = {}
+        for group, tags in device.write_groups.items():
+            for n, tag in enumerate(tags):
+                at = ("devices", name, "write_groups", group, n)
+                if f"{name}.{tag}" not in written or device.profile.inbox is not None:
+                    outputs = [t.partition(".")[2] for t in sorted(written) if t.partition(".")[0] == name]
+                    raise system.file.error(
+                        at,
+                        f"{tag!r} is no output of a program, so it cannot be in a group",
+                        expected=", ".join(outputs) or "outputs of programs; this device has none",
+                        hint=_near(tag, outputs),
+                    )
+                if tag in seen:
+                    raise system.file.error(at, f"{tag!r} is in the group {seen[tag]!r} already")
+                seen[tag] = group
 
 
 def _split(system: System, loc: tuple[Key, ...], tag: str) -> tuple[DeviceConfig, str]:

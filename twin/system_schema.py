@@ -59,9 +59,9 @@ class PollForm(Strict):
 
 
 class HeartbeatForm(Strict):
-    """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in us)."""
+    """CANopen heartbeat times (CiA 301: 1017h in the node, 1016h in us). Without `producer_ms` the node keeps its own time."""
 
-    producer_ms: Milliseconds
+    producer_ms: Milliseconds | None = None
     consumer_ms: Milliseconds
 
 
@@ -108,7 +108,12 @@ class DeviceForm(Strict):
     backoff_limit_ms: Milliseconds = Field(default=10_000, description="that doubles up to this")
     stale_after_ms: Milliseconds = 5000
     writable: list[Name] = []
-    safe: dict[Name, int | float] = {}
+    safe: dict[Name, bool | int | float | str] = Field(
+        default={}, description="tag -> its safe value: a number, true or false, or the value's name"
+    )
+    write_groups: dict[Name, Annotated[list[Name], Field(min_length=2, max_length=32)]] = Field(
+        default={}, description="name -> outputs of programs that are written whole or not at all, in this order"
+    )
     heartbeat: HeartbeatForm | None = None
     tpdo1: TpdoForm | None = None
     identity: IdentityForm | None = None
@@ -139,11 +144,22 @@ class InputForm(Strict):
     if_bad: Literal["hold", "pass", "trip"] | float = "pass"
 
 
+class StartForm(Strict):
+    """How long a program waits before its first scan until each input has been good once, and what happens after that."""
+
+    timeout_ms: int = Field(default=10_000, ge=0, le=3_600_000, description="0: do not wait")
+    at_timeout: Literal["wait", "stop", "start_anyway"] = Field(
+        default="wait",
+        description="wait: go on waiting and report it; stop: stop the PLC, outputs safe; start_anyway: start with what there is",
+    )
+
+
 class ProgramForm(Strict):
     """A program of the PLC: its source and how its variables are bound to tags."""
 
     source: str
     task: Name | None = Field(default=None, description="default: the first task")
+    start: StartForm | None = Field(default=None, description="default: the PLC's")
     inputs: dict[Name, InputForm] = {}
     outputs: dict[Name, TagName] = {}
 
@@ -153,6 +169,7 @@ class TaskForm(Strict):
 
     interval_ms: Milliseconds | None = None
     priority: int = Field(default=10, ge=0, le=31)
+    late_ms: Milliseconds | None = Field(default=None, description="default: that of the watchdog")
     single: TagName | None = None
 
     @model_validator(mode="after")
@@ -167,6 +184,7 @@ class PlcForm(Strict):
 
     cycle_ms: Milliseconds = 10
     watchdog: WatchdogForm = WatchdogForm()
+    start: StartForm = Field(default=StartForm(), description="when its programs begin")
     outputs_at: Literal["start", "end"] = Field(
         default="end", description="start: a scan's outputs change at the next cycle"
     )
@@ -241,6 +259,22 @@ class CommandsForm(Strict):
         return self
 
 
+class FollowsForm(Strict):
+    """Each time that `after` becomes true, `then` is so `within` a time, such as 2s."""
+
+    after: str
+    then: str
+    within: str
+
+
+class InvariantsForm(Strict):
+    """What holds in every run, scenario and campaign of this system: expressions as scenarios have them."""
+
+    always: list[str] = Field(default=[], max_length=200)
+    never: list[str] = Field(default=[], max_length=200)
+    within: list[FollowsForm] = Field(default=[], max_length=200)
+
+
 class SystemForm(Strict):
     """A plant: read by the physical twin and by its prototype, byte for byte the same."""
 
@@ -253,6 +287,9 @@ class SystemForm(Strict):
     commands: CommandsForm = CommandsForm()
     serve: dict[Name, ServeForm] = {}
     bridge: dict[Name, BridgeForm] = {}
+    invariants: InvariantsForm = Field(
+        default=InvariantsForm(), description="what holds in every run, scenario and campaign"
+    )
 
 
 class BusMappingForm(Strict):
@@ -314,6 +351,12 @@ class EmulatedForm(Strict):
     )
     model: Literal["mailbox", "profile"] | None = None
     profile: str | None = Field(default=None, description="the emulated device's own profile, where it differs")
+    cia: Literal["401", "402", "404", "406", "410", "none"] | None = Field(
+        default=None, description="CANopen: the device profile whose model is behind the objects; default as 1000h says"
+    )
+    parameter_values: bool = Field(
+        default=True, description="CANopen: false starts with the data sheet's DefaultValues"
+    )
     speed: float = Field(default=1.0, gt=0, le=10_000)
     at_end: Literal["hold", "loop", "error"] = "hold"
     latency_ms: float = Field(default=0.0, ge=0, le=60_000)

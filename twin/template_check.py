@@ -7,7 +7,7 @@ it was told that it may.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +15,9 @@ from gateway.core.clock import Clock
 from gateway.core.errors import FileInvalid
 from twin.software import wheel_hash
 from twin.system import System, load_system
-from twin.template import DigitalTemplate, Manifest, describe_model
+from twin.template import DigitalTemplate, Manifest, Software, describe_model
 from twin.template_pack import MODEL, collect
-from twin.template_package import Package
+from twin.template_package import Content, Package
 
 TEXT = (".yaml", ".yml", ".st", ".xml", ".py", ".eds", ".dcf", ".json", ".md", ".txt", ".csv")
 MAX_SHOWN_BYTES = 256 * 1024
@@ -91,31 +91,36 @@ class Difference:
         return "added" if not self.before else "removed" if not self.after else "changed"
 
 
-def differences(before: Manifest, after: Manifest) -> list[Difference]:
-    """Files that differ, by path, and the control software."""
-    old, new = before.by_path(), after.by_path()
+def differences(old: Mapping[str, Content], new: Mapping[str, Content]) -> list[Difference]:
+    """Return the files that differ, by path."""
     found = []
-    if before.software.modules_sha256 != after.software.modules_sha256:
-        a, b = before.software, after.software
-        found.append(
-            Difference("fieldtwin", "software", f"{a.version} {a.modules_sha256}", f"{b.version} {b.modules_sha256}")
-        )
     for path in sorted({*old, *new}):
-        a_hash, b_hash = (side[path].sha256 if path in side else "" for side in (old, new))
-        if a_hash != b_hash:
-            found.append(Difference(path, (new.get(path) or old[path]).kind, a_hash, b_hash))
+        before, after = (side[path].sha256 if path in side else "" for side in (old, new))
+        if before != after:
+            kind = (new[path].kind if path in new else "") or (old[path].kind if path in old else "")
+            found.append(Difference(path, kind, before, after))
     return found
 
 
-def unified(before: Package, after: Package, path: str) -> Iterator[str]:
-    """Lines of a unified diff of one text file; none for other files, and those of more than `MAX_SHOWN_BYTES`."""
-    sides = []
-    for package in (before, after):
-        file = package.manifest.by_path().get(path)
-        if file is not None and (not path.lower().endswith(TEXT) or file.bytes > MAX_SHOWN_BYTES):
+def software_difference(before: Software, after: Software) -> list[Difference]:
+    """Return the difference between the control software of two templates; an empty list if the modules are the same."""
+    if before.modules_sha256 == after.modules_sha256:
+        return []
+    sides = (f"{software.version} {software.modules_sha256}" for software in (before, after))
+    return [Difference("fieldtwin", "software", *sides)]
+
+
+def unified(path: str, *sides: tuple[Package, Content | None]) -> Iterator[str]:
+    """Yield the lines of a unified diff of one text file: nothing for other files, and those of more than `MAX_SHOWN_BYTES`.
+
+    `sides` are the two templates, each with what it holds under `path`.
+    """
+    texts: list[list[str]] = []
+    for package, content in sides:
+        if content is not None and (not path.lower().endswith(TEXT) or content.bytes > MAX_SHOWN_BYTES):
             return
         try:
-            sides.append(package.text(path).decode().splitlines() if file is not None else [])
+            texts.append(package.text(path).decode().splitlines() if content is not None else [])
         except UnicodeDecodeError:
             return
-    yield from difflib.unified_diff(sides[0], sides[1], f"a/{path}", f"b/{path}", lineterm="")
+    yield from difflib.unified_diff(texts[0], texts[1], f"a/{path}", f"b/{path}", lineterm="")

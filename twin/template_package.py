@@ -18,11 +18,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 from gateway.core.errors import FileInvalid, Unreachable, UsageError
+from gateway.core.input_file import open_input
 from twin.template import (
     MANIFEST,
+    MAX_FILE_BYTES,
     MAX_FILES,
     MAX_MANIFEST_BYTES,
     MAX_TOTAL_BYTES,
@@ -39,6 +41,20 @@ MAX_DIRECTORY_BYTES = MAX_FILES * 600
 _END = struct.Struct("<4s4H2LH")
 """A zip's end of central directory record (APPNOTE 4.3.16)."""
 _LOCAL_CACHE = "__pycache__"
+_DAMAGED = (OSError, EOFError, zlib.error, zipfile.BadZipFile, NotImplementedError, RuntimeError)
+"""What reading a file of a damaged or foreign zip raises: `zipfile` passes on the errors of the modules that it uses."""
+
+
+def _reason(error: Exception) -> str:
+    return str(error) or "it ends too early"  # EOFError has no text of its own
+
+
+class Content(NamedTuple):
+    """What a file of a template holds: its kind (empty if the manifest does not name the file), bytes, and SHA-256."""
+
+    kind: str
+    bytes: int
+    sha256: str
 
 
 class Package(ABC):
@@ -69,17 +85,18 @@ class Package(ABC):
                         raise self._wrong(file, f"{file.bytes} bytes", "more")
                     digest.update(block)
                     yield block
-        except (OSError, zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError) as e:
-            raise FileInvalid(f"{file.path}: cannot be read: {e}", path=str(self.path)) from e
-        except zlib.error as e:  # zipfile lets it through
-            raise FileInvalid(f"{file.path}: what was packed is broken: {e}", path=str(self.path)) from e
+        except _DAMAGED as e:
+            raise FileInvalid(f"{file.path}: cannot be read: {_reason(e)}", path=str(self.path)) from e
         if size != file.bytes:
             raise self._wrong(file, f"{file.bytes} bytes", f"{size} bytes")
         if digest.hexdigest() != file.sha256:
             raise self._wrong(file, f"SHA-256 {file.sha256}", digest.hexdigest())
 
     def _wrong(self, file: TemplateFile, expected: str, got: str) -> FileInvalid:
-        return FileInvalid(f"{file.path}: not what was packed", path=str(self.path), expected=expected, got=got)
+        hint = "`fieldtwin template diff` shows what was edited; pack the template again" if self.path.is_dir() else ""
+        return FileInvalid(
+            f"{file.path}: not what was packed", path=str(self.path), expected=expected, got=got, hint=hint
+        )
 
     def verify(self) -> None:
         """Read everything once. Raises `FileInvalid` for the first file that is not what the manifest says."""
@@ -91,12 +108,24 @@ class Package(ABC):
         """The whole of one file, checked."""
         return b"".join(self.read(self.manifest.by_path()[name]))
 
+    def contents(self) -> dict[str, Content]:
+        """Return every file with the hash of its bytes, by path, in the manifest's order.
+
+        Reads all files once. Raises `FileInvalid` for the first file that is not what the manifest says: a damaged file has the
+        manifest's hash only on paper, so it would differ from nothing.
+        """
+        self.verify()
+        return {file.path: Content(file.kind, file.bytes, file.sha256) for file in self.manifest.files}
+
 
 @contextmanager
-def open_package(path: Path) -> Iterator[Package]:
-    """Open a template, folder or zip. Raises `FileInvalid` or `UsageError`."""
+def open_package(path: Path, *, edited: bool = False) -> Iterator[Package]:
+    """Open a template, folder or zip. With `edited`, a folder may differ from its manifest (`EditedFolder`).
+
+    Raises `FileInvalid` or `UsageError`.
+    """
     if path.is_dir():
-        yield FolderPackage(path)
+        yield EditedFolder(path) if edited else FolderPackage(path)
     elif path.is_file():
         with ZipPackage(path) as package:
             yield package
@@ -109,9 +138,9 @@ def is_template(path: Path) -> bool:
     if path.is_dir():
         return (path / MANIFEST).is_file()
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             return file.read(4) == b"PK\x03\x04"
-    except OSError:
+    except (OSError, FileInvalid):
         return False
 
 
@@ -120,21 +149,68 @@ class FolderPackage(Package):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        try:
-            with (path / MANIFEST).open("rb") as file:
-                text = file.read(MAX_MANIFEST_BYTES + 1)
-        except OSError as e:
-            raise FileInvalid(f"no template: {e.strerror}", path=str(path / MANIFEST)) from e
-        self.manifest = parse_manifest(_bounded(text, str(path)), str(path / MANIFEST))
+        self.manifest = _folder_manifest(path)
         found: list[str] = []
         caches: list[str] = []
         for name in names_below(path):
-            (caches if f"/{_LOCAL_CACHE}/" in f"/{name}" else found).append(name)
+            (caches if _is_cache(name) else found).append(name)
         self.caches = tuple(caches)
         _compare(found, self.manifest, str(path))
 
     def open(self, name: str) -> IO[bytes]:
-        return open(os.open(self.path / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
+        return _open_inside(self.path, name)
+
+
+class EditedFolder(Package):
+    """A template as a folder that its owner works in: files may have been edited, added or removed since it was packed.
+
+    Only for comparing. Everything that runs or unpacks a template takes a `FolderPackage`, which accepts no such change.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.manifest = _folder_manifest(path)
+
+    def open(self, name: str) -> IO[bytes]:
+        return _open_inside(self.path, name)
+
+    def text(self, name: str) -> bytes:
+        """Return the file as it is now. Raises `FileInvalid` if it is larger than a template allows."""
+        try:
+            with self.open(name) as source:
+                text = source.read(MAX_FILE_BYTES + 1)
+        except OSError as e:
+            raise FileInvalid(f"{name}: cannot be read: {e.strerror}", path=str(self.path)) from e
+        if len(text) > MAX_FILE_BYTES:
+            raise FileInvalid(f"{name}: too large", path=str(self.path), expected=f"at most {MAX_FILE_BYTES} bytes")
+        return text
+
+    def contents(self) -> dict[str, Content]:
+        """Return the files that the folder holds now. A file that the manifest does not name has an empty kind."""
+        kinds: dict[str, str] = {file.path: file.kind for file in self.manifest.files}
+        found = {}
+        for name in sorted(names_below(self.path)):
+            if name != MANIFEST and not _is_cache(name):
+                text = self.text(name)
+                found[name] = Content(kinds.get(name, ""), len(text), hashlib.sha256(text).hexdigest())
+        return found
+
+
+def _is_cache(name: str) -> bool:
+    return f"/{_LOCAL_CACHE}/" in f"/{name}"
+
+
+def _folder_manifest(path: Path) -> Manifest:
+    try:
+        with open_input(path / MANIFEST) as file:
+            text = file.read(MAX_MANIFEST_BYTES + 1)
+    except OSError as e:
+        raise FileInvalid(f"no template: {e.strerror}", path=str(path / MANIFEST)) from e
+    return parse_manifest(_bounded(text, str(path)), str(path / MANIFEST))
+
+
+def _open_inside(folder: Path, name: str) -> IO[bytes]:
+    return open(os.open(folder / name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb")
 
 
 def names_below(folder: Path) -> Iterator[str]:
@@ -199,8 +275,8 @@ class ZipPackage(Package):
         try:
             with self._zip.open(entry) as file:
                 return _bounded(file.read(MAX_MANIFEST_BYTES + 1), str(self.path))
-        except (OSError, zipfile.BadZipFile, RuntimeError, zlib.error) as e:
-            raise FileInvalid(f"{MANIFEST} cannot be read: {e}", path=str(self.path)) from e
+        except _DAMAGED as e:
+            raise FileInvalid(f"{MANIFEST} cannot be read: {_reason(e)}", path=str(self.path)) from e
 
     def _check_entries(self) -> None:
         _compare(list(self._entries), self.manifest, str(self.path))
@@ -230,7 +306,7 @@ def _check_directory(path: Path) -> None:
     size = path.stat().st_size
     if size > MAX_TOTAL_BYTES + MAX_DIRECTORY_BYTES:
         raise FileInvalid("too large", path=str(path), expected=f"at most {MAX_TOTAL_BYTES} bytes", got=str(size))
-    with path.open("rb") as file:
+    with open_input(path) as file:
         file.seek(max(0, size - _END.size - 0xFFFF - 20))
         tail = file.read()
     at = len(tail) - _END.size

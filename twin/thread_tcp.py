@@ -64,8 +64,9 @@ class StreamLink(DatagramLink):
         """Whether it was one of ours, and no frame. Raises `Unwelcome` where it says so."""
         if data.startswith(TAKEN):
             raise Unwelcome(
-                f"somebody else follows this thread already: {data.removeprefix(TAKEN).decode(errors='replace')}",
-                where=str(self._connection.endpoint), hint="one at a time; over a broker (mqtt://) there may be several",
+                f"another shadow or twin follows this thread already: {data.removeprefix(TAKEN).decode(errors='replace')}",
+                where=str(self._connection.endpoint),
+                hint="stop it first, or use a broker (mqtt://), which serves several at a time",
             )  # fmt: skip
         if data == PING:
             await self.send_datagram(PONG)

@@ -23,6 +23,7 @@ from gateway.core.nursery import Nursery
 from gateway.core.started import Started
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.gateway import Gateway
+from gateway.runtime.refusals import Refusal
 from gateway.store.exchange_log import ExchangeLog
 from plc.publishing import Change
 from plc.runner import Runner
@@ -59,6 +60,7 @@ class VirtualPrototype(Started):
         seed: int | None = None,
         taps: Sequence[Tap] = (),
         on_change: Callable[[Change], None] | None = None,
+        on_refusal: Callable[[Refusal], None] | None = None,
         prepare: Callable[[VirtualPrototype], None] | None = None,
         water: Mapping[str, ModemEnd] | None = None,
     ) -> None:
@@ -80,6 +82,7 @@ class VirtualPrototype(Started):
         self._run_dir = run_dir
         self._taps = taps
         self._on_change = on_change
+        self._on_refusal = on_refusal
         self._prepare = prepare
 
     async def _start(self) -> None:
@@ -117,6 +120,7 @@ class VirtualPrototype(Started):
             plc_config(self.system, self._run_dir), for_plc, clock.monotonic_ns, on_change=self._on_change
         )
         self._stack.callback(self.plc.close)
+        self.gateway.outputs.journal.on_new = self._refused
         if self._prepare is not None:
             self._prepare(self)
         self._nursery = await self._stack.enter_async_context(Nursery())
@@ -127,6 +131,13 @@ class VirtualPrototype(Started):
         self.started_ns = self.field.faults.start_ns = self.loop.now_ns
         self._nursery.start(self.gateway.run(), "gateway")
         self._nursery.start(self._flush(log), "store")
+
+    def _refused(self, entry: Refusal) -> None:
+        if entry.by == "plc" and entry.tag in self.plc.outputs.last():
+            value = entry.first if isinstance(entry.first, int | float) else None
+            entry.program, entry.place = self.plc.origin(entry.tag, value)
+        if self._on_refusal is not None:
+            self._on_refusal(entry)
 
     async def _flush(self, log: ExchangeLog) -> None:
         while True:

@@ -11,6 +11,7 @@ from typing import Any
 from gateway.core.clock import Clock
 from gateway.core.errors import UsageError
 from gateway.core.values import TagValue
+from gateway.runtime.refusals import Refusals
 from gateway.runtime.tags import TagTable
 
 MOST = 50_000
@@ -23,7 +24,8 @@ Change = tuple[int, int, str, Any, str, str]
 class TagWatch:
     """Changes of a `TagTable`, numbered. ``answer({"since": 0, "names": [...]})`` is the control channel's `watch`."""
 
-    def __init__(self, tags: TagTable, clock: Clock) -> None:
+    def __init__(self, tags: TagTable, clock: Clock, journal: Refusals | None = None) -> None:
+        self._journal = journal
         self._tags = tags
         self._clock = clock
         self._changes: deque[Change] = deque(maxlen=MOST)
@@ -31,15 +33,16 @@ class TagWatch:
 
     def answer(self, args: dict[str, Any]) -> dict[str, Any]:
         """``now_ns``; ``changes`` after number `since`, the oldest first, `AT_ONCE` at most; ``dropped``, how many of them are
-        not kept any more; ``last``, the newest number; ``tags``: of each of `names` value, quality, reason, source time (ns).
+        not kept any more; ``last``, the newest number; ``tags``: of each of `names` value, quality, reason, source time (ns);
+        ``refusals``: writes that did not reach their device, after the entry number `refused`.
 
         Raises `UsageError` for a tag that there is not.
         """
         if self._tags.on_put is None:
             self._tags.on_put = self._changed
-        since, names = args.get("since", 0), args.get("names", [])
-        if type(since) is not int or not isinstance(names, list):
-            raise UsageError("what to watch", expected='{"since": NUMBER, "names": [TAG...]}')
+        since, names, refused = args.get("since", 0), args.get("names", []), args.get("refused", 0)
+        if type(since) is not int or type(refused) is not int or not isinstance(names, list):
+            raise UsageError("what to watch", expected='{"since": NUMBER, "refused": NUMBER, "names": [TAG...]}')
         now_ns = self._clock.monotonic_ns()
         known = set(self._tags.names)
         for name in names:
@@ -52,6 +55,7 @@ class TagWatch:
             "changes": self._after(since),
             "dropped": max(0, oldest - since - 1),
             "tags": {name: _shown(self._tags.current(name, now_ns)) for name in names},
+            "refusals": [r.describe() for r in self._journal.since(refused)] if self._journal is not None else [],
         }
 
     def _after(self, since: int) -> list[Change]:

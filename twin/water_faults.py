@@ -10,14 +10,16 @@ from emulators.faults.drop import Drop
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active
 from emulators.faults.frames import Frame, Framing, Way
-from emulators.faults.schema import FaultSpec, WrongAim, parse_fault
+from emulators.faults.schema import FaultSpec, parse_fault
+from emulators.faults.wrong_aim import WrongAim
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import UsageError
 from twin.fault_aims import known
+from twin.fault_history import FaultHistory
 from twin.network import WATER, Network
 
 MOST = 1_000
-_AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probability"})
+_AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probability", "optional"})
 
 
 class WaterFaults:
@@ -28,6 +30,7 @@ class WaterFaults:
         self._network = network
         self._seed = seed
         self._wire = WireFaults(Framing.RAW)
+        self.history = FaultHistory()
         self._numbers = {name: number for number, name in enumerate(network.places, 1)}
 
     def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
@@ -44,17 +47,17 @@ class WaterFaults:
             raise UsageError("too many faults at once", expected=f"at most {MOST}")
         until_ns = None if spec.until_s is None else self.start_ns + round(spec.until_s * NS_PER_S)
         units = (self._numbers[spec.aim.device],) if spec.aim.device else ()
-        self._wire.put_in(
-            Active(
-                spec.id,
-                spec.make(),
-                spec.aim,
-                Random(f"{self._seed} {spec.id}"),
-                self.start_ns + round(spec.from_s * NS_PER_S),
-                until_ns,
-                units=units,
-            )
+        active = Active(
+            spec.id,
+            spec.make(),
+            spec.aim,
+            Random(f"{self._seed} {spec.id}"),
+            self.start_ns + round(spec.from_s * NS_PER_S),
+            until_ns,
+            units=units,
         )
+        self._wire.put_in(active)
+        self.history.add(active, f"{WATER} {spec.aim.device}".strip())
         return spec.id
 
     def clear(self, id: str) -> None:

@@ -46,6 +46,11 @@ def is_number(data_type: int) -> bool:
     return data_type in _INTEGER_BYTES or data_type in _REAL
 
 
+def is_integer(data_type: int) -> bool:
+    """Whether it is one of the integer types or BOOLEAN."""
+    return data_type in _INTEGER_BYTES
+
+
 def integer_range(data_type: int) -> tuple[int, int] | None:
     """The smallest and largest value of an integer type or BOOLEAN; None for others."""
     return _RANGES.get(data_type)
@@ -114,18 +119,19 @@ def parse_number(text: str) -> int:
 def encode_text(data_type: int, text: str) -> bytes:
     """The bytes of a value as an electronic data sheet writes it (without $NODEID). Raises `ValueError`.
 
-    An empty text is a type's zero, or the empty string.
+    An empty text is a type's zero, or the empty string. A time is a number of 48 bits, or its six octets as twelve digits.
     """
     if data_type == VISIBLE_STRING:
         return text.encode("latin-1", "replace")
     if data_type == UNICODE_STRING:
         return text.encode("utf-16-le")
     size = size_bytes(data_type)
-    if size is None or data_type in _TIME_BYTES:
-        raw = _hex_bytes(text)
-        return raw if size is None else raw.ljust(size, b"\0")[:size]
+    if size is None:
+        return _hex_bytes(text)
     if not text.strip():
         return bytes(size)
+    if data_type in _TIME_BYTES:
+        return _hex_bytes(text) if len(text.strip()) == 2 * size else _fit(parse_number(text), size)
     if data_type in _REAL and not text.strip().lower().startswith("0x"):
         return encode(data_type, float(text))
     if data_type in _REAL:  # a hexadecimal number is the bit pattern

@@ -22,16 +22,30 @@ from emulators.canopen.entries import DictionaryObject as DictionaryObject
 from emulators.canopen.entries import Entry as Entry
 from emulators.canopen.entries import Key as Key
 from gateway.core.errors import FileInvalid
+from gateway.core.input_file import read_input
 
-_DEFTYPE, _DEFSTRUCT = 0x05, 0x06
+MAX_EDS_BYTES = 8 * 1024 * 1024
+"""An EDS or DCF file that is larger is a mistake; the largest one known has 2 MB."""
+MAX_DOMAIN_BYTES = 16 * 1024 * 1024
+"""Of a file that a DOMAIN object names as its content."""
 _ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
 _OBJECT = re.compile(r"[0-9a-f]{1,4}")
+_VALUES = re.compile(r"[0-9a-f]{4}value")
 _SUBOBJECT = re.compile(r"([0-9a-f]{1,4})sub([0-9a-f]{1,2})")
+_HOLDS_NO_VALUE = (0x05, 0x06)
+"""DEFTYPE and DEFSTRUCT: the definition of a data type."""
+_RESERVED_TYPES = (0x00, 0x0E, 0x17)
 _BIT_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 _NAMED = 4
 """Objects of a kind that a note names."""
 _NODE_ID = re.compile(r"\$nodeid", re.IGNORECASE)
+_RELATIVE = re.compile(r"\$nodeid(?:\+([0-9a-fx]+))?|([0-9a-fx]+)\+\$nodeid", re.IGNORECASE)
+"""``$NODEID``, ``$NODEID+0x180`` and ``0x180+$NODEID`` (CiA 306-1, 4.6.3.2), without spaces."""
+_HIGHEST_NODE_ID = 127
+_FIRST_OBJECT = 0x1000
+"""Lower indices define data types (CiA 301, 7.4.1): no client reads them."""
+_LAST_TYPE = 0x1B
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,25 +82,35 @@ class Dictionary:
             yield from (self.objects[index].entries[sub] for sub in sorted(self.objects[index].entries))
 
 
-def load_eds(path: str | Path) -> Dictionary:
-    """The dictionary in a file. Raises `FileInvalid` with path and line."""
+def load_eds(path: str | Path, *, parameter_values: bool = True) -> Dictionary:
+    """The dictionary in a file. Without `parameter_values` the node starts with the DefaultValues, as one that no DCF has
+    configured. Raises `FileInvalid` with path and line."""
     try:
-        raw = Path(path).read_bytes()
+        raw = read_input(Path(path), MAX_EDS_BYTES)
     except OSError as e:
         raise FileInvalid("the data sheet cannot be read", path=str(path), got=e.strerror or str(e)) from e
     notes: list[Note] = []
-    return parse_eds(decode_file(raw, notes), str(path), notes, Path(path).parent)
+    return parse_eds(decode_file(raw, notes), str(path), notes, Path(path).parent, parameter_values=parameter_values)
 
 
-def parse_eds(text: str, path: str = "", notes: list[Note] | None = None, folder: Path | None = None) -> Dictionary:
+def parse_eds(
+    text: str,
+    path: str = "",
+    notes: list[Note] | None = None,
+    folder: Path | None = None,
+    *,
+    parameter_values: bool = True,
+) -> Dictionary:
     """The dictionary in the text of an EDS or DCF. `path` is for messages, `notes` are known already; what a DOMAIN's
-    DownloadFile names is looked for in `folder`. Raises `FileInvalid`."""
+    DownloadFile names is looked for in `folder`. `parameter_values` as in `load_eds`. Raises `FileInvalid`."""
     notes = [] if notes is None else notes
     sections = parse_sections(text, path, notes)
+    if not parameter_values:
+        _forget_parameter_values(sections)
     objects: dict[int, DictionaryObject] = {}
     for name, section in sections.items():
         # Short names such as [A0] describe data types, not objects that a client can reach.
-        if _OBJECT.fullmatch(name) and len(name) == 4:
+        if _OBJECT.fullmatch(name) and len(name) == 4 and int(name, 16) >= _FIRST_OBJECT:
             found = _read_object(int(name, 16), section, sections)
             if found is not None:
                 objects[found.index] = found
@@ -102,15 +126,24 @@ def parse_eds(text: str, path: str = "", notes: list[Note] | None = None, folder
         path=path,
         product_name=info.text("ProductName"),
         vendor_name=info.text("VendorName"),
-        vendor_number=info.number("VendorNumber", 0),
+        vendor_number=info.count("VendorNumber"),
         node_id=_in_range(commissioning, "NodeID", 127) if commissioning else 0,
         objects=objects,
         dummies=_read_dummies(sections.get("dummyusage")),
         bit_rate=_in_range(commissioning, "Baudrate", 1000) * 1000 if commissioning else 0,
-        bit_rates=frozenset(1000 * rate for rate in _BIT_RATES if info.number(f"BaudRate_{rate}", 0)),
-        lss=bool(info.number("LSS_Supported", 0)),
+        bit_rates=frozenset(1000 * rate for rate in _BIT_RATES if info.count(f"BaudRate_{rate}")),
+        lss=bool(info.count("LSS_Supported")),
         notes=tuple(sorted(notes, key=lambda note: note.line)),
     )
+
+
+def _forget_parameter_values(sections: dict[str, Section]) -> None:
+    """Leave out what a DCF adds to an EDS: ParameterValues, DownloadFiles and the values of compact arrays."""
+    for name in [name for name in sections if _VALUES.fullmatch(name)]:
+        del sections[name]
+    for section in sections.values():
+        for key in ("parametervalue", "downloadfile"):
+            section.values.pop(key, None)
 
 
 def _commissioning(sections: dict[str, Section]) -> Section | None:
@@ -122,10 +155,11 @@ def _commissioning(sections: dict[str, Section]) -> Section | None:
 
 
 def _in_range(section: Section, key: str, most: int) -> int:
-    number = section.number(key, 0)
-    if not 0 <= number <= most:
-        raise section.error(f"{key} of [{section.name}]", key, expected=f"1 to {most}", got=str(number))
-    return number
+    number = section.count(key)
+    if 0 <= number <= most:
+        return number
+    section.note(f"{key} of [{section.name}] is not 1 to {most}, left out", key)
+    return 0
 
 
 def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObject]) -> None:
@@ -135,7 +169,7 @@ def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObje
         section = sections.get(name)
         for key in section.values if section else ():
             if section is not None and key.isdigit():
-                index = section.number(key)
+                index = section.count(key)
                 listed.add(index)
                 if index not in objects and f"{index:x}".zfill(4) not in sections:
                     section.note(f"object {index:04X}h is listed in [{section.name}] and not described", key)
@@ -147,7 +181,7 @@ def _check_lists(sections: dict[str, Section], objects: dict[int, DictionaryObje
         own = sections.get(f"{index:04x}")
         if own is None:
             continue
-        told = own.number("SubNumber", 0)
+        told = own.count("SubNumber")
         if told and not own.number("CompactSubObj", 0) and found.kind in (ARRAY, RECORD) and told != len(found.entries):
             own.note(f"SubNumber of [{own.name}] is {told}, {len(found.entries)} are described", "SubNumber")
 
@@ -167,7 +201,9 @@ def _fill_domains(sections: dict[str, Section], objects: dict[int, DictionaryObj
             try:
                 if folder is None:
                     raise FileNotFoundError
-                found.entries[sub] = replace(entry, default=(folder / PureWindowsPath(name).name).read_bytes())
+                found.entries[sub] = replace(
+                    entry, default=read_input(folder / PureWindowsPath(name).name, MAX_DOMAIN_BYTES), configured=True
+                )
             except OSError:
                 section.note(f"DownloadFile of [{section.name}] cannot be read, the object is empty", "DownloadFile")
 
@@ -175,18 +211,18 @@ def _fill_domains(sections: dict[str, Section], objects: dict[int, DictionaryObj
 def _read_dummies(section: Section | None) -> frozenset[int]:
     if section is None:
         return frozenset()
-    return frozenset(t for t in range(1, 8) if section.number(f"Dummy{t:04X}", 0) == 1)
+    return frozenset(t for t in range(1, 8) if section.count(f"Dummy{t:04X}") == 1)
 
 
 def _read_object(index: int, section: Section, sections: dict[str, Section]) -> DictionaryObject | None:
     kind = section.number("ObjectType", VAR)
     name = section.text("ParameterName", f"{index:04X}h")
-    if kind in (_DEFTYPE, _DEFSTRUCT):
-        return None  # a data type's definition is no object that holds a value
     if kind in (VAR, DOMAIN_OBJECT):
         return DictionaryObject(index, name, kind, {0: _read_entry(index, 0, section, sections, name)})
     if kind not in (ARRAY, RECORD):
-        raise section.error(f"object {index:04X}h is of an unknown kind", "ObjectType", expected="2, 7, 8 or 9")
+        if kind not in _HOLDS_NO_VALUE:
+            section.note(f"ObjectType {kind:X}h of [{section.name}] is unknown, the object is left out", "ObjectType")
+        return None
     entries: dict[int, Entry] = {}
     count = section.number("CompactSubObj", 0)
     if not 0 <= count <= 254:
@@ -214,10 +250,11 @@ def _read_subobjects(sections: dict[str, Section], objects: dict[int, Dictionary
         index, sub = int(match.group(1), 16), int(match.group(2), 16)
         parent = objects.get(index)
         if parent is None:
-            raise section.error(
-                f"a subindex of an object that is not there: [{section.name}]", expected=f"[{index:04X}]"
-            )
-        if parent.kind in (ARRAY, RECORD):
+            if f"{index:04x}" not in sections:
+                section.note(f"[{section.name}] is left out, there is no [{index:04X}]")
+        elif parent.kind not in (ARRAY, RECORD):
+            section.note(f"[{section.name}] is left out, [{index:04X}] is a single variable")
+        else:
             label = section.text("ParameterName", f"{parent.name}{sub}")
             parent.entries[sub] = _read_entry(index, sub, section, sections, label)
 
@@ -226,22 +263,14 @@ def _read_entry(
     index: int, subindex: int, section: Section, sections: dict[str, Section], name: str, value_text: str = ""
 ) -> Entry:
     data_type = _basic_type(section, sections)
-    if not section.text("AccessType") and "accesstype" in section.values:
-        section.note(f"AccessType of [{section.name}] is empty, taken as rw", "AccessType")
+    if not section.text("AccessType"):
+        section.note(f"AccessType of [{section.name}] is missing, taken as rw", "AccessType")
+    if not section.text("ParameterName"):
+        section.note(f"ParameterName of [{section.name}] is missing", "ParameterName")
     access = section.text("AccessType", "rw").lower()
     if access not in _ACCESS:
         raise section.error(f"AccessType of [{section.name}]", "AccessType", expected=", ".join(_ACCESS), got=access)
-    key = "ParameterValue" if section.text("ParameterValue") else "DefaultValue"
-    text = value_text or section.text(key)
-    relative = bool(_NODE_ID.search(text)) and codec.is_number(data_type)
-    if relative:
-        text = _NODE_ID.sub("", text).replace(" ", "").strip("+") or "0"
-    try:
-        default = codec.encode_text(data_type, text)
-    except ValueError:
-        raise section.error(
-            f"{key} of [{section.name}]", key, expected=f"a value of data type {data_type:04X}h", got=text
-        ) from None
+    default, relative, configured = _read_default(section, data_type, value_text)
     low, high = _limit(section, "LowLimit", data_type), _limit(section, "HighLimit", data_type)
     if low is not None and high is not None and low > high:
         section.note(f"LowLimit of [{section.name}] is above its HighLimit, both are left out", "LowLimit")
@@ -257,7 +286,37 @@ def _read_entry(
         node_relative=relative,
         low=low,
         high=high,
+        configured=configured,
     )
+
+
+def _read_default(section: Section, data_type: int, value_text: str) -> tuple[bytes, bool, bool]:
+    """The bytes that the object starts with, whether the node id is added to them, and whether a DCF sets them.
+
+    A value that its data type cannot hold (a text in a DOMAIN, 300 in an UNSIGNED8) is noted, and the next one counts: the
+    DefaultValue after a ParameterValue, after that the type's zero or the empty string.
+    """
+    texts = [("value", value_text), *((key, section.text(key)) for key in ("ParameterValue", "DefaultValue"))]
+    for key, text in texts:
+        if not text:
+            continue
+        try:
+            return *_value(data_type, text), key != "DefaultValue"
+        except ValueError:
+            section.note(f"{key} of [{section.name}] is no value of data type {data_type:04X}h: {text[:40]}", key)
+    return codec.encode_text(data_type, ""), False, False
+
+
+def _value(data_type: int, text: str) -> tuple[bytes, bool]:
+    """The bytes that a text means, and whether the node id is added to them. Raises `ValueError`."""
+    if not codec.is_integer(data_type) or not _NODE_ID.search(text):
+        return codec.encode_text(data_type, text), False
+    match = _RELATIVE.fullmatch(text.replace(" ", ""))
+    if match is None:
+        raise ValueError("neither a number, nor a number and the node id")
+    raw = codec.encode_text(data_type, match[1] or match[2] or "0")
+    codec.encode(data_type, int(codec.decode(data_type, raw)) + _HIGHEST_NODE_ID)  # has to hold it for every node
+    return raw, True
 
 
 def _basic_type(section: Section, sections: dict[str, Section]) -> int:
@@ -265,13 +324,13 @@ def _basic_type(section: Section, sections: dict[str, Section]) -> int:
     if section.number("ObjectType", VAR) == DOMAIN_OBJECT:
         return codec.DOMAIN
     data_type = section.number("DataType")
-    if data_type <= 0x1B:
-        return data_type
     defined = sections.get(f"{data_type:x}sub1")
-    if defined is None:
-        section.note(f"DataType {data_type:04X}h of [{section.name}] is not described, taken as DOMAIN", "DataType")
-        return codec.DOMAIN
-    return defined.number("DefaultValue", codec.DOMAIN)
+    if data_type > _LAST_TYPE and defined is not None:
+        data_type = defined.count("DefaultValue")
+    if 0 < data_type <= _LAST_TYPE and data_type not in _RESERVED_TYPES:
+        return data_type
+    section.note(f"DataType {data_type:04X}h of [{section.name}] is not described, taken as DOMAIN", "DataType")
+    return codec.DOMAIN
 
 
 def _limit(section: Section, key: str, data_type: int) -> int | float | None:
@@ -281,4 +340,5 @@ def _limit(section: Section, key: str, data_type: int) -> int | float | None:
     try:
         return codec.decode(data_type, codec.encode_text(data_type, text))
     except ValueError:
-        raise section.error(f"{key} of [{section.name}]", key, expected="a number of its type", got=text) from None
+        section.note(f"{key} of [{section.name}] is no number of its type, left out: {text[:40]}", key)
+        return None

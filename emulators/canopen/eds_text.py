@@ -1,15 +1,21 @@
 """The INI layer of an electronic data sheet (CiA 306-1, 4.2): sections of ``key=value`` lines, each with its line number.
 
-Tolerant where real files are sloppy (indentation, empty values, case, line ends, encodings), strict where a guess would
-be wrong (a section or a key given twice, a line that is nothing). It knows no objects.
+Tolerant where real files are sloppy (indentation, empty values, case, line ends, encodings, free text in sections that
+describe no object), strict where a guess would be wrong: an object that is described twice, a key with two values, a line of
+an object that is no ``key=value``. The gateway's reader is as tolerant as this one (decision 0001); it shares no code. It
+knows no objects.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 from emulators.canopen.codec import parse_number
 from gateway.core.errors import FileInvalid
+
+_OBJECT = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2}|name|value)?", re.IGNORECASE)
+"""Names of the sections that describe objects."""
 
 MAX_LINES = 500_000
 """More than any device has (65,536 objects), and a bound on what a wrong file can cost."""
@@ -57,6 +63,14 @@ class Section:
                 f"{key} of [{self.name}] is no number", path=self.path, line=line, expected="a number", got=text
             ) from None
 
+    def count(self, key: str) -> int:
+        """The integer of `key`, which nothing depends on: one that cannot be read is noted and counts as 0."""
+        try:
+            return self.number(key, 0)
+        except FileInvalid:
+            self.note(f"{key} of [{self.name}] is no number, left out", key)
+            return 0
+
     def note(self, text: str, key: str = "") -> None:
         """Something that was mended, at `key` or in the section as a whole; said once."""
         note = Note(self.values.get(key.lower(), ("", self.line))[1], text)
@@ -92,17 +106,21 @@ def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -
         raise FileInvalid("the file is too long", path=path, expected=f"at most {MAX_LINES} lines", got=str(len(lines)))
     for number, line in enumerate(lines, start=1):
         line = line.strip()
-        if not line or line.startswith(";"):
+        if not line or line[0] in ";#":
             continue
         if line.startswith("["):
             name = line[1:].partition("]")[0].strip()
             if not name or "]" not in line:
                 raise FileInvalid("a broken section header", path=path, line=number, expected="[name]", got=line)
             if name.lower() in sections:
-                raise FileInvalid(f"section [{name}] is given twice", path=path, line=number)
+                if _OBJECT.fullmatch(name):
+                    raise FileInvalid(f"section [{name}] is given twice", path=path, line=number)
+                notes.append(Note(number, f"[{name}] is given twice, the last one counts"))
             current = sections[name.lower()] = Section(name, number, path, notes=notes)
             continue
         key, equals, value = line.partition("=")
+        if not equals and current is not None and not _OBJECT.fullmatch(current.name):
+            continue  # free text, as in a section of comments
         if not equals or current is None:
             expected = "[section]" if current is None else "key=value"
             where = f" in [{current.name}]" if current else ""
@@ -110,9 +128,11 @@ def parse_sections(text: str, path: str = "", notes: list[Note] | None = None) -
                 f"not a line of a data sheet{where}", path=path, line=number, expected=expected, got=line[:60]
             )
         key = key.strip().lower()
-        if key in current.values:
-            raise FileInvalid(f"{key} is given twice in [{current.name}]", path=path, line=number)
         bare = _without_comment(value).strip()
+        if key in current.values:
+            if current.values[key][0] != bare and _OBJECT.fullmatch(current.name):
+                raise FileInvalid(f"{key} is given twice in [{current.name}]", path=path, line=number)
+            notes.append(Note(number, f"{key} of [{current.name}] is given twice, the last one counts"))
         if bare != value.strip():
             notes.append(Note(number, f"a comment behind the value of {key} in [{current.name}] is left out"))
         current.values[key] = (bare, number)

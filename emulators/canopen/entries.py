@@ -16,7 +16,8 @@ VAR, ARRAY, RECORD, DOMAIN_OBJECT = 0x07, 0x08, 0x09, 0x02
 class Entry:
     """One subindex. `default` is on-wire bytes; with `node_relative` the node id is added to it.
 
-    `size` is the value's length in bytes, None where every value has its own. `low` and `high` are inclusive.
+    `size` is the value's length in bytes, None where every value has its own. `low` and `high` are inclusive. `configured`:
+    `default` is what a DCF sets (its ParameterValue), not what the device leaves the factory with.
     """
 
     index: int
@@ -29,6 +30,7 @@ class Entry:
     node_relative: bool = False
     low: int | float | None = None
     high: int | float | None = None
+    configured: bool = False
 
     @property
     def key(self) -> Key:

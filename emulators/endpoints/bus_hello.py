@@ -4,7 +4,7 @@ Pure bytes; no sockets. A hello is as long as a frame's record (24 bytes) and it
 frame's record has, so a reader of fixed-size records needs no second framing. Network byte order:
 
     0  u8   80h
-    1  u8   protocol version, 1
+    1  u8   protocol version: 1, or 2 for records that carry CAN FD (80 bytes each); the answer has that of the request
     2  u8   status (answer): 0 welcome, 1 wrong bit rate, 2 unknown version, 3 bus full
     3  u8   options (request): bit 0, confirm each frame of mine when it was on the wire; bit 1, error frames when my
             controller's state changes or frames for me were lost; bit 2, one for each error on the wire that I took part in
@@ -12,7 +12,7 @@ frame's record has, so a reader of fixed-size records needs no second framing. N
     8  u64  monotonic clock of the bus in ns (answer)
     16 4s   "ftcb"
     20 u16  transmit window (answer): unconfirmed frames that the bus takes without holding back the sender
-    22 u16  0
+    22 u16  data bit rate in kbit/s, in version 2: wanted (0: whatever the bus has), in the answer the bus's own; else 0
 
 The joining side speaks first. After a status other than 0 the bus closes.
 """
@@ -25,7 +25,7 @@ from enum import IntEnum
 
 from gateway.core.canframe import RECORD_SIZE
 
-VERSION = 1
+VERSION, FD_VERSION = 1, 2
 WANTS_CONFIRMATIONS = 0x01
 WANTS_ERRORS = 0x02
 WANTS_VIOLATIONS = 0x04
@@ -55,17 +55,26 @@ class Hello:
     options: int = 0
     t_ns: int = 0
     window: int = 0
+    data_kbitrate: int = 0
 
     def pack(self) -> bytes:
         """The 24 bytes."""
         return _HELLO.pack(
-            _MARK, self.version, self.status, self.options, self.bitrate, self.t_ns, _MAGIC, self.window, 0
+            _MARK,
+            self.version,
+            self.status,
+            self.options,
+            self.bitrate,
+            self.t_ns,
+            _MAGIC,
+            self.window,
+            self.data_kbitrate,
         )
 
 
 def unpack_hello(record: bytes) -> Hello | None:
     """The hello in a record of 24 bytes, or None when it is none."""
-    mark, version, status, options, bitrate, t_ns, magic, window, _ = _HELLO.unpack(record)
+    mark, version, status, options, bitrate, t_ns, magic, window, data_kbitrate = _HELLO.unpack(record)
     if mark != _MARK or magic != _MAGIC:
         return None
-    return Hello(bitrate, version, status, options, t_ns, window)
+    return Hello(bitrate, version, status, options, t_ns, window, data_kbitrate)

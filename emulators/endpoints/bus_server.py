@@ -5,7 +5,8 @@ transmit queue stops reading from that client only, so TCP holds it back; a clie
 frames alone, counted, and never stalls the bus. Confirmations are never dropped: a client that asked for them and does
 not read is not read from either.
 
-What runs on the bus, and what the frames mean, is not known here.
+What runs on the bus is not known here, and of frames only which are SDO requests and replies: those are counted by client, so
+that a prototype run can tell its own from those of a third party.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import socket
 from typing import Any, cast
 
 from emulators.endpoints.bus_hello import (
+    FD_VERSION,
     VERSION,
     WANTS_CONFIRMATIONS,
     WANTS_ERRORS,
@@ -25,14 +27,18 @@ from emulators.endpoints.bus_hello import (
     unpack_hello,
 )
 from emulators.endpoints.bus_runner import BusRunner
+from emulators.endpoints.client_counts import ClientCounts, Counts
 from emulators.wires.can_faults import Rule
 from gateway.core.can_error import overrun_frame
-from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
+from gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, FieldtwinError, Unreachable, UsageError, os_reason
 
 HELLO_TIMEOUT_S = 5.0
+SDO_REPLY, SDO_REQUEST = 0x580, 0x600
+"""The predefined connection set's function codes (CiA 301, 7.3.3)."""
+SDO_ABORT = b"\x80"
 CLOSE_TIMEOUT_S = 1.0
 SEND_BUFFER_BYTES = 64 * 1024
 """The kernel's buffer per client. Left alone it grows to megabytes: minutes of frames that a slow client reads late."""
@@ -49,6 +55,9 @@ class SoftBusServer:
         self._max_outbound_bytes = max_outbound_frames * RECORD_SIZE
         self._clients: set[_Client] = set()
         self._server: asyncio.Server | None = None
+        self.sdo_clients = ClientCounts()
+        """SDO requests by the client that sent them, and the frames that answered the client that asked last."""
+        self._asked_by: dict[int, _Client] = {}
         self.turned_away = 0
         """Clients that were refused or broke the protocol."""
 
@@ -63,19 +72,28 @@ class SoftBusServer:
         max_nodes: int = 128,
         max_outbound_frames: int = 4096,
         monitored: bool = True,
+        data_bitrate: int = 0,
     ) -> SoftBusServer:
         """Listen on a ``can:fieldtwin/HOST:PORT`` endpoint; port 0 takes a free one (see `bound`).
 
         `paced`: frames take their exact time at `bitrate` bit/s; otherwise they are delivered at once. `queue_frames`
         bounds each node's transmit queue, `max_outbound_frames` what waits for a client that reads slowly. `monitored`: the
         bus itself acknowledges every frame; otherwise a node that is alone on it tries for ever, as on a real one.
+        `data_bitrate` in bit/s is that of CAN FD frames with the bit-rate switch, 0 for `bitrate`.
         Raises `EndpointBusy` when the port is in use, `Unreachable` when it cannot be opened, `UsageError` for another
         kind of endpoint or an impossible bit rate.
         """
         if endpoint.interface != "fieldtwin":
             raise UsageError(f"{endpoint} is no software CAN bus", expected="can:fieldtwin/HOST:PORT")
         host, port = endpoint.address
-        runner = BusRunner(bitrate, paced=paced, queue_frames=queue_frames, max_nodes=max_nodes, monitored=monitored)
+        runner = BusRunner(
+            bitrate,
+            paced=paced,
+            queue_frames=queue_frames,
+            max_nodes=max_nodes,
+            monitored=monitored,
+            data_bitrate=data_bitrate,
+        )
         bus = cls(runner, endpoint, max_outbound_frames)
         loop = asyncio.get_running_loop()
         try:
@@ -118,7 +136,7 @@ class SoftBusServer:
 
     def bus_stats(self) -> dict[str, Any]:
         """JSON-able: see `CanBus.stats` (frames, bits, load, overruns, nodes...), and ``turned_away``."""
-        return {**self._runner.stats(), "turned_away": self.turned_away}
+        return {**self._runner.stats(), "turned_away": self.turned_away, "sdo_clients": self.sdo_clients.describe()}
 
     async def aclose(self) -> None:
         """Stop listening, end the bus for everybody. Closing twice does nothing."""
@@ -149,7 +167,11 @@ class _Client(asyncio.Protocol):
         self._inbound = bytearray()
         self._outbound = bytearray()
         self._node = 0  # 0 until welcome
+        self._counts = Counts()
         self._options = 0
+        self._fd = False
+        self._record_size = RECORD_SIZE
+        self._max_outbound_bytes = bus._max_outbound_bytes
         self._lost_since_ns = 0  # when frames began to be lost that this client has not been told of
         self._reading = True
         self._flooded = False  # it asked for confirmations and does not read them
@@ -170,6 +192,9 @@ class _Client(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:
         self._deadline.cancel()
         self._bus._clients.discard(self)
+        self._counts.open = False
+        for node in [node for node, client in self._bus._asked_by.items() if client is self]:
+            del self._bus._asked_by[node]
         if self._node:
             self._runner.leave(self._node)
             self._node = 0
@@ -200,26 +225,30 @@ class _Client(asyncio.Protocol):
     # -- the bus's side -------------------------------------------------------------------------------------------
 
     def on_frame(self, frame: CanFrame) -> bool:
+        if frame.fd and not self._fd:
+            return True  # a classic node, as a kernel's socket without the option for CAN FD
+        if frame.can_id & 0x780 == SDO_REPLY and self._bus._asked_by.get(frame.can_id & 0x7F) is self:
+            self._counts.replies += 1
         waiting = self._transport.get_write_buffer_size() + len(self._outbound)
-        if waiting + 2 * RECORD_SIZE > self._bus._max_outbound_bytes:
+        if waiting + 2 * self._record_size > self._max_outbound_bytes:
             self._lost_since_ns = self._lost_since_ns or frame.t_ns or 1
             return False
         if self._lost_since_ns:
             self.on_error(overrun_frame(self._lost_since_ns), violation=False)
             self._lost_since_ns = 0
-        self._outbound += pack_record(frame)
+        self._outbound += pack_record(frame, fd=self._fd)
         return True
 
     def on_confirmed(self, frame: CanFrame) -> None:
         if self._confirms:
-            self._outbound += pack_record(frame, confirmed=True)
+            self._outbound += pack_record(frame, confirmed=True, fd=self._fd)
 
     def on_error(self, frame: CanFrame, *, violation: bool) -> None:
         waiting = self._transport.get_write_buffer_size() + len(self._outbound)
         if self._options & (WANTS_VIOLATIONS if violation else WANTS_ERRORS) and (
-            not violation or waiting + RECORD_SIZE <= self._bus._max_outbound_bytes
+            not violation or waiting + self._record_size <= self._max_outbound_bytes
         ):
-            self._outbound += pack_record(frame)
+            self._outbound += pack_record(frame, fd=self._fd)
 
     def on_settled(self) -> None:
         if self._outbound:
@@ -237,14 +266,14 @@ class _Client(asyncio.Protocol):
         """Take whole records while the bus has room; stop reading when it has none."""
         taken = 0
         blocked = False
-        while len(self._inbound) - taken >= RECORD_SIZE and not self._transport.is_closing():
-            record = bytes(self._inbound[taken : taken + RECORD_SIZE])
+        while len(self._inbound) - taken >= (size := self._record_size) and not self._transport.is_closing():
+            record = bytes(self._inbound[taken : taken + size])
             if not self._node:
                 self._greet(unpack_hello(record))
             elif self._flooded or not self._submit(record):
                 blocked = True
                 break
-            taken += RECORD_SIZE
+            taken += size
         del self._inbound[:taken]
         if self._transport.is_closing():
             self._runner.settle()
@@ -262,7 +291,11 @@ class _Client(asyncio.Protocol):
             frame, confirmed = unpack_record(record)
             if confirmed:
                 raise Desync("a confirmation from a node", got=str(frame))
-            return self._runner.submit(self._node, frame, more=True)
+            taken = self._runner.submit(self._node, frame, more=True)
+            if taken and frame.can_id & 0x780 == SDO_REQUEST and frame.data[:1] != SDO_ABORT:
+                self._counts.requests += 1
+                self._bus._asked_by[frame.can_id & 0x7F] = self
+            return taken
         except (Desync, UsageError):  # not our protocol, or an error frame: nothing after it can be trusted
             self._turn_away()
             return True
@@ -272,14 +305,17 @@ class _Client(asyncio.Protocol):
             self._turn_away()
             return
         status = Status.WELCOME
-        if hello.version != VERSION:
+        data_kbitrate = self._runner.data_bitrate // 1000 if hello.version == FD_VERSION else 0
+        if hello.version not in (VERSION, FD_VERSION):
             status = Status.UNKNOWN_VERSION
-        elif hello.bitrate not in (0, self._runner.bitrate):
+        elif hello.bitrate not in (0, self._runner.bitrate) or hello.data_kbitrate not in (0, data_kbitrate):
             status = Status.WRONG_BITRATE
         else:
             host, port = self._transport.get_extra_info("peername")[:2]
             try:
                 self._node = self._runner.join(self, f"{host}:{port}")
+                self._counts = self._bus.sdo_clients.of(f"{host}:{port}")
+                self._counts.open = True
             except EndpointBusy:
                 status = Status.FULL
             except ConnectionLost:  # the bus is closing, and so is this client
@@ -288,12 +324,25 @@ class _Client(asyncio.Protocol):
         self._deadline.cancel()
         self._options = hello.options
         answer = Hello(
-            self._runner.bitrate, status=status, t_ns=self._runner.now_ns(), window=self._runner.queue_frames
+            self._runner.bitrate,
+            version=FD_VERSION if hello.version == FD_VERSION else VERSION,
+            status=status,
+            t_ns=self._runner.now_ns(),
+            window=self._runner.queue_frames,
+            data_kbitrate=data_kbitrate,
         )
         self._transport.write(answer.pack())
+        if hello.version == FD_VERSION:
+            self._carry_fd()
         if status is not Status.WELCOME:
             self._bus.turned_away += 1
             self._transport.close()
+
+    def _carry_fd(self) -> None:
+        """From now on all records of this client can carry CAN FD; as many frames may wait for it as before."""
+        self._fd, self._record_size = True, FD_RECORD_SIZE
+        self._max_outbound_bytes = self._max_outbound_bytes * FD_RECORD_SIZE // RECORD_SIZE
+        self._transport.set_write_buffer_limits(high=2 * self._max_outbound_bytes, low=self._max_outbound_bytes)
 
     def _turn_away(self) -> None:
         self._bus.turned_away += 1

@@ -167,7 +167,7 @@ class FaultyEnd(ByteConnection):
         out: list[bytes] = []
         for frame in frames:
             if self._asked is not None:
-                frame = replace(frame, address=self._asked.address)
+                frame = replace(frame, address=self._asked.address, count=self._asked.count)
             outcome = self._faults.decide(frame, self._now_ns())
             out += self._carry_out(Way.REPLY, outcome or Outcome((Piece(frame.data),)), after_s)
         return out

@@ -30,7 +30,7 @@ class FaultyDatagrams(Datagrams):
         self._loop = asyncio.get_running_loop()
         self._heard: asyncio.Queue[Heard | ConnectionLost] = asyncio.Queue(MOST_WAITING)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._asked: dict[tuple[str, int], int] = {}
+        self._asked: dict[tuple[str, int], tuple[int, int]] = {}
         self._listening = self._loop.create_task(self._listen(), name=f"datagrams at {inner.bound}")
 
     @property
@@ -44,7 +44,8 @@ class FaultyDatagrams(Datagrams):
         return heard
 
     async def send(self, data: bytes, peer: tuple[str, int]) -> None:
-        frame = replace(understood(Way.REPLY, self._faults.framing, data), address=self._asked.pop(peer, -1))
+        address, count = self._asked.pop(peer, (-1, -1))
+        frame = replace(understood(Way.REPLY, self._faults.framing, data), address=address, count=count)
         outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
         for piece in (outcome or Outcome((Piece(data),))).pieces:
             if piece.back:
@@ -96,7 +97,7 @@ class FaultyDatagrams(Datagrams):
                 self._show(Way.REQUEST, data, peer)
                 frame = understood(Way.REQUEST, self._faults.framing, data)
                 if len(self._asked) < MOST_WAITING:
-                    self._asked[peer] = frame.address
+                    self._asked[peer] = frame.address, frame.count
                 outcome = self._faults.decide(frame, round(self._loop.time() * NS_PER_S))
                 for piece in (outcome or Outcome((Piece(data),))).pieces:
                     if piece.back:

@@ -26,6 +26,8 @@ else:
 
 CHUNK = 4096
 MAX_PENDING = 64
+PTY_MAJORS = range(136, 144)
+"""Device numbers of the slave side of Linux pseudo-terminals (Linux, Documentation/admin-guide/devices.txt)."""
 """Chunks that wait in an end: with `CHUNK` the bound of what is in flight each way (256 KiB)."""
 
 WRITE_HIGH_WATER = 64 * 1024
@@ -316,7 +318,9 @@ def _make_raw(fd: int, endpoint: Endpoint) -> None:
         raise UsageError(f"{endpoint}: baud rate", expected="one of the standard rates", got=str(settings.baudrate))
     attributes: list[Any] = termios.tcgetattr(fd)
     cflag = termios.CREAD | termios.CLOCAL | (termios.CS8 if settings.data_bits == 8 else termios.CS7)
-    cflag |= {"N": 0, "E": termios.PARENB, "O": termios.PARENB | termios.PARODD}[settings.parity]
+    # A pty drops parity, and glibc's tcsetattr then fails with EINVAL when a port is opened a second time (docs/decisions/0013).
+    parity = "N" if os.major(os.fstat(fd).st_rdev) in PTY_MAJORS else settings.parity
+    cflag |= {"N": 0, "E": termios.PARENB, "O": termios.PARENB | termios.PARODD}[parity]
     cflag |= termios.CSTOPB if settings.stop_bits == 2 else 0
     attributes[0:4] = [0, 0, cflag, 0]  # no translation, no flow control, no echo, no signals
     attributes[4] = attributes[5] = speed

@@ -112,6 +112,8 @@ class _Client(asyncio.Protocol):
     # -- the bus's side -------------------------------------------------------------------------------------------
 
     def on_frame(self, frame: CanFrame) -> bool:
+        if frame.fd:
+            return True  # the protocol has no word for it
         if self._transport.get_write_buffer_size() + len(self._outbound) > MAX_OUTBOUND_BYTES:
             self._session.controller(overrun_frame())
             return False

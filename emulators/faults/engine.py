@@ -36,10 +36,13 @@ class WireFaults:
         return [active for active in self.active.values() if active.from_ns <= now_ns]
 
     def refuses(self, now_ns: int) -> bool:
-        """Whether nobody can connect now."""
-        return any(
-            isinstance(a.fault, WireFault) and a.fault.refuses and in_time(a, now_ns) for a in self.active.values()
-        )
+        """Return whether a connection that is asked for now is refused. Each fault that refuses it has struck."""
+        refusing = [
+            a for a in self.active.values() if isinstance(a.fault, WireFault) and a.fault.refuses and in_time(a, now_ns)
+        ]
+        for active in refusing:
+            active.struck += 1
+        return bool(refusing)
 
     def decide(self, frame: Frame, now_ns: int) -> Outcome | None:
         """What becomes of the frame; None: nothing happens to it. Several faults strike one after the other."""
@@ -68,7 +71,7 @@ def _joined(before: Outcome | None, frame: Frame, fault: WireFault, active: Acti
             continue
         seen = understood(frame.way, frame.framing, piece.data)
         after = fault.strike(
-            Frame(seen.way, seen.framing, seen.data, seen.unit, seen.pdu, frame.address), active.random
+            Frame(seen.way, seen.framing, seen.data, seen.unit, seen.pdu, frame.address, frame.count), active.random
         )
         pieces += _later(after.pieces, piece)
         hang = hang or after.hang

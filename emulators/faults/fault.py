@@ -7,7 +7,7 @@ out. It never opens, waits or reads a clock.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from random import Random
@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from emulators.faults.frames import Frame, Way
+from gateway.core.profile import Tag
 
 
 class Hang(Enum):
@@ -72,6 +73,8 @@ class Aim(BaseModel):
     function: int | None = Field(default=None, ge=1, le=127)
     address: str | int | None = None
     """A PDU address, or ``holding:0x10``."""
+    registers: str | int | None = None
+    """How many registers or bits the request reads or writes: ``40``, ``65..125`` or ``65..``."""
     register_: str = Field(default="", alias="register")
     """A tag of the device."""
     cob_id: int | None = Field(default=None, ge=0, le=0x7FF)
@@ -83,6 +86,8 @@ class Aim(BaseModel):
     from_: str | float | int = Field(default=0, alias="from")
     until: str | float | int | None = None
     probability: float = Field(default=1.0, ge=0.0, le=1.0)
+    optional: bool = False
+    """A run in which the fault never struck has tested something all the same."""
 
 
 class Parameters(BaseModel):
@@ -146,6 +151,13 @@ class ValueFault(Fault):
     kind = Kind.VALUE
     ways: ClassVar[frozenset[Way]] = frozenset()
 
+    def learn(self, tags: Iterable[Tag]) -> None:
+        """Take note of the tags of the device that the fault is put into, before it strikes."""
+
+    def on(self, tag: str) -> ValueFault | None:
+        """Return the fault as it strikes `tag`; None where it leaves that tag alone."""
+        return self
+
     @abstractmethod
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
         """The value instead of `value`. `since_s`: seconds since the fault began; `held`: what it was then."""
@@ -166,6 +178,7 @@ class Active:
     units: Sequence[int] = field(default_factory=tuple)
     """Units that `device` and `bus` stand for; none: all."""
     addresses: range | None = None
+    counts: range | None = None
     functions: frozenset[int] = frozenset()
     """Those of the table that the addresses are in; none: all."""
 
@@ -186,6 +199,8 @@ class Active:
         if self.functions and frame.function not in self.functions:
             return False
         if self.addresses is not None and frame.address not in self.addresses:
+            return False
+        if self.counts is not None and frame.count not in self.counts:
             return False
         self.matched += 1
         if aim.nth is not None and self.matched != aim.nth:

@@ -20,6 +20,8 @@ _MBAP_HEADER = 7
 _MQTT_TYPE, _MQTT_PUBLISH, _MQTT_QOS = 0xF0, 0x30, 0x06
 """Bits of a packet's first byte (MQTT 2.1.2, 3.3.1.2)."""
 _ADDRESSED = frozenset((1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 24))
+_SINGLE = frozenset((5, 6, 22, 24))
+"""Functions that are about one register, coil or queue, so that no count is in the request."""
 
 
 class Framing(Enum):
@@ -49,7 +51,10 @@ class Way(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame. `pdu` is empty, `unit` and `function` are -1 where it is not understood. `address`: of the request."""
+    """One frame. `pdu` is empty, `unit` and `function` are -1 where it is not understood.
+
+    `address` and `count` are those of the request, also in its reply: the first register or bit, and how many; -1: none.
+    """
 
     way: Way
     framing: Framing
@@ -57,6 +62,7 @@ class Frame:
     unit: int = -1
     pdu: bytes = b""
     address: int = -1
+    count: int = -1
 
     @property
     def spared(self) -> bool:
@@ -145,7 +151,8 @@ def understood(way: Way, framing: Framing, data: bytes) -> Frame:
     if len(adu) < 2:
         return Frame(way, framing, data)
     unit, pdu = adu[0], adu[1:]
-    address = -1
+    address = count = -1
     if way is Way.REQUEST and pdu[0] in _ADDRESSED and len(pdu) >= 3:
         address = int.from_bytes(pdu[1:3])
-    return Frame(way, framing, data, unit, pdu, address)
+        count = 1 if pdu[0] in _SINGLE else int.from_bytes(pdu[3:5]) if len(pdu) >= 5 else -1
+    return Frame(way, framing, data, unit, pdu, address, count)

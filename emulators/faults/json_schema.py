@@ -14,6 +14,7 @@ _ABOUT = {
     "unit": "the unit id, on CAN the node id; default: the device's",
     "function": "Modbus: the function code, without the bit of an exception",
     "address": "Modbus: a PDU address, or holding:0x10",
+    "registers": "Modbus: how many registers or bits the request reads or writes: 40, 65..125 or 65..",
     "register": "a tag of the device",
     "cob_id": "CAN: the identifier",
     "index": "CANopen: the object that an SDO frame names",
@@ -22,6 +23,7 @@ _ABOUT = {
     "every": "each n-th frame that matches",
     "from": "since when: 5s, 250ms, 2min, 24h of the run",
     "until": "until when; default: for good",
+    "optional": "true: a scenario may pass although the fault never struck",
     "probability": "of each frame that matches",
 }
 

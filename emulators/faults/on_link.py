@@ -10,7 +10,8 @@ from emulators.faults.can_fault import BusFault, CanFault
 from emulators.faults.engine import WireFaults
 from emulators.faults.fault import Active, Kind
 from emulators.faults.frames import Framing
-from emulators.faults.schema import FaultSpec, WrongAim, addressed, parse_fault
+from emulators.faults.schema import FaultSpec, addressed, counted, parse_fault
+from emulators.faults.wrong_aim import WrongAim
 from gateway.core.clock import NS_PER_S
 
 
@@ -72,6 +73,7 @@ def wire_faults(
                 until_ns,
                 units=() if aim.unit is None else (aim.unit,),
                 addresses=addresses,
+                counts=counted(aim.registers),
                 functions=functions,
             )
         )

@@ -10,7 +10,8 @@ from gateway.core.errors import UsageError
 
 _FILES = """
 drop delay jitter duplicate reorder split pause coalesce corrupt_bits corrupt_crc corrupt_length wrong_unit wrong_function
-wrong_transaction truncate garbage noise echo late_reply exception busy silence half_open reset disconnect wrong_baud wrong_parity
+wrong_transaction fewer_registers
+truncate garbage noise echo late_reply exception busy silence half_open reset disconnect wrong_baud wrong_parity
 collision lost_frame error_frame bus_off duplicate_node sdo_abort sdo_toggle lost_segment heartbeat_loss heartbeat_late emcy_burst
 sync_jitter boot_storm late_frame short_frame odd_sdo odd_heartbeat stuck drift spike nan out_of_range set_value
 """

@@ -18,24 +18,17 @@ from pydantic import ValidationError
 
 from emulators.faults.fault import Aim, Fault, Kind
 from emulators.faults.registry import fault_class
+from emulators.faults.wrong_aim import WrongAim
 from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.yaml_file import Key, YamlFile, load
+from gateway.core.yaml_file import Key, YamlFile, expected_value, load
 
 _AIM_KEYS = tuple(info.alias or name for name, info in Aim.model_fields.items())
 _NOT_OF = {
     Kind.BYTES: frozenset({"cob_id", "index"}),
-    Kind.CAN: frozenset({"function", "address"}),
-    Kind.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until"},
+    Kind.CAN: frozenset({"function", "address", "registers"}),
+    Kind.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until", "optional"},
 }
 """What of an aim means nothing to a kind of fault."""
-
-
-class WrongAim(UsageError):
-    """An aim that cannot be meant; `key` is the key of the fault that says it."""
-
-    def __init__(self, key: str, message: str, *, expected: str = "", got: str = "", hint: str = "") -> None:
-        super().__init__(message, expected=expected, got=got, hint=hint)
-        self.key = key
 
 
 _DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|min|h)?$")
@@ -110,7 +103,9 @@ def parse_fault(
         words = re.findall(r"'([^']+)'", str(first.get("ctx", {}).get("expected", "")))
         near = difflib.get_close_matches(str(first["input"]), words, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else ""
-        raise wrong(key, f"{key}: {first['msg']}", got=repr(first["input"])[:60], hint=hint) from e
+        expected = expected_value(first)
+        what = key if expected else f"{key}: {first['msg']}"
+        raise wrong(key, what, expected=expected, got=repr(first["input"])[:60], hint=hint) from e
 
     def time(key: str, value: str | float | int) -> float:
         try:
@@ -118,6 +113,11 @@ def parse_fault(
         except UsageError as e:
             raise wrong(key, e.message, expected=e.expected, got=e.got) from e
 
+    if aim.registers is not None:
+        try:
+            counted(aim.registers)
+        except WrongAim as e:
+            raise wrong("registers", e.message, expected=e.expected, got=e.got) from e
     from_s = time("from", aim.from_)
     until_s = None if aim.until is None else time("until", aim.until)
     if until_s is not None and until_s <= from_s:
@@ -159,6 +159,25 @@ def checked(check: Check, spec: FaultSpec, file: YamlFile, loc: tuple[Key, ...])
         at = (*loc, e.key) if (*loc, e.key) in file.positions else loc
         raise file.error(at, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
 
+
+def counted(count: str | int | None) -> range | None:
+    """The counts of registers or bits that ``40``, ``65..125`` or ``65..`` means; None: all. Raises `WrongAim`."""
+    if count is None:
+        return None
+    low, dots, high = str(count).partition("..")
+    try:
+        first = int(low)
+        last = first if not dots else int(high) if high else MOST_COUNTED
+    except ValueError:
+        first = last = 0
+    if not 1 <= first <= last <= MOST_COUNTED:
+        expected = f"1 to {MOST_COUNTED}, such as 40, 65..125 or 65.."
+        raise WrongAim("registers", "a count of registers or bits", expected=expected, got=repr(count))
+    return range(first, last + 1)
+
+
+MOST_COUNTED = 2000
+"""Bits that one request can read (AP 6.1)."""
 
 FUNCTIONS_OF = {
     "coil": frozenset({1, 5, 15}),

@@ -15,6 +15,8 @@ from gateway.core.errors import DeviceRefused, UsageError
 
 Table = Literal["coil", "discrete", "input", "holding"]
 Access = Literal["ro", "rw", "wo"]
+Undeclared = Literal["exception", "zero", "hold"]
+"""What cells are that no span declares, in tables that have spans: refused, always 0, or 0 until they are written."""
 
 BIT_TABLES: frozenset[str] = frozenset({"coil", "discrete"})
 WRITABLE_TABLES: frozenset[str] = frozenset({"coil", "holding"})
@@ -134,15 +136,28 @@ class _Plan(NamedTuple):
     hooked: tuple[tuple[int, Callable[[int, int], int]], ...]
 
 
+class _Zeros(dict[int, int]):
+    """Cells of which those that were never set are 0."""
+
+    def __missing__(self, address: int) -> int:
+        return 0
+
+
 class MapBank(RegisterBank):
-    """Plain cells in declared spans, all zero at first. Gaps between spans do not exist: exception 02.
+    """Plain cells in declared spans, all zero at first. Gaps between spans do not exist (exception 02), or are as `undeclared`
+    says.
 
     `on_write(table, address, values, now_ns)` is called for a write of the master that is otherwise fine, before any
     cell changes; a `Refusal` raised there is the device's answer and nothing changes.
     """
 
-    def __init__(self, spans: Iterable[Span], on_write: OnWrite | None = None) -> None:
-        self._cells: dict[Table, dict[int, int]] = {table: {} for table in get_args(Table)}
+    def __init__(
+        self, spans: Iterable[Span], on_write: OnWrite | None = None, undeclared: Undeclared = "exception"
+    ) -> None:
+        cells = dict[int, int] if undeclared == "exception" else _Zeros
+        self._cells: dict[Table, dict[int, int]] = {table: cells() for table in get_args(Table)}
+        self._filled = frozenset({"exception": (), "zero": ("read",), "hold": ("read", "written", "set")}[undeclared])
+        """What can be done with cells that no span declares."""
         self._declared: dict[Table, set[int]] = {table: set() for table in self._cells}
         self._readable: dict[Table, set[int]] = {table: set() for table in self._cells}
         self._writable: dict[Table, set[int]] = {table: set() for table in self._cells}
@@ -211,7 +226,7 @@ class MapBank(RegisterBank):
     def peek(self, table: Table, address: int) -> int:
         """The device's own view of a cell, whatever its access. Raises `IllegalAddress` where there is none."""
         try:
-            return self._cells[table][address]
+            return self._cells[table][address]  # of undeclared cells that are filled: 0
         except KeyError:
             raise IllegalAddress("no cell that can be read", where=f"{table}:{address}") from None
 
@@ -225,8 +240,11 @@ class MapBank(RegisterBank):
         self._require(self._declared, table, addresses, "set")
         self._cells[table].update(zip(addresses, values, strict=True))
 
-    @staticmethod
-    def _require(allowed: dict[Table, set[int]], table: Table, addresses: range, verb: str) -> None:
-        if not allowed[table].issuperset(addresses):
-            missing = next(address for address in addresses if address not in allowed[table])
-            raise IllegalAddress(f"no cell that can be {verb}", where=f"{table}:{missing}")
+    def _require(self, allowed: dict[Table, set[int]], table: Table, addresses: range, verb: str) -> None:
+        if allowed[table].issuperset(addresses):
+            return
+        declared = self._declared[table]
+        filled = bool(declared) and verb in self._filled
+        for address in addresses:
+            if address not in allowed[table] and not (filled and address not in declared):
+                raise IllegalAddress(f"no cell that can be {verb}", where=f"{table}:{address}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+from emulators.endpoints.client_counts import Counts
 from emulators.modbus.line import Exchange
 from emulators.modbus.unit import ModbusUnit
 from gateway.core.errors import Desync, UsageError
@@ -29,9 +30,9 @@ Allow = Callable[[int, bytes], bool]
 class MbapSlave:
     """The units behind one connection. `units`: unit id -> unit.
 
-    With a single unit, ids 0 and 255 reach it too, and are echoed. A unit id that nobody has is answered with exception
-    0A, as a gateway does without a route. At most `max_in_flight` requests of those that came together are
-    executed; the rest gets exception 06.
+    With a single unit, ids 0 and 255 reach it too, and are echoed; with `any_unit` every id does, as with devices that ignore
+    it. A unit id that no unit has is answered with exception 0A, as a gateway does without a route. At most
+    `max_in_flight` requests of those that came together are executed; the rest gets exception 06.
 
     A request that `allow` refuses gets exception 01 (MODBUS/TCP Security, 8.3), unexecuted; without it all are allowed.
 
@@ -40,18 +41,29 @@ class MbapSlave:
     """
 
     def __init__(
-        self, units: Mapping[int, ModbusUnit], max_in_flight: int = MAX_IN_FLIGHT, allow: Allow | None = None
+        self,
+        units: Mapping[int, ModbusUnit],
+        max_in_flight: int = MAX_IN_FLIGHT,
+        allow: Allow | None = None,
+        counts: Counts | None = None,
+        *,
+        any_unit: bool = False,
     ) -> None:
+        if any_unit and len(units) != 1:
+            raise UsageError("only a single unit can answer under any id", got=f"{len(units)} units")
         for unit_id in units:
             if not 0 <= unit_id <= 255:
                 raise UsageError("unit id", expected="0 to 255", got=str(unit_id))
         self.units = dict(units)
         self.max_in_flight = max_in_flight
         self.desync: Desync | None = None
+        self.counts = counts or Counts()
+        """Requests that reached a unit, and the replies to them."""
         self.requests = 0
         self.discarded = 0
         """ADUs that were dropped: not Modbus, or too short for a function."""
         self._allow = allow
+        self._any_unit = any_unit
         self._buffer = bytearray()
 
     @property
@@ -132,6 +144,8 @@ class MbapSlave:
                 response = unit.refuse_function(pdu)
             else:
                 response = unit.refuse_busy(pdu) if busy else unit.respond(pdu, now_ns)
+            self.counts.requests += 1
+            self.counts.replies += response is not None
         if response is None:
             return b""
         return adu[:4] + (len(response) + 1).to_bytes(2, "big") + adu[6:7] + response
@@ -139,7 +153,7 @@ class MbapSlave:
     def _route(self, unit_id: int) -> ModbusUnit | None:
         if unit_id in self.units:
             return self.units[unit_id]
-        if unit_id in ANY_UNIT and len(self.units) == 1:
+        if (self._any_unit or unit_id in ANY_UNIT) and len(self.units) == 1:
             return next(iter(self.units.values()))
         return None
 

@@ -50,6 +50,11 @@ class Hunt:
         """The owner took `count` bytes off the front of the buffer; trials that began there are over."""
         self._base += count
 
+    @property
+    def has_dropped(self) -> bool:
+        """Whether bytes of the hunt are gone from the buffer."""
+        return self._base > 0
+
     def search(self, buffer: bytearray) -> tuple[int, int] | None:
         """Start and end of the frame in `buffer` that is whole first, or None: then call again when there is more."""
         size = self._base + len(buffer)

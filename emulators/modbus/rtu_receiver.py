@@ -14,6 +14,7 @@ from __future__ import annotations
 from emulators.modbus.rtu_hunt import Hunt
 from emulators.modbus.rtu_shapes import (
     FIXED_REQUESTS,
+    KNOWN_REQUESTS,
     LAST_UNIT,
     MAX_FRAME,
     MIN_FRAME,
@@ -68,6 +69,8 @@ class RtuReceiver:
             return [data]
         frames: list[bytes] = []
         if self._buffer and now_ns - self._last_ns >= self.gap_ns:
+            if self._is_a_whole_request_of_a_wrong_length():
+                frames.append(self._take(len(self._buffer)))
             while frame := self._next_frame(wait=False):
                 frames.append(frame)
             self._drop(len(self._buffer))
@@ -85,6 +88,19 @@ class RtuReceiver:
         if len(data) < MIN_FRAME or data[0] not in self._own or self._hunt is not None:
             return False
         return FIXED_REQUESTS.get(data[1]) == len(data) and is_whole(data)
+
+    def _is_a_whole_request_of_a_wrong_length(self) -> bool:
+        """Whether all that came between two pauses is one request to us, whose length is not the one that its head says.
+
+        The pauses and the check sum say that it is a whole frame (SL 2.5.1.1), so it is refused with exception 03 (AP 7: the
+        implied length is incorrect) and not taken for noise.
+        """
+        if self._hunt is not None and self._hunt.has_dropped:
+            return False
+        buffer = self._buffer
+        if not MIN_FRAME <= len(buffer) <= MAX_FRAME or buffer[0] not in self._own or buffer[1] not in KNOWN_REQUESTS:
+            return False
+        return self._at_front() <= 0 and crc16(buffer) == 0
 
     def _next_frame(self, wait: bool) -> bytes | None:
         if self._hunt is None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
+from emulators.endpoints.client_counts import ClientCounts
 from emulators.endpoints.faulty import FaultyEnd
 from emulators.endpoints.ports import Datagrams
 from emulators.endpoints.pty import PtyEnd
@@ -103,6 +104,7 @@ async def serve_udp(
     clock: Clock,
     latency_s: float | Latency = 0.0,
     on_frame: OnFrame | None = None,
+    clients: ClientCounts | None = None,
 ) -> None:
     """Serve Modbus TCP's ADUs in datagrams until cancelled or closed; one `slave` for all clients, one after the other.
 
@@ -116,7 +118,11 @@ async def serve_udp(
             async def answer(reply: bytes, peer: tuple[str, int] = peer) -> None:
                 await end.send(reply, peer)
 
-            await _reply(answer, slave.receive_datagram(data, now_ns), clock, now_ns, latency_s, on_frame)
+            requests, replies = slave.counts.requests, slave.counts.replies
+            exchanges = slave.receive_datagram(data, now_ns)
+            if clients is not None:
+                clients.add(f"{peer[0]}:{peer[1]}", slave.counts.requests - requests, slave.counts.replies - replies)
+            await _reply(answer, exchanges, clock, now_ns, latency_s, on_frame)
     except ConnectionLost:
         return
 

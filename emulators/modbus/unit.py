@@ -32,6 +32,9 @@ BROADCAST_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16})
 WHILE_BUSY = frozenset({0x08, 0x0B, 0x0C})
 """What a busy unit still answers: how a master finds out that it is busy (AP 6.9)."""
 
+MAX_SERVER_DATA = 249
+"""Bytes of a server id and the data after the run indicator that fit a reply of 11h."""
+
 Handler = Callable[[bytes, int], bytes | None]
 """``(pdu, now_ns)`` -> the response PDU, None for silence. May raise a `Refusal`, then it has changed nothing."""
 
@@ -40,14 +43,15 @@ class UnitParts(TypedDict, total=False):
     """What a unit may have besides registers, as `ModbusUnit` takes it."""
 
     server_id: bytes | None
+    server_data: bytes
     identification: Identification | None
     files: FileRecords | None
     fifos: FifoQueues | None
 
 
 class ModbusUnit:
-    """A unit's functions over a bank. Without `server_id` (the data of 11h), `identification` (2Bh), `files` (14h, 15h) or
-    `fifos` (18h) it has no such function; without `limits` it has all others.
+    """A unit's functions over a bank. Without `server_id` (function 11h; `server_data` follows its run indicator),
+    `identification` (2Bh), `files` (14h, 15h) or `fifos` (18h) it has no such function; without `limits` it has all others.
 
     Use `respond` for a request to the unit, `execute_broadcast` for one to unit 0 of a serial line. `counters` grow
     with both; a line tells by `heard` what else went over it. `latency_s` is how long the unit thinks about what it
@@ -61,12 +65,14 @@ class ModbusUnit:
         server_id: bytes | None = None,
         name: str = "",
         *,
+        server_data: bytes = b"",
         identification: Identification | None = None,
         files: FileRecords | None = None,
         fifos: FifoQueues | None = None,
     ) -> None:
-        if server_id is not None and len(server_id) > 249:
-            raise UsageError("server id", expected="at most 249 bytes", got=str(len(server_id)))
+        if len((server_id or b"") + server_data) > MAX_SERVER_DATA:
+            got = str(len((server_id or b"") + server_data))
+            raise UsageError("server id and the data after it", expected=f"at most {MAX_SERVER_DATA} bytes", got=got)
         self.bank = bank
         self.limits = limits or UnitLimits()
         self.name = name
@@ -79,6 +85,7 @@ class ModbusUnit:
         self.request_lengths: dict[int, int] = {}
         """Of functions of its own, how long a request PDU is: how a line tells where it ends. By its check sum otherwise."""
         self._server_id = server_id
+        self._server_data = server_data
         self._busy_until_ns = 0
         self._busy_every = self._busy_for_ns = self._answered = 0
         self._broadcasts = set(BROADCAST_FUNCTIONS)
@@ -222,5 +229,6 @@ class ModbusUnit:
 
     def _report_server_id(self, pdu: bytes, now_ns: int) -> bytes:
         require_length(pdu, 1)
-        data = (self._server_id or b"") + (b"\xff" if self.running else b"\x00")  # run indicator (AP 6.13)
+        indicator = b"\xff" if self.running else b"\x00"  # AP 6.13: server id, run indicator, additional data
+        data = (self._server_id or b"") + indicator + self._server_data
         return bytes((pdu[0], len(data))) + data

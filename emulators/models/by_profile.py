@@ -1,4 +1,4 @@
-"""Which model stands behind a data sheet: the device profile in the low word of 1000h says it (CiA 301, 7.5.2.1)."""
+"""Which model stands behind a data sheet: the device profile in the low word of 1000h says it (CiA 301, 7.5.2.1), or the user."""
 
 from __future__ import annotations
 
@@ -22,8 +22,15 @@ MODELS: dict[int, Callable[[], DeviceModel]] = {
 }
 
 
-def model_for(dictionary: Dictionary) -> DeviceModel | None:
-    """A new model for the device that the data sheet describes; None for a profile without one."""
+NO_MODEL = "none"
+CHOICES = (*(str(number) for number in MODELS), NO_MODEL)
+"""What a user may choose in place of what 1000h says."""
+
+
+def model_for(dictionary: Dictionary, chosen: str | None = None) -> DeviceModel | None:
+    """A new model for the device that the data sheet describes; None for a profile without one. `chosen` is one of `CHOICES`."""
+    if chosen is not None:
+        return None if chosen == NO_MODEL else MODELS[int(chosen)]()
     entry = dictionary.entry(0x1000, 0)
     if entry is None or not codec.is_number(entry.data_type):
         return None

@@ -23,8 +23,16 @@ class DistortedObjects:
     the node asks `over` behind the model instead (`NodeContext.distort`)."""
 
     def __init__(
-        self, tags: Iterable[Tag], dictionary: Dictionary, source: Source | None, *, has_model: bool = False
+        self,
+        tags: Iterable[Tag],
+        dictionary: Dictionary,
+        source: Source | None,
+        *,
+        has_model: bool = False,
+        named: bool = False,
     ) -> None:
+        """`named`: only what names a tag distorts it, not what is aimed at all tags."""
+        self._named = named
         self.distortions = Distortions()
         self.data: NodeData | None = None
         self._source = source
@@ -47,7 +55,7 @@ class DistortedObjects:
         """As `AnswersReads`."""
         raw = self._source.answer(key, now_ns) if isinstance(self._source, AnswersReads) else None
         known = self._tags.get(key)
-        if raw is None or known is None or not self.distortions.of(known[0].name):
+        if raw is None or known is None or not self.distortions.of(known[0].name, named=self._named):
             return raw
         return self._distorted(*known, raw, now_ns)
 
@@ -57,7 +65,7 @@ class DistortedObjects:
         if not self.distortions and not self._own:
             return out
         for key, known in self._tags.items():
-            if not self.distortions.of(known[0].name):
+            if not self.distortions.of(known[0].name, named=self._named):
                 self._given.pop(key, None)
                 if (own := self._own.pop(key, None)) is not None and key not in out:
                     out[key] = own  # it is over
@@ -81,7 +89,7 @@ class DistortedObjects:
 
     def _distorted(self, tag: Tag, data_type: int, raw: bytes, now_ns: int) -> bytes:
         value = codec.decode(data_type, raw) * tag.scale + tag.offset
-        number = (self.distortions.apply(tag.name, value, now_ns) - tag.offset) / tag.scale
+        number = (self.distortions.apply(tag.name, value, now_ns, named=self._named) - tag.offset) / tag.scale
         if tag.type.startswith("float"):
             return codec.encode(data_type, number)
         return raw if math.isnan(number) else codec.encode(data_type, whole(number, data_type))

@@ -1,9 +1,9 @@
-"""A CiA 402 drive: state machine, profile position and profile velocity mode, and a motor that follows without error.
+"""A CiA 402 drive: state machine, profile modes, homing and cyclic synchronous modes, with a motor that follows without error.
 
 Objects and bits after CiA 402-2 and 402-3 (IEC 61800-7-201, -301), as drive makers' manuals print them. Positions are in
-increments, speeds in increments a second, accelerations in increments a second squared. What the drive cannot know by itself
-(DC link voltage, torque) comes from a recording; what is recorded is never computed. An error that is present in the node,
-whoever raised it, is the drive's malfunction; the reset of the fault ends it.
+increments, speeds in increments a second, accelerations in increments a second squared, torques in thousandths of the rated one.
+What the drive cannot know by itself (DC link voltage) comes from a recording; what is recorded is never computed. An error that
+is present in the node, whoever raised it, is the drive's malfunction; the reset of the fault ends it.
 """
 
 from __future__ import annotations
@@ -13,29 +13,18 @@ from dataclasses import dataclass
 from emulators.canopen.aborts import Abort
 from emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
 from emulators.canopen.dictionary import Key
+from emulators.models import drive_objects as od
+from emulators.models.drive_homing import METHODS, Axis, Speeds, Way, plan
 from emulators.models.drive_states import Cause, DriveState, Transition, command_of, transition
-from emulators.models.motion import Motion, to_place, to_speed
+from emulators.models.motion import Motion, by_torque, to_place, to_speed
 from gateway.core.clock import NS_PER_S
-
-ERROR_CODE, CONTROLWORD, STATUSWORD = 0x603F, 0x6040, 0x6041
-ABORT_CONNECTION, QUICK_STOP_OPTION, SHUTDOWN_OPTION, DISABLE_OPTION, HALT_OPTION, FAULT_OPTION = (
-    0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E,
-)  # fmt: skip
-MODE, MODE_DISPLAY, SUPPORTED_MODES = 0x6060, 0x6061, 0x6502
-POSITION_DEMAND, POSITION_ACTUAL, VELOCITY_DEMAND, VELOCITY_ACTUAL = 0x6062, 0x6064, 0x606B, 0x606C
-VELOCITY_WINDOW, VELOCITY_THRESHOLD = 0x606D, 0x606F
-TARGET_POSITION, POSITION_LIMIT, MAX_VELOCITY = 0x607A, 0x607D, 0x607F
-PROFILE_VELOCITY, ACCELERATION, DECELERATION, QUICK_DECELERATION = 0x6081, 0x6083, 0x6084, 0x6085
-TARGET_VELOCITY = 0x60FF
-
-PROFILE_POSITION, PROFILE_SPEED = 1, 3
-"""Modes of operation that this model has; 6502h says them by bit (mode - 1)."""
 
 NEW_SET_POINT, AT_ONCE, RELATIVE, HALT = 1 << 4, 1 << 5, 1 << 6, 1 << 8
 """Bits of the controlword in profile position mode; halt is every mode's."""
 
-VOLTAGE, REMOTE, REACHED, LIMITED, BIT_12 = 1 << 4, 1 << 9, 1 << 10, 1 << 11, 1 << 12
-"""Bits of the statusword. Bit 12 is set-point acknowledge, or in profile velocity mode "speed is zero"."""
+VOLTAGE, REMOTE, REACHED, LIMITED, BIT_12, BIT_13 = 1 << 4, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13
+"""Bits of the statusword. Bit 12 is set-point acknowledge (profile position), speed is zero (profile velocity), homing attained,
+or that the drive follows the command (cyclic modes). Bit 13 is a homing error, or a following error (cyclic position)."""
 
 HEARTBEAT_LOST, BUS_OFF = 0x8130, 0x8140
 _COMMUNICATION = frozenset({HEARTBEAT_LOST, BUS_OFF})
@@ -43,6 +32,10 @@ _REACTIONS = {1: Cause.ERROR, 2: Cause.DISABLE_VOLTAGE, 3: Cause.QUICK_STOP}
 """Abort connection option code 6007h: what the loss of the connection does."""
 
 _SPAN = 1 << 32
+_USUAL, _UNLIMITED = 10_000.0, 10_000_000.0
+"""Accelerations without an object for them: of a profile, and of a motor that nothing bounds."""
+_FASTEST = 10_000_000.0
+"""A motor that a torque accelerates for ever ends at this speed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,9 +47,21 @@ class _SetPoint:
 
 
 class Drive(DeviceModel):
-    """One axis. `self_test_s` is how long it is not ready to switch on; `coasting` how an unpowered motor slows down."""
+    """One axis. `self_test_s` is how long it is not ready to switch on; `coasting` how an unpowered motor slows down by its
+    friction; `rated` is the acceleration that the rated torque gives without friction; `axis` where the switches are."""
 
-    def __init__(self, *, self_test_s: float = 0.02, coasting: float = 20_000.0) -> None:
+    def __init__(
+        self,
+        *,
+        self_test_s: float = 0.02,
+        coasting: float = 20_000.0,
+        rated: float = 500_000.0,
+        axis: Axis | None = None,
+    ) -> None:
+        self._rated, self._axis = rated, axis or Axis()
+        self._zero = 0.0  # the place where 6064h is 0
+        self._exists: dict[Key, Number] = {}
+        """6502h and 60E3h: what of the data sheet's modes and homing methods the model has."""
         self._self_test_ns = round(self_test_s * NS_PER_S)
         self._coasting = coasting
         self._motion = Motion()
@@ -74,6 +79,10 @@ class Drive(DeviceModel):
         self._queue: _SetPoint | None = None
         self._acknowledge = False
         self._limited = False
+        self._homing: Way | None = None
+        self._homed = 0  # bits of the statusword in homing mode
+        self._wanted: int | None = None  # the demand of cyclic synchronous position
+        self._torque: float | None = None  # of cyclic synchronous torque, once it was used
         self._seen: frozenset[int] = frozenset()
 
     # -- what the mechanics of a twin ask -----------------------------------------------------------------------------
@@ -91,22 +100,26 @@ class Drive(DeviceModel):
     def power_on(self, situation: Situation) -> None:
         self._ramp(situation.now_ns, 0.0, self._coasting)
         self._restart(situation.now_ns)
+        objects = situation.objects
+        self._exists = {(od.SUPPORTED_MODES, 0): od.mode_bits(objects), **od.methods_of(objects)}
 
     def refuse(self, key: Key, value: Number, objects: Objects) -> Abort | None:
-        return None if key != (MODE, 0) or _supported(int(value), objects) else Abort.VALUE
+        if key == (od.MODE, 0):
+            return None if _supported(int(value), objects) else Abort.VALUE
+        codes = od.OPTIONS.get(key[0]) if key[1] == 0 else None
+        return None if codes is None or int(value) in codes else Abort.VALUE
 
     def step(self, situation: Situation) -> Outcome:
         now_ns, objects = situation.now_ns, situation.objects
         self._by_itself(now_ns, objects)
         self._mind_errors(situation)
-        if (MODE, 0) in situation.written or (self._mode == 0 and _supported(objects.whole(MODE), objects)):
+        if (od.MODE, 0) in situation.written or (self._mode == 0 and _supported(objects.whole(od.MODE), objects)):
             self._change_mode(now_ns, objects)
-        if (CONTROLWORD, 0) in situation.written:
+        new_target = any(key[0] in od.FOLLOWED.get(self._mode, ()) for key in situation.written)
+        if (od.CONTROLWORD, 0) in situation.written:
             self._obey(now_ns, objects)
-        if self._in(PROFILE_SPEED) and {(TARGET_VELOCITY, 0), (ACCELERATION, 0), (DECELERATION, 0)} & set(
-            situation.written
-        ):
-            self._follow_speed(now_ns, objects)
+        if new_target and self.state is DriveState.OPERATION_ENABLED:
+            self._follow(now_ns, objects)
         clears = (
             situation.errors if self.state is DriveState.SWITCH_ON_DISABLED and self.transitions[-1:] == [15] else ()
         )
@@ -125,7 +138,9 @@ class Drive(DeviceModel):
             self._go(Cause.STOPPED, now_ns, objects)
         elif self.state is DriveState.FAULT_REACTION:
             self._go(Cause.REACTED, now_ns, objects)
-        elif self._queue is not None and self._in(PROFILE_POSITION) and not self._controlword & HALT:
+        elif self._homing is not None:
+            self._arrive(self._homing, objects)
+        elif self._queue is not None and self._in(od.PROFILE_POSITION) and not self._controlword & HALT:
             queued, self._queue = self._queue, None
             self._acknowledge = bool(self._controlword & NEW_SET_POINT)
             self._move_to(queued, now_ns)
@@ -136,13 +151,13 @@ class Drive(DeviceModel):
         for code in sorted(arisen):
             cause: Cause | None = Cause.ERROR
             if code in _COMMUNICATION:
-                cause = _REACTIONS.get(situation.objects.whole(ABORT_CONNECTION, default=1))
+                cause = _REACTIONS.get(situation.objects.whole(od.ABORT_CONNECTION, default=1))
             if cause is not None:
                 self._go(cause, situation.now_ns, situation.objects)
 
     def _obey(self, now_ns: int, objects: Objects) -> None:
         """A controlword came. The same one can take two arrows: switch on and enable operation in one."""
-        before, self._controlword = self._controlword, objects.whole(CONTROLWORD)
+        before, self._controlword = self._controlword, objects.whole(od.CONTROLWORD)
         command = command_of(self._controlword, before)
         if command is Cause.FAULT_RESET and self._disconnected(objects):
             return  # what made it a fault is still there
@@ -153,15 +168,17 @@ class Drive(DeviceModel):
             return
         if (self._controlword ^ before) & HALT:
             self._halt_or_go_on(now_ns, objects)
-        if self._mode == PROFILE_POSITION:
+        if self._mode == od.PROFILE_POSITION:
             self._take_set_point(before, now_ns, objects)
+        if self._mode == od.HOMING and (self._controlword ^ before) & NEW_SET_POINT:
+            self._begin_homing(now_ns, objects)
 
     def _disconnected(self, objects: Objects) -> bool:
-        return bool(self._seen & _COMMUNICATION) and objects.whole(ABORT_CONNECTION, default=1) == 1
+        return bool(self._seen & _COMMUNICATION) and objects.whole(od.ABORT_CONNECTION, default=1) == 1
 
     def _go(self, cause: Cause, now_ns: int, objects: Objects) -> Transition | None:
         """Take the arrow that `cause` means here, if there is one, with what it does to the motor."""
-        option = objects.whole(QUICK_STOP_OPTION, default=2)
+        option = objects.whole(od.QUICK_STOP_OPTION, default=2)
         taken = transition(self.state, cause, stays_stopped=option >= 5)
         if taken is None:
             return None
@@ -170,17 +187,17 @@ class Drive(DeviceModel):
         if taken.number in (4, 16):
             self._take_up(now_ns, objects)
         elif taken.number == 5:
-            self._slow_down(objects.whole(DISABLE_OPTION, default=1), now_ns, objects)
+            self._slow_down(objects.whole(od.DISABLE_OPTION, default=1), now_ns, objects)
         elif taken.number == 8:
-            self._slow_down(objects.whole(SHUTDOWN_OPTION), now_ns, objects)
+            self._slow_down(objects.whole(od.SHUTDOWN_OPTION), now_ns, objects)
         elif taken.number == 11:
             self._slow_down(option - 4 if option >= 5 else option, now_ns, objects)
             if option == 0:
                 self._go(Cause.STOPPED, now_ns, objects)
         elif taken.number == 13:
             if powered:
-                self._slow_down(objects.whole(FAULT_OPTION, default=2), now_ns, objects)
-            if not powered or objects.whole(FAULT_OPTION, default=2) == 0:
+                self._slow_down(objects.whole(od.FAULT_OPTION, default=2), now_ns, objects)
+            if not powered or objects.whole(od.FAULT_OPTION, default=2) == 0:
                 self._go(Cause.REACTED, now_ns, objects)
         elif taken.number in (9, 12):
             self._ramp(now_ns, 0.0, self._coasting)
@@ -197,48 +214,120 @@ class Drive(DeviceModel):
 
     def _ramp(self, now_ns: int, speed: float, acceleration: float, deceleration: float = 0.0) -> None:
         x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
-        self._motion = Motion(x, v, to_speed(v, speed, acceleration, deceleration or acceleration))
-        self._began_ns = now_ns
+        self._move(Motion(x, v, to_speed(v, speed, acceleration, deceleration or acceleration)), now_ns)
+
+    def _move(self, motion: Motion, now_ns: int) -> None:
+        """Move like this from now on. Homing that was under way is interrupted."""
+        self._motion, self._began_ns, self._homing = motion, now_ns, None
 
     def _slow_down(self, option: int, now_ns: int, objects: Objects) -> None:
-        """Option codes: 0 the motor coasts, 1 the profile's ramp, 2 and above the quick stop's (3, 4: as fast as can be)."""
-        rates = {0: self._coasting, 1: _rate(objects, DECELERATION)}
-        self._ramp(now_ns, 0.0, rates.get(option, _rate(objects, QUICK_DECELERATION)))
+        """Stop the motor by an option code (605Ah to 605Eh).
+
+        0: the motor coasts. 1: the ramp of the profile. 2: the ramp of the quick stop. 3: the current limit, which is the maximum
+        torque. 4: the voltage limit, where the friction helps as well.
+        """
+        strongest = self._rated * objects.number(od.MAX_TORQUE, default=1000) / 1000
+        rates = {
+            0: self._coasting,
+            1: _rate(objects, od.DECELERATION),
+            3: max(1.0, strongest),
+            4: max(1.0, strongest + self._coasting),
+        }
+        self._ramp(now_ns, 0.0, rates.get(option, _rate(objects, od.QUICK_DECELERATION)))
         self._target = self._queue = None
 
     def _take_up(self, now_ns: int, objects: Objects) -> None:
         """Operation begins or goes on: the mode has the motor."""
-        self._target = self._queue = None
-        self._acknowledge = False
-        if self._mode == PROFILE_SPEED and not self._controlword & HALT:
-            self._follow_speed(now_ns, objects)
+        self._target = self._queue = self._wanted = None
+        self._acknowledge = self._limited = False
+        self._homed = 0
+        if self._mode in od.FOLLOWED and not self._controlword & HALT:
+            self._follow(now_ns, objects)
         else:
-            self._ramp(now_ns, 0.0, _rate(objects, DECELERATION))
+            self._ramp(now_ns, 0.0, _rate(objects, od.DECELERATION))
 
     def _change_mode(self, now_ns: int, objects: Objects) -> None:
-        mode = objects.whole(MODE)
+        mode = objects.whole(od.MODE)
         if not _supported(mode, objects) or mode == self._mode:
             return  # by RPDO nobody can be refused: the display keeps the mode that is
         self._mode = mode
         if self.state is DriveState.OPERATION_ENABLED:
             self._take_up(now_ns, objects)
 
-    def _follow_speed(self, now_ns: int, objects: Objects) -> None:
+    def _follow(self, now_ns: int, objects: Objects) -> None:
+        """Go after the target of a mode whose target counts at once."""
         if self._controlword & HALT:
             return
-        wanted = objects.number(TARGET_VELOCITY)
-        most = objects.number(MAX_VELOCITY) or float("inf")
-        self._limited = abs(wanted) > most
-        speed = max(-most, min(most, wanted))
-        self._ramp(now_ns, speed, _rate(objects, ACCELERATION), _rate(objects, DECELERATION))
+        most = _fastest(objects)
+        if self._mode == od.CYCLIC_POSITION:
+            self._follow_position(most, now_ns, objects)
+        elif self._mode == od.CYCLIC_TORQUE:
+            self._follow_torque(most, now_ns, objects)
+        else:
+            cyclic = self._mode == od.CYCLIC_SPEED
+            wanted = objects.number(od.TARGET_VELOCITY) + (objects.number(od.VELOCITY_OFFSET) if cyclic else 0)
+            self._limited = abs(wanted) > most
+            up, down = (od.MAX_ACCELERATION, od.MAX_DECELERATION) if cyclic else (od.ACCELERATION, od.DECELERATION)
+            usual = _UNLIMITED if cyclic else _USUAL
+            speed = max(-most, min(most, wanted))
+            self._ramp(now_ns, speed, _rate(objects, up, usual), _rate(objects, down, usual))
+
+    def _follow_position(self, most: float, now_ns: int, objects: Objects) -> None:
+        """Cyclic synchronous position: be at the target when the interpolation period (60C2h) is over, within the limits."""
+        place = objects.whole(od.TARGET_POSITION) + objects.whole(od.POSITION_OFFSET)
+        inside = _inside(place, objects)
+        self._wanted = _wrapped(inside)
+        period_s = max(1, objects.whole(od.INTERPOLATION, 1, 1)) * 10.0 ** objects.whole(od.INTERPOLATION, 2, -3)
+        x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
+        distance = self._distance(self._wanted, x)
+        speed = abs(distance) / period_s
+        self._limited = inside != place or speed > most
+        up, down = (_rate(objects, index, _UNLIMITED) for index in (od.MAX_ACCELERATION, od.MAX_DECELERATION))
+        self._move(Motion(x, v, to_place(distance, v, max(min(speed, most), 1e-9), up, down)), now_ns)
+
+    def _follow_torque(self, most: float, now_ns: int, objects: Objects) -> None:
+        """Cyclic synchronous torque: the torque accelerates the motor against its friction, up to the maximum speed."""
+        wanted = objects.number(od.TARGET_TORQUE) + objects.number(od.TORQUE_OFFSET)
+        strongest = objects.number(od.MAX_TORQUE, default=1000)
+        self._torque = max(-strongest, min(strongest, wanted))
+        self._limited = self._torque != wanted
+        x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
+        ramps = by_torque(v, self._torque / 1000 * self._rated, self._coasting, min(most, _FASTEST))
+        self._move(Motion(x, v, ramps), now_ns)
+
+    # -- homing -------------------------------------------------------------------------------------------------------
+
+    def _begin_homing(self, now_ns: int, objects: Objects) -> None:
+        """Bit 4 of the controlword begins homing when it rises, and interrupts it when it falls."""
+        method, most = objects.whole(od.HOMING_METHOD), _fastest(objects)
+        acceleration = _rate(objects, od.HOMING_ACCELERATION)
+        if not self._controlword & NEW_SET_POINT or self._controlword & HALT:
+            if self._homing is not None:
+                self._ramp(now_ns, 0.0, acceleration)
+            return
+        self._homed = 0
+        if method not in METHODS:
+            self._homed = BIT_13 if method else 0
+            return
+        x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
+        search, zero = (max(1.0, min(most, objects.number(od.HOMING_SPEEDS, sub, 1_000))) for sub in (1, 2))
+        way = plan(method, self._axis, x, v, Speeds(search, zero, acceleration))
+        self._move(way.motion, now_ns)
+        self._homing = way
+
+    def _arrive(self, way: Way, objects: Objects) -> None:
+        """The way of homing is over: home has the position that the home offset (607Ch) says."""
+        self._homing, self._homed = None, BIT_12 if way.home is not None else BIT_13
+        if way.home is not None:
+            self._zero = way.home - objects.number(od.HOME_OFFSET)
 
     def _halt_or_go_on(self, now_ns: int, objects: Objects) -> None:
         if self._controlword & HALT:
             kept = self._target, self._queue
-            self._slow_down(objects.whole(HALT_OPTION, default=1), now_ns, objects)
+            self._slow_down(objects.whole(od.HALT_OPTION, default=1), now_ns, objects)
             self._target, self._queue = kept
-        elif self._mode == PROFILE_SPEED:
-            self._follow_speed(now_ns, objects)
+        elif self._mode in od.FOLLOWED:
+            self._follow(now_ns, objects)
         elif self._target is not None:
             self._move_to(self._target, now_ns)
 
@@ -261,22 +350,24 @@ class Drive(DeviceModel):
             self._queue = set_point
 
     def _set_point(self, now_ns: int, objects: Objects) -> _SetPoint:
-        place = objects.whole(TARGET_POSITION)
+        place = objects.whole(od.TARGET_POSITION)
         if self._controlword & RELATIVE:
-            place += self._target.position if self._target else _wrapped(self.position(now_ns))
-        low, high = objects.whole(POSITION_LIMIT, 1), objects.whole(POSITION_LIMIT, 2)
-        inside = min(max(place, low), high) if low < high else place
+            place += self._target.position if self._target else _wrapped(self.position(now_ns) - self._zero)
+        inside = _inside(place, objects)
         self._limited = inside != place
-        most = objects.number(MAX_VELOCITY) or float("inf")
-        speed = min(objects.number(PROFILE_VELOCITY), most)
-        return _SetPoint(_wrapped(inside), speed, _rate(objects, ACCELERATION), _rate(objects, DECELERATION))
+        speed = min(objects.number(od.PROFILE_VELOCITY), _fastest(objects))
+        return _SetPoint(_wrapped(inside), speed, _rate(objects, od.ACCELERATION), _rate(objects, od.DECELERATION))
 
     def _move_to(self, to: _SetPoint, now_ns: int) -> None:
         self._target = to
         x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
-        distance = to.position - (x if abs(x) < _SPAN / 2 else _wrapped(x))
-        ramps = to_place(distance, v, max(to.velocity, 1e-9), to.acceleration, to.deceleration)
-        self._motion, self._began_ns = Motion(x, v, ramps), now_ns
+        ramps = to_place(self._distance(to.position, x), v, max(to.velocity, 1e-9), to.acceleration, to.deceleration)
+        self._move(Motion(x, v, ramps), now_ns)
+
+    def _distance(self, position: int, x: float) -> float:
+        """From the motor's place `x` to a value of 6064h."""
+        shown = x - self._zero
+        return position - (shown if abs(shown) < _SPAN / 2 else _wrapped(shown))
 
     # -- what the objects hold ----------------------------------------------------------------------------------------
 
@@ -285,16 +376,21 @@ class Drive(DeviceModel):
         x, v = self._motion.at((now_ns - self._began_ns) / NS_PER_S)
         in_fault = self.state in (DriveState.FAULT, DriveState.FAULT_REACTION)
         error = situation.errors[-1] if in_fault and situation.errors else 0
-        states = {
-            (STATUSWORD, 0): self._statusword(now_ns, v, objects),
-            (MODE_DISPLAY, 0): self._mode,
-            (ERROR_CODE, 0): error,
+        states: dict[Key, Number] = {
+            (od.STATUSWORD, 0): self._statusword(now_ns, v, objects),
+            (od.MODE_DISPLAY, 0): self._mode,
+            (od.ERROR_CODE, 0): error,
         }
-        place, speed = _wrapped(x), round(v)
+        states = {**states, **self._exists}
+        place, speed = _wrapped(x - self._zero), round(v)
+        demand = self._wanted if self._wanted is not None and self._in(od.CYCLIC_POSITION) else place
         readings = {
-            (POSITION_ACTUAL, 0): place, (POSITION_DEMAND, 0): place,
-            (VELOCITY_ACTUAL, 0): speed, (VELOCITY_DEMAND, 0): speed,
+            (od.POSITION_ACTUAL, 0): place, (od.POSITION_DEMAND, 0): demand, (od.FOLLOWING_ERROR, 0): demand - place,
+            (od.VELOCITY_ACTUAL, 0): speed, (od.VELOCITY_DEMAND, 0): speed, (od.DIGITAL_INPUTS, 0): self._axis.inputs(x),
         }  # fmt: skip
+        if self._torque is not None:
+            torque = round(self._torque) if self._in(od.CYCLIC_TORQUE) and not self._controlword & HALT else 0
+            readings |= {(od.TORQUE_ACTUAL, 0): torque, (od.TORQUE_DEMAND, 0): torque}
         recorded = situation.played.keys()
         end_ns = self._end_ns()
         wakes = [t for t in (self._ready_ns, end_ns if end_ns > now_ns else None) if t is not None]
@@ -310,28 +406,47 @@ class Drive(DeviceModel):
         moving = now_ns < self._end_ns()
         if self.state is DriveState.QUICK_STOP or (self._controlword & HALT and self.state.powered):
             return word | (0 if moving else REACHED)
-        if self._in(PROFILE_POSITION):
+        if self._in(od.PROFILE_POSITION):
             reached = not moving and self._queue is None
             return word | (REACHED if reached else 0) | (BIT_12 if self._acknowledge else 0)
-        if self._in(PROFILE_SPEED):
-            off = abs(v - objects.number(TARGET_VELOCITY))
-            reached = off <= objects.number(VELOCITY_WINDOW) or (self._limited and not moving)
-            still = abs(v) <= objects.number(VELOCITY_THRESHOLD)
+        if self._in(od.PROFILE_SPEED):
+            off = abs(v - objects.number(od.TARGET_VELOCITY))
+            reached = off <= objects.number(od.VELOCITY_WINDOW) or (self._limited and not moving)
+            still = abs(v) <= objects.number(od.VELOCITY_THRESHOLD)
             return word | (REACHED if reached else 0) | (BIT_12 if still else 0)
-        return word
+        if self._in(od.HOMING):
+            return word | self._homed | (0 if moving else REACHED)
+        if self._in(od.CYCLIC_POSITION):
+            return word | BIT_12 | (BIT_13 if self._lags(now_ns, objects) else 0)
+        return word | (BIT_12 if self.state is DriveState.OPERATION_ENABLED and self._mode in od.FOLLOWED else 0)
+
+    def _lags(self, now_ns: int, objects: Objects) -> bool:
+        """Whether the following error is beyond its window (6065h); FFFFFFFFh switches the supervision off."""
+        window = objects.whole(od.FOLLOWING_WINDOW, default=_SPAN - 1)
+        if self._wanted is None or window == _SPAN - 1:
+            return False
+        return abs(self._distance(self._wanted, self.position(now_ns))) > window
 
 
 def _supported(mode: int, objects: Objects) -> bool:
-    """Whether the drive has this mode: this model knows two, and 6502h may say fewer. 0 is no mode, which is always."""
-    if mode == 0:
-        return True
-    said = objects.whole(SUPPORTED_MODES, default=-1)
-    return mode in (PROFILE_POSITION, PROFILE_SPEED) and bool(said >> (mode - 1) & 1)
+    """Whether the drive has this mode, as 6502h says. 0 is no mode, which is always accepted."""
+    return mode == 0 or (mode > 0 and bool(od.mode_bits(objects) >> (mode - 1) & 1))
 
 
-def _rate(objects: Objects, index: int) -> float:
-    """An acceleration object; 0 would never get anywhere, so 1 is the least."""
-    return max(1.0, float(objects.number(index, default=10_000)))
+def _rate(objects: Objects, index: int, usual: float = _USUAL) -> float:
+    """An acceleration object, `usual` where the node has none; 0 would never get anywhere, so 1 is the least."""
+    return max(1.0, float(objects.number(index, default=usual)))
+
+
+def _fastest(objects: Objects) -> float:
+    """The maximum profile velocity (607Fh), which bounds every mode; without it, or at 0, there is no bound."""
+    return float(objects.number(od.MAX_VELOCITY)) or float("inf")
+
+
+def _inside(place: int, objects: Objects) -> int:
+    """A target within the software position limits (607Dh), which hold where the lower one is below the upper one."""
+    low, high = objects.whole(od.POSITION_LIMIT, 1), objects.whole(od.POSITION_LIMIT, 2)
+    return min(max(place, low), high) if low < high else place
 
 
 def _wrapped(place: float) -> int:

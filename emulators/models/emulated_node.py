@@ -5,16 +5,20 @@ It must never know buses nor clocks: the player that it is given has its start.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from emulators.canopen.behaviour import DeviceModel
 from emulators.canopen.codec import encode
 from emulators.canopen.dictionary import Dictionary, Key, load_eds
 from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.canopen.remarks import Remark, remarks
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
-from emulators.models.by_profile import model_for
+from emulators.models.by_profile import NO_MODEL, model_for
 from emulators.models.distorted_objects import DistortedObjects
+from emulators.models.drive import Drive
+from emulators.models.drive_objects import missing_modes
 from emulators.models.played_objects import HeldObjects, PlayedObjects
 from emulators.replay.can_log import CanLog
 from emulators.replay.objects import recorded_objects
@@ -24,12 +28,22 @@ from gateway.core.profile import DeviceProfile
 
 
 @dataclass(frozen=True, slots=True)
+class NodeOptions:
+    """What a user may say of a node beyond its files. `model` is one of `by_profile.CHOICES`, None: as 1000h says. Without
+    `parameter_values` the node starts with the DefaultValues of its data sheet."""
+
+    model: str | None = None
+    parameter_values: bool = True
+
+
+@dataclass(frozen=True, slots=True)
 class EmulatedNode:
-    """The node and what it held, by tag. `distortions`: what its objects hold instead."""
+    """The node and what it held, by tag. `distortions`: what its objects hold instead. `remarks`: what does not fit."""
 
     node: CanopenNode
     journal: HeldJournal
     distortions: Distortions
+    remarks: Sequence[Remark] = ()
 
 
 def emulated_node(
@@ -38,6 +52,7 @@ def emulated_node(
     recording: Signals | CanLog | None,
     now_ns: int,
     identity: Mapping[str, str] | None = None,
+    options: NodeOptions | None = None,
 ) -> EmulatedNode:
     """The node of a CANopen profile, playing signals or what is in a log of its bus. Without a `recording` it holds what the data
     sheet says and what its model does.
@@ -48,29 +63,44 @@ def emulated_node(
     """
     if profile.eds_path is None:
         raise UsageError("a node needs a data sheet", where=profile.path, expected="`eds: FILE.eds` in the profile")
-    dictionary = load_eds(profile.eds_path)
+    options = options or NodeOptions()
+    dictionary = load_eds(profile.eds_path, parameter_values=options.parameter_values)
     tags = profile.tags.values()
     held = HeldObjects(tags)
     own = _factory(profile, dictionary, identity or {})
-    model = model_for(dictionary)
+    model = model_for(dictionary, options.model)
     context = NodeContext(model=model, held=held, factory=own)
     if recording is not None and not isinstance(recording, CanLog):
         played = PlayedObjects(tags, dictionary, recording)
-        distortions = played.distortions
-        node = CanopenNode(dictionary, node_id, replace(context, source=played))
+        unfed = [tag for tag in tags if tag.name not in recording.names]  # the others are distorted as they are played
+        distorted = DistortedObjects(unfed, dictionary, played, has_model=model is not None, named=True)
+        distorted.distortions = played.distortions
     else:
         objects = None if recording is None else recorded_objects(recording, dictionary, node_id)
         if objects is not None:
             context = replace(context, factory={**objects.initial, **own}, refusals=objects.refusals)
         distorted = DistortedObjects(tags, dictionary, objects, has_model=model is not None)
-        distortions = distorted.distortions
-        context = replace(context, source=distorted, distort=distorted.over if model is not None else None)
-        node = CanopenNode(dictionary, node_id, context)
-        distorted.data = node.data
+    distortions = distorted.distortions
+    context = replace(context, source=distorted, distort=distorted.over if model is not None else None)
+    node = CanopenNode(dictionary, node_id, context)
+    distorted.data = node.data
     for tag in tags:  # what nobody plays is held as well: by the data sheet
         if tag.object is not None and node.data.has(*tag.object):
             held({tag.object: node.data.get(*tag.object)}, now_ns)
-    return EmulatedNode(node, held.journal, distortions)
+    return EmulatedNode(node, held.journal, distortions, node_remarks(dictionary, node_id, model, options))
+
+
+def node_remarks(dictionary: Dictionary, node_id: int, model: DeviceModel | None, options: NodeOptions) -> list[Remark]:
+    """What does not fit this node; a model that the user chose not to have is not missed."""
+    found = remarks(dictionary, node_id, has_model=model is not None or options.model == NO_MODEL)
+    if isinstance(model, Drive) and (missing := missing_modes(dictionary)):
+        listed = ", ".join(map(str, missing))
+        found.append(
+            Remark(
+                f"6502h (supported drive modes) names modes that the drive model lacks: {listed}; it reads without them"
+            )
+        )
+    return found
 
 
 def _factory(profile: DeviceProfile, dictionary: Dictionary, identity: Mapping[str, str]) -> dict[Key, bytes]:

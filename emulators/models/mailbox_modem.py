@@ -13,10 +13,10 @@ from random import Random
 
 from emulators.codec import encode
 from emulators.journal import HeldJournal
-from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
+from emulators.modbus.bank import BIT_TABLES, IllegalValue, MapBank, RegisterBank, Span, Table
 from emulators.models.packet_link import TAME, Incoming, Outgoing, PacketLink, Untamed
 from gateway.core.errors import FileInvalid
-from gateway.core.profile import Box, DeviceProfile, RegisterRange
+from gateway.core.profile import Box, DeviceProfile, RegisterRange, Tag
 
 LAST_SEQUENCE = 0xFFFF
 RECEIVED = 64
@@ -47,6 +47,16 @@ class MailboxModem(RegisterBank):
         self._pending: bytes | None = None
         for name, text in (identity or {}).items():
             self._state(name, text)
+        for tag in self._tags.values():  # what no identity states is empty or 0, and is read as such
+            if tag.readable and tag.name not in (identity or {}):
+                self._note(tag, 0)
+
+    def _note(self, tag: Tag, now_ns: int) -> None:
+        """Journal what the registers of `tag` hold now."""
+        at = tag.registers
+        words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
+        bits = at.table in BIT_TABLES
+        self.journal.note(tag.name, bytes(words) if bits else b"".join(w.to_bytes(2) for w in words), now_ns)
 
     def _state(self, name: str, text: str) -> None:
         """A tag that never changes."""

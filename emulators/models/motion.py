@@ -85,3 +85,27 @@ def to_place(distance: float, v: float, cruise: float, acceleration: float, dece
 
 def _positive(ramps: Sequence[Ramp]) -> list[Ramp]:
     return [(duration, a) for duration, a in ramps if duration > 0]
+
+
+def by_torque(v: float, acceleration: float, friction: float, fastest: float) -> tuple[Ramp, ...]:
+    """From speed `v` under a torque that alone gives `acceleration`, against dry `friction`, both in units a second squared.
+
+    A torque that the friction outweighs moves nothing that stands. The speed stays within `fastest`, which is above 0.
+    """
+    ramps: list[Ramp] = []
+    if abs(v) > fastest:
+        ramps.append(((abs(v) - fastest) / friction, -math.copysign(friction, v)))
+        v = math.copysign(fastest, v)
+    if v:
+        net = acceleration - math.copysign(friction, v)
+        if v * net < 0:
+            ramps.append((abs(v / net), net))
+            v = 0.0
+        elif net:
+            return (*ramps, *_positive([((fastest - abs(v)) / abs(net), net)]))
+        else:
+            return tuple(ramps)
+    if abs(acceleration) > friction:
+        net = acceleration - math.copysign(friction, acceleration)
+        ramps.append((fastest / abs(net), net))
+    return tuple(ramps)

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import BIT_TABLES, IllegalValue, MapBank, RegisterBank, Table
 from emulators.modbus.unit import Handler, ModbusUnit
-from emulators.stated import Effects, cells_of, spans_of
+from emulators.stated import Effects, cells_of, fits, spans_of
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import DeviceProfile, OwnFunction, Tag
 
@@ -30,11 +30,16 @@ class StatedRegisters(RegisterBank):
                 raise FileInvalid(f"{profile.name} has no tag {name!r}", path=profile.path, expected=known)
         self.journal = HeldJournal()
         self._tags = [tag for tag in profile.tags.values() if tag.readable]
-        self._cells = MapBank(spans_of(profile))
+        self._cells = MapBank(spans_of(profile), undeclared=profile.form.undeclared)
         self._effects = Effects(profile.effects)
         self._exponents = {t.name: _exponent(t, values) for t in profile.tags.values()}
         for name, value in values.items():
-            self._put(profile.tags[name], value)
+            tag = profile.tags[name]
+            number = _number(tag, value) if isinstance(value, str) != (tag.type == "string") else value
+            if not fits(tag, number, self._exponents[name]):
+                expected = f"what {tag.registers.count} registers of type {tag.type} can hold"
+                raise FileInvalid(f"the value of {name!r}", path=profile.path, expected=expected, got=repr(value))
+            self._put(tag, value)
         for tag in self._tags:
             self._note(tag, now_ns)
 

@@ -55,6 +55,9 @@ class SampledSensor(RegisterBank):
             self._put(tag, 0, player.start_ns)
         for name, text in identity.items():
             self._put(self._tag(name, profile), text, player.start_ns)
+        for tag in profile.tags.values():  # a text that no identity states is empty, and is read as such
+            if tag.is_text and tag.readable and tag.name not in identity:
+                self._note(tag, player.start_ns)
 
     @staticmethod
     def _tag(name: str, profile: DeviceProfile) -> Tag:
@@ -73,6 +76,16 @@ class SampledSensor(RegisterBank):
         if self._period_s > 0:
             self._take_due(now_ns)
         return self._cells.read(table, address, count, now_ns)
+
+    def peek(self, table: Table, address: int) -> int:
+        """Return a cell as it is, without taking samples that fell due."""
+        return self._cells.peek(table, address)
+
+    @property
+    def own_tags(self) -> list[Tag]:
+        """The numbers that the model fills itself. They are no signals, so a distortion of them is not sampled."""
+        signals = {tag.name for tag in self._signals}
+        return [tag for tag in self._tags.values() if tag.name not in signals and not tag.is_text]
 
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
         self._cells.check_read(table, address, count, now_ns)
@@ -145,8 +158,13 @@ class SampledSensor(RegisterBank):
         for tag in self._tags.values():
             at = tag.registers
             if at.table == table and at.address < address + count and address < at.end:
-                words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
-                self.journal.note(tag.name, b"".join(w.to_bytes(2) for w in words), now_ns)
+                self._note(tag, now_ns)
+
+    def _note(self, tag: Tag, now_ns: int) -> None:
+        """Journal what the registers of `tag` hold now."""
+        at = tag.registers
+        words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
+        self.journal.note(tag.name, b"".join(w.to_bytes(2) for w in words), now_ns)
 
 
 def _spans(profile: DeviceProfile) -> list[Span]:

@@ -9,15 +9,19 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from emulators.context import WhenUsedUp
 from gateway.core.canframe import CanFrame
 from gateway.core.errors import FileInvalid
+from gateway.core.input_file import open_input
 
 _LINE = re.compile(
     r"\((\d+\.\d+)\)\s+\S+\s+([0-9A-F]{3}|[0-9A-F]{8})#(R[0-8]?|(?:[0-9A-F]{2}){0,8})(?:\s+[RT])?", re.IGNORECASE
 )
 _ERROR = 0x20000000
+MAX_LINE_BYTES = 1024
+"""A line of candump has at most 60 characters, and the name of its interface."""
 
 SUFFIX = ".log"
 """By which a file is known as a log of candump, among recordings."""
@@ -34,10 +38,21 @@ class CanLog:
     def frames(self) -> Iterator[tuple[float, CanFrame]]:
         """`read_can_log` of the file. Raises `FileInvalid`, also where it cannot be read."""
         try:
-            with self.path.open(encoding="ascii", errors="replace") as lines:
-                yield from read_can_log(lines, str(self.path))
+            with open_input(self.path) as file:
+                yield from read_can_log(_lines(file, str(self.path)), str(self.path))
         except OSError as e:
             raise FileInvalid("the log cannot be read", path=str(self.path), got=e.strerror or str(e)) from e
+
+
+def _lines(file: BinaryIO, path: str) -> Iterator[str]:
+    number = 0
+    while line := file.readline(MAX_LINE_BYTES + 1):
+        number += 1
+        if len(line) > MAX_LINE_BYTES:
+            raise FileInvalid(
+                "the line is too long", path=path, line=number, expected=f"at most {MAX_LINE_BYTES} bytes"
+            )
+        yield line.decode("ascii", "replace")
 
 
 def read_can_log(lines: Iterable[str], path: str = "") -> Iterator[tuple[float, CanFrame]]:

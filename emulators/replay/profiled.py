@@ -33,15 +33,19 @@ class ProfiledReplay(ReplayUnit):
         self._counting = _COUNTING & frozenset(form.limits.functions or ())
         stated = {0x11: form.server_id, 0x14: form.files, 0x15: form.files, 0x18: form.fifos, 0x2B: form.identification}
         self._stated = frozenset(function for function, said in stated.items() if said)
+        self._undeclared = form.undeclared
+        self._declared: set[tuple[Table, int]] = set()
         self._writable: set[tuple[Table, int]] = set()
         self._unreadable: set[tuple[Table, int]] = set()
         readable: set[tuple[Table, int]] = set()
         for tag in profile.tags.values():
             cells = {(tag.registers.table, tag.registers.address + i) for i in range(tag.registers.count)}
+            self._declared |= cells
             self._writable |= cells if tag.writable else set()
             readable |= cells if tag.readable else set()
             self._unreadable |= set() if tag.readable else cells
         self._unreadable -= readable
+        self._tables = {table for table, _ in self._declared}
         add_own_functions(self, profile)
 
     def computes(self, pdu: bytes) -> bool:
@@ -71,6 +75,8 @@ class ProfiledReplay(ReplayUnit):
             code = requests.ILLEGAL_ADDRESS if requests.leaves_the_table(pdu) else requests.ILLEGAL_VALUE
         if code:
             return self.replay.refuse(self.unit_id, pdu, code)
+        if request is not None and self._undeclared != "exception":
+            self._fill(request)
         if request is not None and request.values is not None and self._may_write(request):
             return self.replay.accept(self.unit_id, request, pdu)
         return super().recall(pdu)
@@ -90,5 +96,18 @@ class ProfiledReplay(ReplayUnit):
             return requests.ILLEGAL_ADDRESS
         return 0
 
+    def _fill(self, request: CellRequest) -> None:
+        """Cells of the request that no tag names and nobody recorded hold 0 from now on."""
+        if request.table in self._tables:
+            for address in request.addresses:
+                if (request.table, address) not in self._declared and not self.replay.knows(
+                    self.unit_id, request.table, address
+                ):
+                    self.replay.put(self.unit_id, request.table, address, [0])
+
     def _may_write(self, request: CellRequest) -> bool:
-        return all((request.table, address) in self._writable for address in request.addresses)
+        held = self._undeclared == "hold" and request.table in self._tables
+        return all(
+            (request.table, address) in self._writable or (held and (request.table, address) not in self._declared)
+            for address in request.addresses
+        )

@@ -162,6 +162,10 @@ class ExchangeReplay:
         found = self._units[unit_id].request_lengths
         return {function: max(lengths) for function, lengths in found.items() if len(lengths) == 1}
 
+    def knows(self, unit_id: int, table: Table, address: int) -> bool:
+        """Whether a cell was recorded, written or put."""
+        return self._knows(unit_id, self._units[unit_id], (table, address))
+
     def put(self, unit_id: int, table: Table, address: int, values: Sequence[int]) -> None:
         """The unit itself changed these cells: they read so until they are written or put again, counters too."""
         self._units[unit_id].put.update({(table, address + i): value for i, value in enumerate(values)})

@@ -13,9 +13,10 @@ from functools import partial
 from emulators.wires import can_verdict
 from emulators.wires.can_events import Delivery, Notice, WireFault
 from emulators.wires.can_faults import SUSPEND_BITS, Disturbance, Rule
+from emulators.wires.can_fd_timing import data_phase
 from emulators.wires.can_load import BusLoad
 from emulators.wires.can_nodes import BusOff, Node, Start
-from emulators.wires.can_timing import INTERFRAME_BITS, bits_on_wire, bits_to_end
+from emulators.wires.can_timing import INTERFRAME_BITS, bits_to_end
 from emulators.wires.can_verdict import Verdict
 from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame
@@ -34,8 +35,9 @@ class Attempts:
     those in bus-off; `free_ns` is when the interframe space of the last attempt ends.
     """
 
-    def __init__(self, bitrate: int, *, instant: bool, monitored: bool) -> None:
+    def __init__(self, bitrate: int, *, instant: bool, monitored: bool, data_bitrate: int = 0) -> None:
         self.bitrate = bitrate
+        self.data_bitrate = data_bitrate or bitrate
         self.instant = instant
         self.monitored = monitored
         self.conflicts = 0
@@ -68,6 +70,24 @@ class Attempts:
     def duration_ns(self, bits: int) -> int:
         """How long so many bits take: nothing where frames are instant."""
         return 0 if self.instant else (bits * NS_PER_S + self.bitrate // 2) // self.bitrate
+
+    def frame_ns(self, frame: CanFrame, bits: int) -> int:
+        """How long the first `bits` of `frame` take, those of its data phase at the data bit rate."""
+        if not frame.brs or self.instant:
+            return self.duration_ns(bits)
+        first, end = data_phase(frame)
+        fast = max(0, min(bits, end) - first)
+        return self.duration_ns(bits - fast) + (fast * NS_PER_S + self.data_bitrate // 2) // self.data_bitrate
+
+    def busy(self, frame: CanFrame, bits: int, rest: int) -> tuple[int, int]:
+        """How long `bits` of `frame` and `rest` more take, and how many bits at the nominal bit rate that is.
+
+        What follows a frame, or an error in it, is always sent at the nominal bit rate.
+        """
+        if not frame.brs or self.instant:
+            return self.duration_ns(bits + rest), bits + rest
+        ns = self.frame_ns(frame, bits) + self.duration_ns(rest)
+        return ns, -(-ns * self.bitrate // NS_PER_S)
 
     def attempt(self, start: Start) -> None:
         """An attempt's regular end has come: it was a frame, or an error. Who is in bus-off by it counts from its end on."""
@@ -131,7 +151,7 @@ class Attempts:
             verdict = can_verdict.collided(frame, outcome.error_bit)
             self._fail(verdict, frame, start, by_age, self._receivers(start, by_age))
             return None
-        at_ns = start.start_ns + self.duration_ns(outcome.lost_bit + 1)
+        at_ns = start.start_ns + self.frame_ns(frame, outcome.lost_bit + 1)
         for number in outcome.losers:  # error-passive: they give way without spoiling the frame
             node = self.nodes[number]
             self.change(number, at_ns, node.faults.send_failed)
@@ -152,7 +172,7 @@ class Attempts:
         at_sender = not what.seen_by or bool(what.seen_by & set(senders))
         if not at_sender and not any(self.nodes[n].flags_are_dominant for n in victims):
             for number in victims:
-                at_ns = start.start_ns + self.duration_ns(bits_to_end(frame))
+                at_ns = start.start_ns + self.frame_ns(frame, bits_to_end(frame))
                 self.change(number, at_ns, partial(self.nodes[number].faults.receive_failed, first=False))
                 self.nodes[number].errors += 1
             return False
@@ -172,8 +192,9 @@ class Attempts:
         self, verdict: Verdict, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]
     ) -> None:
         """An error frame, that all who take part count; what was to be sent stays at the head of its queue."""
-        at_ns = start.start_ns + self.duration_ns(verdict.flag_at)
-        self._pass(start.start_ns, verdict.bits)
+        at_ns = start.start_ns + self.frame_ns(frame, verdict.flag_at)
+        took_ns, bits = self.busy(frame, verdict.flag_at, verdict.bits - verdict.flag_at)
+        self._pass(start.start_ns, took_ns)
         for number in senders:
             faults = self.nodes[number].faults
             self.change(number, at_ns, faults.not_acknowledged if verdict.kind == "ack" else faults.send_failed)
@@ -181,22 +202,19 @@ class Attempts:
             first = number in verdict.first
             self.change(number, at_ns, partial(self.nodes[number].faults.receive_failed, first=first))
         self.error_frames += 1
-        self.load.count(frame, verdict.bits, at_ns, tuple(senders), whole=False)
+        self.load.count(frame, bits, at_ns, tuple(senders), whole=False)
         counters = []
         for number in (*senders, *receivers):
             node = self.nodes[number]
             node.errors += 1
             counters.append((number, node.faults.tec, node.faults.rec))
-        self.faults.append(
-            WireFault(at_ns, verdict.kind, frame, start.start_ns, verdict.bits, tuple(senders), tuple(counters))
-        )
+        self.faults.append(WireFault(at_ns, verdict.kind, frame, start.start_ns, bits, tuple(senders), tuple(counters)))
 
     def _deliver(self, frame: CanFrame, start: Start, senders: Sequence[int], receivers: Sequence[int]) -> None:
-        if len(start.rivals) == 1:  # then its length is known already
-            bits, end_ns = start.bits + INTERFRAME_BITS, start.end_ns
-        else:
-            bits, end_ns = bits_on_wire(frame), start.start_ns + self.duration_ns(bits_to_end(frame))
-        self._pass(start.start_ns, bits)
+        length = start.bits if len(start.rivals) == 1 else bits_to_end(frame)  # of one alone it is known already
+        took_ns, bits = self.busy(frame, length, INTERFRAME_BITS)
+        end_ns = start.end_ns if len(start.rivals) == 1 else start.start_ns + self.frame_ns(frame, length)
+        self._pass(start.start_ns, took_ns)
         sent_by = tuple(senders)
         self.load.count(frame, bits, end_ns, sent_by, whole=True)
         self.done.append(Delivery(frame.at(end_ns), start.start_ns, bits, sent_by, tuple(receivers)))
@@ -225,12 +243,12 @@ class Attempts:
         if faults.state is not before:
             self.notices.append(Notice(at_ns, number, before, faults.state, faults.tec, faults.rec))
 
-    def _pass(self, start_ns: int, bits: int) -> None:
-        """An attempt took the bus: it is free again after `bits`. Nodes in bus-off count the recessive sequences."""
+    def _pass(self, start_ns: int, took_ns: int) -> None:
+        """An attempt took the bus: it is free again after `took_ns`. Nodes in bus-off count the recessive sequences."""
         if self.off:
             idle_bits = 0 if self.instant else (start_ns - self.free_ns) * self.bitrate // NS_PER_S
             self.off.attempt_passed(idle_bits)
-        self.free_ns = start_ns + self.duration_ns(bits)
+        self.free_ns = start_ns + took_ns
 
     def _go_off(self, number: int) -> None:
         self.off.enter(number)

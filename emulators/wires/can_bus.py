@@ -32,7 +32,7 @@ from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame
 from gateway.core.errors import Bug, EndpointBusy, UsageError
 
-MAX_BITRATE = 1_000_000
+MAX_BITRATE, MAX_DATA_BITRATE = 1_000_000, 8_000_000
 
 
 class CanBus:
@@ -40,7 +40,8 @@ class CanBus:
 
     `queue_frames` bounds each node's transmit queue. `instant` makes frames take no time (they are still arbitrated and
     counted), for tests and imports that should not wait for a wire: without bits there are no collisions, of two frames with one
-    arbitration field the older goes first. `monitored`: the bus acknowledges every frame; otherwise only other nodes do.
+    arbitration field the older goes first. `data_bitrate` is that of CAN FD frames with the bit-rate switch, 0 for `bitrate`.
+    `monitored`: the bus acknowledges every frame; otherwise only other nodes do.
     """
 
     def __init__(
@@ -51,16 +52,22 @@ class CanBus:
         queue_frames: int = 64,
         max_nodes: int = 128,
         monitored: bool = True,
+        data_bitrate: int = 0,
     ) -> None:
         if not 1 <= bitrate <= MAX_BITRATE:
             raise UsageError("bit rate of a CAN bus", expected=f"1 to {MAX_BITRATE} bit/s", got=str(bitrate))
+        if data_bitrate and not bitrate <= data_bitrate <= MAX_DATA_BITRATE:
+            raise UsageError(
+                "data bit rate of a CAN bus", expected=f"{bitrate} to {MAX_DATA_BITRATE} bit/s", got=str(data_bitrate)
+            )
         self.bitrate = bitrate
+        self.data_bitrate = data_bitrate or bitrate
         self.instant = instant
         self.queue_frames = queue_frames
         self.max_nodes = max_nodes
         self.monitored = monitored
         self.overruns = 0
-        self._wire = Attempts(bitrate, instant=instant, monitored=monitored)
+        self._wire = Attempts(bitrate, instant=instant, monitored=monitored, data_bitrate=data_bitrate)
         self._next_node = 1
         self._sequence = 0
         self._next: Start | None = None  # cached: see `_upcoming`
@@ -211,17 +218,16 @@ class CanBus:
             winner = node.queue[0]
             start_ns = max(self._wire.free_ns, winner.ready_ns, node.hold_ns)
             bits = bits_to_end(winner.frame)
-            self._next = Start(start_ns, start_ns + self._wire.duration_ns(bits), bits, winner, (number,))
+            self._next = Start(start_ns, start_ns + self._wire.frame_ns(winner.frame, bits), bits, winner, (number,))
         elif self._next is None and self._wire.waiting:
             heads = [(max(node.queue[0].ready_ns, node.hold_ns), number) for number, node in self._wire.waiting.items()]
             start_ns = max(self._wire.free_ns, min(heads)[0])
             contenders = [number for ready_ns, number in heads if ready_ns <= start_ns]
             winner = min((self._wire.waiting[n].queue[0] for n in contenders), key=lambda p: (p.key, p.sequence))
             rivals = tuple(n for n in contenders if self._wire.waiting[n].queue[0].key == winner.key)
-            longest = bits_to_end(winner.frame)
-            if len(rivals) > 1:  # of a collision, any may stay
-                longest = max(bits_to_end(self._wire.waiting[n].queue[0].frame) for n in rivals)
-            end_ns = start_ns + self._wire.duration_ns(longest)
+            frames = [self._wire.waiting[n].queue[0].frame for n in rivals]  # of a collision, any may stay
+            longest = max(bits_to_end(frame) for frame in frames)
+            end_ns = start_ns + max(self._wire.frame_ns(frame, bits_to_end(frame)) for frame in frames)
             self._next = Start(start_ns, end_ns, longest, winner, rivals)
         return self._next
 
@@ -255,8 +261,10 @@ class CanBus:
 
     def _skip(self, start: Start, now_ns: int, recovery_ns: int | None) -> bool:
         """Pass over attempts that change nothing, all that end before `now_ns` and before a node is back."""
-        bits = can_verdict.unacknowledged(start.winner.frame).bits
-        period_ns = self._wire.duration_ns(bits + SUSPEND_BITS)
+        frame = start.winner.frame
+        verdict = can_verdict.unacknowledged(frame)
+        after = verdict.bits - verdict.flag_at + SUSPEND_BITS
+        period_ns = self._wire.busy(frame, verdict.flag_at, after)[0]
         if recovery_ns is not None or period_ns == 0:
             return False
         attempts = (now_ns - start.start_ns) // period_ns

@@ -1,4 +1,4 @@
-"""How long a classic CAN frame is on the wire, bit by bit (ISO 11898-1, 10.4 and 10.5).
+"""How long a CAN frame is on the wire, bit by bit (ISO 11898-1, 10.4 and 10.5); `can_fd_timing` has what is special in CAN FD.
 
 Pure arithmetic on one frame: this module knows no bus, no time and no other frame.
 
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+from emulators.wires.can_fd_timing import fd_bits
 from gateway.core.canframe import CanFrame
 
 CRC15_POLYNOMIAL = 0x4599
@@ -70,6 +71,8 @@ def stuff(bits: str) -> str:
 
 def bits_to_end(frame: CanFrame) -> int:
     """Bits from start of frame to the end of end-of-frame: when receivers have the frame and the sender its success."""
+    if frame.fd:
+        return len(fd_bits(frame)) + END_BITS
     return _stuffed_length(frame.can_id, frame.data, frame.extended, frame.remote, frame.dlc) + END_BITS
 
 
@@ -151,7 +154,7 @@ def arbitration_key(frame: CanFrame) -> int:
 
 def wire_bits(frame: CanFrame) -> str:
     """All bits of an acknowledged frame as they stand on the wire, start to end of frame; stuffed up to the CRC's end."""
-    return stuff(plain_bits(frame)) + "1" + "0" + "1" + "1" * 7
+    return (fd_bits(frame) if frame.fd else stuff(plain_bits(frame))) + "1" + "0" + "1" + "1" * 7
 
 
 def last_errant_bit(frame: CanFrame) -> int:

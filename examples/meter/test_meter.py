@@ -31,7 +31,7 @@ def test_it_writes_once(meter, device, wire):
 def test_it_asks_twice_and_no_more(meter, wire):
     with wire.fault("silence"), pytest.raises(MeterError, match="no reply"):
         meter.voltage()
-    wire.expect(times=2, problem="no reply")
+    wire.expect(times=2, problem="no reply", within_s=0.3)
     assert meter.voltage() == pytest.approx(230.5)
 
 

@@ -6,12 +6,14 @@ CO-030, CO-034 to CO-039, CO-042, CO-043, CO-045 to CO-056, CO-058, CO-059, CO-0
 
 from __future__ import annotations
 
+from functools import partial
+
 from fieldtwin.checking import canopen_nmt_plays as nmt
 from fieldtwin.checking import canopen_sdo_plays as sdo
 from fieldtwin.checking import canopen_write_plays as write
 from fieldtwin.checking.canopen_wire import CanopenWire
 from fieldtwin.checking.device_case import DeviceCase, Play
-from fieldtwin.conformance.case import Danger
+from fieldtwin.conformance.case import Basis, Danger
 
 CanopenCase = DeviceCase[CanopenWire]
 READ, WRITE, DISRUPT = Danger.READ, Danger.WRITE, Danger.DISRUPT
@@ -27,13 +29,18 @@ def case(
     must: str,
     play: Play[CanopenWire],
     needs: tuple[str, ...] = (),
+    basis: Basis = Basis.STANDARD,
 ) -> CanopenCase:
-    return DeviceCase(id, title, clause, danger, does, must, play, needs=needs)
+    return DeviceCase(id, title, clause, danger, does, must, play, needs=needs, basis=basis)
 
+
+robust = partial(case, basis=Basis.ROBUSTNESS)
+field = partial(case, basis=Basis.FIELD)
 
 CASES: tuple[CanopenCase, ...] = (
-    case("CO-001a", "toggle bit repeated in an upload", "7.2.4", READ, "the second segment asked for with the same toggle",
-         "abort 05030000, transfer over", sdo.toggle_repeated),
+    case("CO-001a", "toggle bit repeated in an upload", "7.2.4", READ,
+         "two segments asked for with the same toggle, then the next one",
+         "abort 05030000 for the repeated toggle, then abort 05040001: the transfer is over", sdo.toggle_repeated),
     case("CO-001b", "toggle bit repeated in a download", "7.2.4", WRITE, "the second segment sent with the same toggle",
          "abort 05030000, nothing written", write.toggle_repeated, OBJECT),
     case("CO-002", "client aborts mid-segment", "7.2.4", READ, "an abort, then the next segment asked for",
@@ -43,8 +50,8 @@ CASES: tuple[CanopenCase, ...] = (
     case("CO-003b", "download segment without initiate", "7.2.4", WRITE, "a segment sent", "abort 05040001",
          write.segment_alone),
     case("CO-004", "unknown command specifier", "7.2.4", DISRUPT, "E0", "abort 05040001", sdo.unknown_specifier),
-    case("CO-005", "a new initiate during a transfer", "canopen-stack #132", READ, "an upload of 1000h in the middle of another",
-         "start afresh", sdo.begun_anew),
+    field("CO-005", "a new initiate during a transfer", "canopen-stack #132", READ, "an upload of 1000h in the middle of another",
+         "answer it, or abort it and answer the next one", sdo.begun_anew),
     case("CO-006a", "write to a read-only object", "7.2.4", WRITE, "1000h, expedited, with its own value", "abort 06010002",
          write.read_only_expedited),
     case("CO-006b", "write to a read-only object in segments", "7.2.4", WRITE, "1000h, 20 bytes announced",
@@ -64,28 +71,28 @@ CASES: tuple[CanopenCase, ...] = (
          ("object", "eds")),
     case("CO-011", "1003h:00 written non-zero", "7.5.2.4", WRITE, "1003h:00 = 1", "abort 06090030 or 08000000",
          write.history_set),
-    case("CO-012", "1003h:01 while empty", "CN PR #253", READ, "1003h:01", "abort 08000024 or 08000000", sdo.empty_history),
+    field("CO-012", "1003h:01 while empty", "CN PR #253", READ, "1003h:01", "abort 08000024 or 08000000", sdo.empty_history),
     case("CO-013a", "more than the indicated size", "7.2.4", WRITE, "a segment with a byte more", "abort 06070012",
          write.more_than_announced, OBJECT),
     case("CO-013b", "less than the indicated size", "7.2.4", WRITE, "a segment with a byte less", "abort 06070013",
          write.less_than_announced, OBJECT),
-    case("CO-014a", "block size 0", "CN PR #42", READ, "a block upload of 0 segments a block", "abort 05040002",
+    case("CO-014a", "block size 0", "7.2.4; CN PR #42", READ, "a block upload of 0 segments a block", "abort 05040002",
          sdo.block_size_0),
-    case("CO-014b", "block size 128", "CN PR #42", READ, "a block upload of 128 segments a block", "abort 05040002",
+    case("CO-014b", "block size 128", "7.2.4; CN PR #42", READ, "a block upload of 128 segments a block", "abort 05040002",
          sdo.block_size_128),
     case("CO-015", "block CRC mismatch", "7.2.4", WRITE, "a block download that ends in another CRC",
          "abort 05040004, nothing written", write.crc_mismatch, OBJECT),
-    case("CO-016", "segment lost in a block upload", "CN #205", READ, "the last segment of a block is not acknowledged",
+    case("CO-016", "segment lost in a block upload", "7.2.4; CN #205", READ, "the last segment of a block is not acknowledged",
          "send it again, from 1", sdo.segment_lost),
-    case("CO-017", "segment lost in the last sub-block", "py #618", WRITE, "a block download without its second segment",
+    case("CO-017", "segment lost in the last sub-block", "7.2.4; py #618", WRITE, "a block download without its second segment",
          "acknowledge the first, recover", write.segment_lost, OBJECT),
-    case("CO-019", "a request right after block-upload end", "CN #39", READ, "the end of a block upload, at once 1000h",
+    field("CO-019", "a request right after block-upload end", "CN #39", READ, "the end of a block upload, at once 1000h",
          "answer it", sdo.right_after_the_end),
     case("CO-020", "per-segment replies inside a block", "7.2.4", WRITE, "a block download", "one reply a block",
          write.one_reply_a_block, OBJECT),
     case("CO-021", "switch from block to normal upload", "7.2.4", READ, "a block upload that does not allow the switch",
          "blocks, or an abort", sdo.no_switch_unasked),
-    case("CO-026", "SDO shorter than 8 bytes", "CN #584", READ, "an upload request of 4 bytes", "ignore it, or take it; go on",
+    robust("CO-026", "SDO shorter than 8 bytes", "CN #584", READ, "an upload request of 4 bytes", "ignore it, or take it; go on",
          sdo.short_request),
     case("CO-027", "NMT reset during an SDO transfer", "7.3.2.2.1", DISRUPT, "reset communication in the middle of an upload",
          "boot-up; the transfer is over", nmt.reset_in_a_transfer),
@@ -96,15 +103,15 @@ CASES: tuple[CanopenCase, ...] = (
          write.store_signature),
     case("CO-032a", "reset node", "7.3.2.2.1", DISRUPT, "NMT 81", "boot-up, PRE-OPERATIONAL", nmt.reset_node),
     case("CO-032b", "reset communication", "7.3.2.2.1", DISRUPT, "NMT 82", "boot-up, PRE-OPERATIONAL", nmt.reset_communication),
-    case("CO-033", "NMT with another length, node > 127", "7.2.8", DISRUPT, "resets of 1 and 3 bytes, and of node id + 128",
+    robust("CO-033", "NMT with another length, node > 127", "7.2.8", DISRUPT, "resets of 1 and 3 bytes, and of node id + 128",
          "ignore them", nmt.odd_commands),
     case("CO-040", "guard requests", "7.2.8", DISRUPT, "two remote frames", "answer, toggle alternating", nmt.guarding),
-    case("CO-041", "1017h changed live", "py #672", WRITE, "1017h = 200 ms", "the new period at once", write.heartbeat_changed,
+    field("CO-041", "1017h changed live", "py #672", WRITE, "1017h = 200 ms", "the new period at once", write.heartbeat_changed,
          OBJECT),
     case("CO-044", "no TPDO outside OPERATIONAL", "7.3.2.2.2", DISRUPT, "NMT enter PRE-OPERATIONAL, a second of listening",
          "no PDO", nmt.silent_outside),
-    case("CO-057", "fastscan with only configured nodes", "py #226", DISRUPT, "the first step of a fastscan", "silence",
+    field("CO-057", "fastscan with only configured nodes", "py #226", DISRUPT, "the first step of a fastscan", "silence",
          nmt.fastscan),
-    case("CO-060", "extended id with a CANopen number", "catalogue", READ, "1000h, asked for with a 29-bit identifier",
+    robust("CO-060", "extended id with a CANopen number", "catalogue", READ, "1000h, asked for with a 29-bit identifier",
          "ignore it", sdo.extended_identifier),
 )  # fmt: skip

@@ -26,13 +26,16 @@ COUNTED = (0x1018, 0x1010, 0x1016, 0x1029)
 
 
 async def toggle_repeated(wire: CanopenWire) -> Finding:
-    """CO-001: the toggle bit stays the same in the second segment."""
+    """CO-001: the toggle bit stays the same in the second segment; afterwards there is no transfer that could go on."""
     await begin_upload(wire, await long_object(wire))
     await wire.ask(b"\x60")
-    wrong = aborted(await wire.ask(b"\x60"), TOGGLE)
-    if wrong:
-        return failed(wrong)
-    return await verdict(wire, aborted(await wire.ask(b"\x70"), UNKNOWN), "aborts, and the transfer is over")
+    repeated = await wire.ask(b"\x60")
+    if wrong := aborted(repeated, TOGGLE):
+        return failed(f"for the repeated toggle: {wrong}")
+    following = await wire.ask(b"\x70")
+    if wrong := aborted(following, UNKNOWN):
+        return await verdict(wire, f"for the repeated toggle: {repeated}; for the next segment: {wrong}")
+    return await verdict(wire, "", f"for the repeated toggle: {repeated}; for the next segment: {following}")
 
 
 async def client_aborts(wire: CanopenWire) -> Finding:
@@ -59,10 +62,16 @@ async def unknown_specifier(wire: CanopenWire) -> Finding:
 
 
 async def begun_anew(wire: CanopenWire) -> Finding:
-    """CO-005: another upload in the middle of one."""
+    """CO-005: another upload starts in the middle of one.
+
+    The server may serve the new upload at once, or abort it and serve the next one: CiA 301 describes neither, and the
+    transfer that was interrupted is over in both cases.
+    """
     await begin_upload(wire, await long_object(wire))
     await wire.ask(b"\x60")
     found = await wire.upload((0x1000, 0))
+    if isinstance(found, Reply) and found.abort:
+        return await verdict(wire, "", f"{found}, then good service")
     if found != wire.device_type:
         said = str(found) if isinstance(found, Reply) else found.hex(" ").upper()
         return failed(f"{said} instead of 1000h")

@@ -48,24 +48,39 @@ async def _unchanged(wire: CanopenWire, key: Key, before: bytes, wrong: str) -> 
 
 
 async def _number(wire: CanopenWire) -> tuple[Key, bytes]:
-    """The first given object that is a number of up to 4 bytes, 1017h if there is no other. Raises `NotHere`."""
+    """Return the first given object that is a number of 1, 2 or 4 bytes; 1017h only if there is no other.
+
+    Raises `NotHere`, which says for each given object why it was not taken.
+    """
+    why_not = []
     for key in sorted(wire.may_write, key=lambda key: key == (0x1017, 0)):
         entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
-        if (entry is not None and entry.type_code in ANY_LENGTH) or key == (0x1017, 0):
+        if entry is not None and entry.type_code in ANY_LENGTH:
+            why_not.append(f"{shown(key)} is text or a domain in the EDS")
             continue
         value = await wire.upload(key)
         if isinstance(value, bytes) and len(value) in (1, 2, 4):
             return key, value
-    raise NotHere("none of the objects given by --write is a number of 1, 2 or 4 bytes")
+        why_not.append(_instead(key, value))
+    raise NotHere(f"needs an object of 1, 2 or 4 bytes by --write: {', '.join(why_not)}")
 
 
 async def _text(wire: CanopenWire) -> tuple[Key, bytes]:
-    """The first given object of more than 14 bytes: three segments. Raises `NotHere`."""
+    """Return the first given object of more than 14 bytes: three segments. Raises `NotHere`, as `_number`."""
+    why_not = []
     for key in wire.may_write:
         value = await wire.upload(key)
         if isinstance(value, bytes) and len(value) > 14:
             return key, value
-    raise NotHere("none of the objects given by --write holds more than 14 bytes")
+        why_not.append(_instead(key, value))
+    raise NotHere(f"needs an object of more than 14 bytes by --write: {', '.join(why_not)}")
+
+
+def _instead(key: Key, value: bytes | Reply) -> str:
+    """Say what a given object is, when a case cannot use it."""
+    if isinstance(value, Reply):
+        return f"{shown(key)} could not be read ({value})"
+    return f"{shown(key)} holds {len(value)} byte{'s' * (len(value) != 1)}"
 
 
 # -- what must refuse -------------------------------------------------------------------------------------------------
@@ -126,8 +141,8 @@ async def _limit(wire: CanopenWire, *, above: bool) -> Finding:
     for key in wire.may_write:
         entry = wire.dictionary.get(*key) if wire.dictionary is not None else None
         bound = None if entry is None else entry.high if above else entry.low
-        if bound is None:
-            continue
+        if not isinstance(bound, int):
+            continue  # no limit, or one of a real type: what lies next beyond it depends on the type's precision
         async with _borrowed(wire, key) as before:
             value, bits = (bound + 1 if above else bound - 1), 8 * len(before)
             least = -(1 << bits - 1) if entry is not None and entry.type_code in SIGNED else 0
@@ -135,7 +150,7 @@ async def _limit(wire: CanopenWire, *, above: bool) -> Finding:
                 continue
             reply = await wire.download(key, (value % (1 << bits)).to_bytes(len(before), "little"))
             return await _unchanged(wire, key, before, aborted(reply, TOO_HIGH if above else TOO_LOW))
-    raise NotHere("none of the objects given by --write has such a limit in the EDS")
+    raise NotHere("no object given by --write has such a limit in the EDS, with values of its type beyond it")
 
 
 async def above_limit(wire: CanopenWire) -> Finding:

@@ -14,7 +14,8 @@ from pathlib import Path
 from fieldtwin.checking.device_case import DeviceResult, Spoken
 from fieldtwin.checking.run import OTHER_WIRE
 from fieldtwin.checking.subject import Subject
-from fieldtwin.conformance.results import summary
+from fieldtwin.conformance.case import Basis
+from fieldtwin.conformance.results import called, summary
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
 from fieldtwin.report.markup import Markup, el
@@ -25,6 +26,11 @@ from gateway.core.connection import Direction
 
 MOST_LINES = 60
 """Of one case's bytes."""
+WEIGHT = {
+    Basis.STANDARD: "required by the standard",
+    Basis.ROBUSTNESS: "robustness: the standard does not require it",
+    Basis.FIELD: "known field problem: the standard does not require it",
+}
 ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Verdict.SKIPPED)
 
 
@@ -36,6 +42,7 @@ def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str
 def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> str:
     """The whole page."""
     bad = [r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE]
+    bad.sort(key=lambda r: not r.deviates)
     body = [_header(subject, results, reproduce)]
     if bad:
         body += [el("h2", "What was found", id="found"), *(_finding(r) for r in bad)]
@@ -51,9 +58,9 @@ def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: st
 
 
 def overall(results: Sequence[DeviceResult]) -> Verdict:
-    """What the whole comes to: failed if anything failed, passed if something passed and nothing failed."""
+    """The verdict of the whole check: failed if a required case failed, passed if some case passed and no required one failed."""
     verdicts = {r.verdict for r in results}
-    if verdicts & {Verdict.FAILED, Verdict.ERROR}:
+    if any(r.deviates or r.verdict is Verdict.ERROR for r in results):
         return Verdict.FAILED
     return Verdict.PASSED if Verdict.PASSED in verdicts else Verdict.INCONCLUSIVE
 
@@ -68,7 +75,7 @@ def _header(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -
         ("reply timeout", f"{subject.timeout_s:g} s"),
         ("fieldtwin", subject.fieldtwin),
     ]
-    counts = Counter(r.verdict for r in results)
+    counts = Counter(_colour(r) for r in results)
     bar = [el("i", cls=v.value, style=f"flex:{counts[v]}") for v in ORDER if counts[v]]
     rows = [[el("dt", name), el("dd", text)] for name, text in facts if text]
     title = el("div", el("h1", f"Conformance of {subject.name}"), el("p", summary(results), cls="small"))
@@ -85,19 +92,32 @@ def _finding(result: DeviceResult) -> Markup:
     case = result.case
     facts = [
         ("source", case.clause),
+        ("weight", WEIGHT[case.weighs]),
         ("danger", case.danger.value),
         ("sent", case.does),
         ("expected", case.must),
         ("found", result.reason),
     ]
-    quiet = "" if result.verdict.bad else " quiet"
+    quiet = "" if result.deviates else " quiet"
     return el(
         "section",
-        el("h3", f"{case.id} {case.title} ", pill(result.verdict)),
+        el("h3", f"{case.id} {case.title} ", _pill(result)),
         el("dl", [[el("dt", name), el("dd", text)] for name, text in facts], cls="facts"),
         wire_table(result.spoken),
         cls=f"failure{quiet}",
     )
+
+
+def _pill(result: DeviceResult) -> Markup:
+    """The verdict; a failure that is no deviation has the colour of an inconclusive case and its own word."""
+    if _colour(result) is result.verdict:
+        return pill(result.verdict)
+    return el("span", f"! {called(result)}", cls=f"pill {_colour(result).value}")
+
+
+def _colour(result: DeviceResult) -> Verdict:
+    """The verdict whose colour the result has: a failure of a case that the standard does not require is never red."""
+    return Verdict.INCONCLUSIVE if result.verdict is Verdict.FAILED and not result.deviates else result.verdict
 
 
 def wire_table(spoken: Sequence[Spoken]) -> Markup:
@@ -121,7 +141,7 @@ def wire_table(spoken: Sequence[Spoken]) -> Markup:
 def _table(results: Sequence[DeviceResult]) -> Markup:
     elsewhere = [r for r in results if r.reason == OTHER_WIRE]
     results = [r for r in results if r.reason != OTHER_WIRE]
-    columns = ("case", "verdict", "danger", "sent", "expected", "source", "found")
+    columns = ("case", "verdict", "basis", "danger", "sent", "expected", "source", "found")
     head = el("tr", [el("th", name) for name in columns])
     table = el("table", el("thead", head), el("tbody", [_row(r) for r in results]))
     ids = ", ".join(r.case.id for r in elsewhere)
@@ -134,7 +154,8 @@ def _row(result: DeviceResult) -> Markup:
     return el(
         "tr",
         el("td", f"{case.id} {case.title}", cls="name", id=case.id),
-        el("td", pill(result.verdict)),
+        el("td", _pill(result)),
+        el("td", case.weighs.value),
         el("td", case.danger.value),
         el("td", case.does),
         el("td", case.must),

@@ -30,15 +30,16 @@ def values_of(answer: Answer | None, function: int, count: int) -> bytes | None:
     return answer.pdu[2:]
 
 
-async def learn(wire: ModbusWire, given: dict[str, int]) -> None:
-    """Fill `good`, `readable` and `refused` of `wire`; `given`: table -> address that the user says can be read.
+async def learn(wire: ModbusWire, given: dict[str, int], writable: dict[str, int] | None = None) -> None:
+    """Fill `good`, `readable` and `refused` of `wire`; `given`: table -> address that the user says can be read,
+    `writable` the same of cells that may be written: these are tried before the usual addresses.
 
     Raises `Unreachable` where nobody answers.
     """
     await wire.reopen()
     refusal: tuple[bytes, bytes] | None = None
     for function in ORDER:
-        refusal = await _table(wire, function, given) or refusal
+        refusal = await _table(wire, function, given, writable or {}) or refusal
     chosen = [f for f in ORDER if f in wire.readable]
     chosen.sort(key=lambda f: TABLE[f] not in given)
     if chosen:
@@ -54,11 +55,14 @@ async def learn(wire: ModbusWire, given: dict[str, int]) -> None:
     await _widen(wire)
 
 
-async def _table(wire: ModbusWire, function: int, given: dict[str, int]) -> tuple[bytes, bytes] | None:
+async def _table(
+    wire: ModbusWire, function: int, given: dict[str, int], writable: dict[str, int]
+) -> tuple[bytes, bytes] | None:
     """Look for a cell of one table. A request that was refused, with its reply, where that is all there is."""
     table, refusal, silent = TABLE[function], None, 0
     counts = (1, 2) if function in (0x03, 0x04) else (1,)  # some have no odd counts (MB-048)
-    for address in [given[table]] if table in given else STARTS:
+    also = [writable[table]] if table in writable else []
+    for address in [given[table]] if table in given else [*also, *STARTS]:
         for count in counts:
             pdu = read_of(function, address, count)
             answer = (await wire.ask(pdu)).first

@@ -93,7 +93,7 @@ async def check_modbus(
                 raise NotAllowed(
                     "somebody else talks on this line", got=str(heard)[:60], hint="--share-bus checks all the same"
                 )
-        await learn(wire, options.given)
+        await learn(wire, options.given, {table: at for table, (at, _) in options.may_write.items()})
         say(f"the usual request is {wire.good.hex(' ').upper()}, its answer {wire.good_reply.hex(' ').upper()}")
         identity = await read_identity(wire)
         before = transcript.spoken

@@ -98,6 +98,30 @@ async def registers_mismatch(wire: ModbusWire) -> Finding:
         return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
 
 
+async def _length_mismatch(wire: ModbusWire, byte_count: int, more: bytes) -> Finding:
+    """FC 16 of one register with a byte count that contradicts the length of the request (AP 7, exception 03)."""
+    async with _borrowed(wire, "holding") as (address, before):
+        pdu = b"\x10" + address.to_bytes(2) + bytes((0, 1, byte_count)) + _other(before) + more
+        return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
+
+
+async def count_below_length(wire: ModbusWire) -> Finding:
+    """MB-040: FC 16, one register, byte count 2, four bytes of data."""
+    return await _length_mismatch(wire, 2, b"\0\0")
+
+
+async def count_above_length(wire: ModbusWire) -> Finding:
+    """MB-040: FC 16, one register, byte count 4, two bytes of data."""
+    return await _length_mismatch(wire, 4, b"")
+
+
+async def count_of_none(wire: ModbusWire) -> Finding:
+    """MB-040: FC 16, no register, byte count 0, two bytes of data, as libmodbus's unit-test-client sends it."""
+    async with _borrowed(wire, "holding") as (address, before):
+        pdu = b"\x10" + address.to_bytes(2) + b"\0\0\0" + _other(before)
+        return await _unchanged(wire, "holding", address, before, await must_refuse(wire, pdu, 0x03))
+
+
 async def coils_mismatch(wire: ModbusWire) -> Finding:
     """MB-040: FC 15, one coil, byte count 2."""
     async with _borrowed(wire, "coil") as (address, before):

@@ -8,13 +8,15 @@ from typing import Any
 
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.subject import Subject
-from fieldtwin.conformance.results import summary
-from fieldtwin.report.model import CheckResult, Report, ScenarioResult
+from fieldtwin.conformance.case import Basis
+from fieldtwin.conformance.results import ONLY_REQUIRED, called, counts_as_failed, summary
+from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
 from gateway.core.clock import NS_PER_MS
 from gateway.core.connection import Direction
 
 KIND = "fieldtwin check"
-VERSION = 1
+VERSION = 2
+"""2: each case has its `basis`, and `findings` counts the failures of each basis."""
 
 
 def as_json(subject: Subject, results: Sequence[DeviceResult]) -> dict[str, Any]:
@@ -24,6 +26,7 @@ def as_json(subject: Subject, results: Sequence[DeviceResult]) -> dict[str, Any]
         "version": VERSION,
         "about": subject.as_json(),
         "counts": dict(Counter(r.verdict.value for r in results)),
+        "findings": {basis.value: sum(r.verdict.bad and r.case.weighs is basis for r in results) for basis in Basis},
         "cases": [_case(r) for r in results],
     }
 
@@ -34,6 +37,7 @@ def _case(result: DeviceResult) -> dict[str, Any]:
         "id": case.id,
         "title": case.title,
         "clause": case.clause,
+        "basis": case.weighs.value,
         "role": case.role,
         "danger": case.danger.value,
         "sent": case.does,
@@ -53,17 +57,25 @@ def _case(result: DeviceResult) -> dict[str, Any]:
     }
 
 
-def as_report(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> Report:
-    """For JUnit: a scenario a case, its bytes in the output."""
+def as_report(
+    subject: Subject, results: Sequence[DeviceResult], reproduce: str, fail_on: frozenset[Basis] = ONLY_REQUIRED
+) -> Report:
+    """For JUnit: a scenario for each case, with its bytes in the output.
+
+    A failure that does not decide the exit code is reported as skipped, with its kind in front of the reason. So a build and its
+    test report agree.
+    """
     scenarios = []
     for r in results:
+        kept = not r.verdict.bad or counts_as_failed(r, fail_on)
+        verdict, reason = (r.verdict, r.reason) if kept else (Verdict.SKIPPED, f"{called(r)} finding: {r.reason}")
         said = "; ".join(f"{'>' if s.direction is Direction.SENT else '<'} {s.text}" for s in r.spoken)
-        check = CheckResult("1", f"{r.case.does}: {r.case.must}", r.verdict, expected=r.case.must, got=r.reason)
-        wire = [CheckResult("wire", said, r.verdict)] if said else []
+        check = CheckResult("1", f"{r.case.does}: {r.case.must}", verdict, expected=r.case.must, got=reason)
+        wire = [CheckResult("wire", said, verdict)] if said else []
         scenarios.append(
             ScenarioResult(
-                f"{r.case.id} {r.case.title}", r.verdict, [check, *wire], requirements=(r.case.row,), target=subject.name,
-                reason=r.reason, reproduce=f"{reproduce} --only {r.case.id}", took_s=r.took_s,
+                f"{r.case.id} {r.case.title}", verdict, [check, *wire], requirements=(r.case.row,), target=subject.name,
+                reason=reason, reproduce=f"{reproduce} --only {r.case.id}", took_s=r.took_s,
                 case=r.case.id, role=r.case.role, danger=r.case.danger.value,
             )
         )  # fmt: skip

@@ -40,6 +40,7 @@ ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
 @click.option("--broadcast", is_flag=True, help="Pass unit 0 on to the line; nobody answers.")
 @click.option("--answer-broadcast", is_flag=True, help="The same, and tell the client that it went out.")
 @click.option("--pause", "pause_s", type=Duration(), default="0", help="Between one exchange and the next on TARGET.")
+@click.option("--echo", is_flag=True, help="Serial TARGET: the adapter returns what is sent (RS-485).")
 @click.option("--idle", "idle_s", type=Duration(), default="0", help="Close clients that were silent for so long.")
 @click.option(
     "--role", "roles", multiple=True, metavar="ROLE", help="tls: only clients whose certificate says so. Repeatable."
@@ -60,6 +61,7 @@ def command(
     broadcast: bool,
     answer_broadcast: bool,
     pause_s: float,
+    echo: bool,
     idle_s: float,
     roles: tuple[str, ...],
     instance: str,
@@ -92,6 +94,7 @@ def command(
         broadcast=broadcast,
         answer_broadcast=answer_broadcast,
         pause_s=pause_s,
+        echo=echo,
         idle_s=idle_s,
         roles=frozenset(roles) or None,
         instance=instance,

@@ -26,6 +26,11 @@ from gateway.core.endpoint import Endpoint
     help="Where nodes join; port 0 takes a free one.",
 )
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), default=125_000, show_default=True, help="bit/s")
+@click.option(
+    "--data-bitrate",
+    type=click.IntRange(10_000, 8_000_000),
+    help="bit/s of the data phase of CAN FD frames with the bit-rate switch; default: as --bitrate.",
+)
 @click.option("--unpaced", is_flag=True, help="Deliver frames at once instead of at the bit rate.")
 @click.option("--slcan", metavar="HOST:PORT", help="A second port for programs that speak slcan (LAWICEL).")
 @click.option(
@@ -34,7 +39,15 @@ from gateway.core.endpoint import Endpoint
 @click.option(
     "--strict-ack", is_flag=True, help="Only other nodes acknowledge: one that is alone becomes error-passive."
 )
-def command(listen: str, bitrate: int, unpaced: bool, slcan: str | None, bridge: str | None, strict_ack: bool) -> int:
+def command(
+    listen: str,
+    bitrate: int,
+    data_bitrate: int | None,
+    unpaced: bool,
+    slcan: str | None,
+    bridge: str | None,
+    strict_ack: bool,
+) -> int:
     """Run a CAN bus where the kernel has none.
 
     Frames take their exact time on the modelled bus and arbitrate by identifier. Any python-can program joins with
@@ -44,23 +57,24 @@ def command(listen: str, bitrate: int, unpaced: bool, slcan: str | None, bridge:
     endpoint = Endpoint.parse(f"can:fieldtwin/{listen}")
     ascii_port = Endpoint.parse(f"tcp://{slcan}") if slcan else None
     kernel = Endpoint.parse(f"can:socketcan/{bridge}") if bridge else None
-    return asyncio.run(_run(endpoint, bitrate, ascii_port, kernel, paced=not unpaced, monitored=not strict_ack))
+    rates = (bitrate, data_bitrate or 0)
+    return asyncio.run(_run(endpoint, rates, ascii_port, kernel, paced=not unpaced, monitored=not strict_ack))
 
 
 async def _run(
     endpoint: Endpoint,
-    bitrate: int,
+    rates: tuple[int, int],
     slcan: Endpoint | None,
     kernel: Endpoint | None,
     *,
     paced: bool,
     monitored: bool,
 ) -> int:
-    stop = asyncio.Event()
+    stop, (bitrate, data_bitrate) = asyncio.Event(), rates
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     async with AsyncExitStack() as closing:
-        bus = await SoftBusServer.open(endpoint, bitrate, paced=paced, monitored=monitored)
+        bus = await SoftBusServer.open(endpoint, bitrate, paced=paced, monitored=monitored, data_bitrate=data_bitrate)
         closing.push_async_callback(bus.aclose)
         bridge = await _bridge(bus, kernel, bitrate) if kernel else None
         if bridge:

@@ -7,6 +7,8 @@ import re
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +17,7 @@ import click
 
 from fieldtwin.cli.check_cases import only_of
 from fieldtwin.cli.check_device_command import canopen, modbus
-from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from fieldtwin.conformance.case import Case
     from fieldtwin.conformance.results import CaseResult
 
+FILE = click.Path(dir_okay=False, path_type=Path)
 DANGERS = ("observe", "read", "write", "disrupt")
 _HELD = re.compile(r"^(holding|input|coil|discrete):(\d{1,5})$")
 _OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$")
@@ -56,6 +59,10 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
         click.option("--junit", type=click.Path(dir_okay=False, path_type=Path), help="Write the verdicts as JUnit XML."),
+        junit_flavour_option,
+        click.option("--html", type=FILE, help="Write a report with every frame."),
+        click.option("-o", "--out", type=FILE, help="Write the JSON to a file."),
+        click.option("--log", "log_path", type=FILE, help="Append all that is sent and heard, as JSON lines."),
         click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
         json_option,
     ]  # fmt: skip
@@ -67,7 +74,8 @@ def _seen(what: str, timeout: str) -> Callable[[Callable[..., Any]], Callable[..
     options = [
         click.option(
             "--probe", default="", metavar="WHERE",
-            help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], or output.",
+            help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], output (numbers that the program prints), or "
+            "output:TEXT (what it prints after TEXT).",
         ),
         click.option(
             "--timeout", "timeout_s", type=Duration(), default="0", help=f"The master's {timeout}, where you know it."
@@ -118,6 +126,10 @@ def modbus_master(
     patience_s: float,
     waivers_path: Path | None,
     junit: Path | None,
+    junit_flavour: str,
+    html: Path | None,
+    out: Path | None,
+    log_path: Path | None,
     list_only: bool,
     as_json: bool,
     argv: tuple[str, ...],
@@ -152,7 +164,7 @@ def modbus_master(
         Listener,
         cases,
         waivers_path,
-        junit,
+        Files(junit, junit_flavour, html, out, log_path),
         as_json,
         listen,
         plan.only,
@@ -196,6 +208,10 @@ def canopen_master(
     patience_s: float,
     waivers_path: Path | None,
     junit: Path | None,
+    junit_flavour: str,
+    html: Path | None,
+    out: Path | None,
+    log_path: Path | None,
     list_only: bool,
     as_json: bool,
     argv: tuple[str, ...],
@@ -229,7 +245,7 @@ def canopen_master(
         Listener,
         cases,
         waivers_path,
-        junit,
+        Files(junit, junit_flavour, html, out, log_path),
         as_json,
         listen,
         plan.only,
@@ -246,40 +262,67 @@ def _objects(texts: tuple[str, ...]) -> dict[tuple[int, int], bytes]:
     return held
 
 
+@dataclass(frozen=True)
+class Files:
+    """What is written besides the table."""
+
+    junit: Path | None
+    junit_flavour: str
+    html: Path | None
+    out: Path | None
+    log: Path | None
+
+
 def _judged(
     judge: Callable[..., Any],
     listener_type: Callable[..., Any],
     cases: list[Case],
     waivers_path: Path | None,
-    junit: Path | None,
+    files: Files,
     as_json: bool,
     title: str,
     only: frozenset[str],
 ) -> int:
-    """Run it, show what was found, write the file. The exit code."""
+    """Run it, show what was found, write the files. The exit code."""
+    from fieldtwin.checking.master_log import MasterLog
     from fieldtwin.cli.check_view import Progress, print_results
     from fieldtwin.conformance.results import as_json as data_of
-    from fieldtwin.conformance.results import as_report, exit_code, waive
+    from fieldtwin.conformance.results import exit_code, waive
     from fieldtwin.conformance.waivers import Waivers, load_waivers
     from gateway.wallclock import run
 
+    argv = sys.argv[1:]
     known = {case.id for case in cases} | {case.row for case in cases}
     waivers = load_waivers(waivers_path, known) if waivers_path else Waivers()
     started = datetime.now(UTC)
-    with Progress(sum(case.chosen(only) for case in cases)) as progress:
-        found: list[CaseResult] = run(judge(listener_type(progress.say, progress.tell)))
+    with ExitStack() as stack:
+        log = stack.enter_context(MasterLog(files.log, title, shlex.join(["fieldtwin", *argv]))) if files.log else None
+        progress = stack.enter_context(Progress(sum(case.chosen(only) for case in cases)))
+        listener = listener_type(progress.say, progress.tell, *([log.on_event] if log is not None else []))
+        found: list[CaseResult] = run(judge(listener))
     results = [waive(result, waivers, started.date()) for result in found]
-    if junit is not None:
-        from fieldtwin.report.junit import write_junit
-
-        again = "fieldtwin " + shlex.join(sys.argv[1:])
-        write_junit(as_report(results, f"master on {title}", again, started.isoformat(timespec="seconds")), junit)
+    document = json.dumps(data_of(results, argv), indent=2) + "\n"
+    _write(files, results, document, f"master on {title}", started)
     if as_json:
-        json.dump(data_of(results), sys.stdout, indent=2)
-        sys.stdout.write("\n")
+        sys.stdout.write(document)
     else:
         print_results(results)
     return exit_code(results)
+
+
+def _write(files: Files, results: list[CaseResult], document: str, title: str, started: datetime) -> None:
+    from fieldtwin.checking.master_html import write_master_html
+    from fieldtwin.conformance.results import as_report
+    from fieldtwin.report.file import put
+    from fieldtwin.report.junit import Flavour, write_junit
+
+    argv, began = sys.argv[1:], started.isoformat(timespec="seconds")
+    if files.junit is not None:
+        write_junit(as_report(results, title, argv, began), files.junit, Flavour(files.junit_flavour))
+    if files.html is not None:
+        write_master_html(results, title, argv, began, files.html)
+    if files.out is not None:
+        put(files.out, document)
 
 
 def _list(cases: list[Case], as_json: bool) -> int:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from fieldtwin.cli.options import Duration, json_option
+from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
 from gateway.core.errors import NotAllowed, UsageError
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ MEANS = {
         "disrupt": "NMT, guarding, LSS, unknown commands: the node is stopped and restarted",
     },
 }
+FAIL_ON = {"standard": 1, "robustness": 2, "field": 3}
+"""How many of the bases, in the order of `Basis`, decide the exit code."""
 FILE = click.Path(dir_okay=False, path_type=Path)
 INTERRUPTED = 130
 F = TypeVar("F", bound=Callable[..., Any])
@@ -55,9 +57,15 @@ def shared(function: F) -> F:
                      help="Requests a second, at most."),
         click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time."),
         click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
+        click.option(
+            "--fail-on", type=click.Choice(tuple(FAIL_ON)), default="standard", show_default=True,
+            help="Which failed cases give exit code 1: those that the standard requires, also those of robustness, or also known "
+                 "field problems.",
+        ),
         click.option("--by", help="Who checks; stands in the reports.  [default: the name you are logged in by]"),
         click.option("--html", type=FILE, help="Write a report with every byte."),
         click.option("--junit", type=FILE, help="Write the verdicts as JUnit XML."),
+        junit_flavour_option,
         click.option("-o", "--out", type=FILE, help="Write the JSON to a file, for `fieldtwin report`."),
         click.option("--log", "log_path", type=FILE, help="Append all that is sent and heard, as JSON lines."),
         click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
@@ -117,17 +125,20 @@ class Check:
         from fieldtwin.checking.run import OTHER_WIRE
         from fieldtwin.cli.check_view import print_results
         from fieldtwin.cli.talk import talk
+        from fieldtwin.conformance.case import Basis
         from fieldtwin.conformance.results import exit_code, waive
 
+        fail_on = frozenset(list(Basis)[: FAIL_ON[self.options["fail_on"]]])
         today = datetime.fromisoformat(subject.started).date()
         results: list[DeviceResult] = [waive(result, self.waivers, today) for result in checked.results]  # type: ignore[misc]
         document = as_json(subject, results)
         if self.options["out"] is not None:
             _write(self.options["out"], json.dumps(document, indent=2) + "\n")
         if self.options["junit"] is not None:
-            from fieldtwin.report.junit import write_junit
+            from fieldtwin.report.junit import Flavour, write_junit
 
-            write_junit(as_report(subject, results, self.words), self.options["junit"])
+            flavour = Flavour(self.options["junit_flavour"])
+            write_junit(as_report(subject, results, self.words, fail_on), self.options["junit"], flavour)
         if self.options["html"] is not None:
             from fieldtwin.checking.html import write_html
 
@@ -140,7 +151,12 @@ class Check:
             print_results([r for r in results if r not in elsewhere], "what is asked")
             if elsewhere:
                 talk.print(f"{len(elsewhere)} more cases are for other wires", markup=False)
-        return INTERRUPTED if self.interrupted else exit_code(results)
+            if any(r.verdict.bad and r.case.weighs not in fail_on for r in results):
+                talk.print(
+                    "The standard does not require what robustness and field problem cases ask. "
+                    "The exit code does not count them: see --fail-on.", markup=False, soft_wrap=True,
+                )  # fmt: skip
+        return INTERRUPTED if self.interrupted else exit_code(results, fail_on)
 
     def play(self, most: int, check: Callable[..., Any]) -> Checked:
         """Run ``check(taps, go_on, say, tell)`` with a bar, and with a log where one is wanted.
@@ -217,7 +233,8 @@ def list_cases(cases: Sequence[DeviceCase[Any]], as_json: bool) -> int:
     if as_json:
         keys = ("id", "title", "clause", "does", "must")
         listed = [
-            {k: getattr(c, k) for k in keys} | {"danger": c.danger.value, "wires": c.wires, "needs": c.needs}
+            {k: getattr(c, k) for k in keys}
+            | {"basis": c.basis.value, "danger": c.danger.value, "wires": c.wires, "needs": c.needs}
             for c in cases
         ]
         json.dump(listed, sys.stdout, indent=2)

@@ -15,7 +15,7 @@ from fieldtwin.cli.options import Duration
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 
-_CELL = re.compile(r"^(holding|coil|input|discrete):(\d{1,5})(?:\+(\d{1,3}))?$")
+_CELL = re.compile(r"^(holding|coil|input|discrete):(0[xX][0-9A-Fa-f]{1,4}|\d{1,5})(?:\+(\d{1,3}))?$")
 _OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
 
 
@@ -24,11 +24,11 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")
 @click.option("--unit", type=click.IntRange(0, 255), default=1, show_default=True, help="The unit id.")
 @click.option(
     "--read", "reads", multiple=True, metavar="TABLE:ADDRESS",
-    help="A cell that can be read, such as holding:100, where none is near 0, 1, 100, 1000 or 40000; repeatable.",
+    help="A cell that can be read, such as holding:100 or holding:0x163, if none is near 0, 1, 100, 1000, 40000; repeatable.",
 )  # fmt: skip
 @click.option(
     "--write", "writes", multiple=True, metavar="TABLE:ADDRESS[+COUNT]",
-    help="A cell that may be written, holding or coil; what was there is put back. Repeatable.",
+    help="A cell that may be written, holding or coil, also in hexadecimal; what was there is put back. Repeatable.",
 )  # fmt: skip
 @click.option("--timeout", "timeout_s", type=Duration(), default="1s", show_default=True, help="For each reply.")
 @click.option("--echo", is_flag=True, help="The adapter hears what it sends.")
@@ -161,8 +161,11 @@ def _object(text: str) -> tuple[int, int]:
 
 def _cell(text: str) -> tuple[str, int, int]:
     match = _CELL.match(text)
-    if not match or int(match[2]) > 0xFFFF or int(match[2]) + int(match[3] or 1) > 0x10000 or match[3] == "0":
+    address = -1 if not match else int(match[2], 16 if match[2][:2].lower() == "0x" else 10)
+    if not match or address > 0xFFFF or address + int(match[3] or 1) > 0x10000 or match[3] == "0":
         raise UsageError(
-            "a cell", expected="such as holding:100 or coil:5, with +COUNT behind it if need be", got=repr(text)
+            "a cell",
+            expected="such as holding:100, holding:0x163 or coil:5, with +COUNT after it if need be",
+            got=repr(text),
         )
-    return match[1], int(match[2]), int(match[3] or 1)
+    return match[1], address, int(match[3] or 1)

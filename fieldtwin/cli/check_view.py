@@ -17,6 +17,8 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from fieldtwin.cli.talk import data, talk
+from fieldtwin.conformance.case import Basis
+from fieldtwin.conformance.results import FOUND, called
 from fieldtwin.report.model import Verdict
 from gateway.core.connection import Direction
 
@@ -30,6 +32,8 @@ STYLE = {
     Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.ERROR: "bold red",
     Verdict.INCONCLUSIVE: "yellow", Verdict.SKIPPED: "dim",
 }  # fmt: skip
+FINDING = {Basis.ROBUSTNESS: "yellow", Basis.FIELD: "magenta"}
+"""Colours of failures that are no deviation from the standard: never red."""
 MARK = {
     Verdict.PASSED: "✓", Verdict.FAILED: "✗", Verdict.ERROR: "!", Verdict.INCONCLUSIVE: "?", Verdict.SKIPPED: "-",
 }  # fmt: skip
@@ -61,9 +65,16 @@ class Progress:
         """A case is done."""
         self._bar.update(self._task, advance=1, description=f"{result.case.id} {result.verdict.value}")
         if result.verdict.bad:
+            mark = f"[{style_of(result)}]{MARK[result.verdict] if result.deviates else '!'}[/]"
+            kind = "" if result.deviates else f" ({called(result)})"
             talk.print(
-                f"[bold red]✗[/] {result.case.id} {escape(result.case.title)}: {escape(result.reason)}", soft_wrap=True
+                f"{mark} {result.case.id} {escape(result.case.title)}{kind}: {escape(result.reason)}", soft_wrap=True
             )
+
+
+def style_of(result: CaseResult) -> str:
+    """The colour of a result: red only for a deviation from the standard."""
+    return FINDING.get(result.case.weighs, STYLE[result.verdict]) if result.verdict.bad else STYLE[result.verdict]
 
 
 def print_results(results: Sequence[CaseResult], does: str = "the device") -> None:
@@ -71,7 +82,7 @@ def print_results(results: Sequence[CaseResult], does: str = "the device") -> No
     if not data.is_terminal:
         for r in results:
             reason = f": {r.reason}" if r.reason else ""
-            line = f"{r.verdict.value:<12} {r.case.id:<7} {r.case.danger.value:<8} {r.case.title}{reason}"
+            line = f"{called(r):<13} {r.case.id:<7} {r.case.danger.value:<8} {r.case.title}{reason}"
             data.print(line, markup=False, soft_wrap=True)
     else:
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
@@ -81,15 +92,20 @@ def print_results(results: Sequence[CaseResult], does: str = "the device") -> No
         table.add_column(does, ratio=2)
         table.add_column("what was found", ratio=3)
         for r in results:
-            style, danger = STYLE[r.verdict], r.case.danger.value
+            style, danger = style_of(r), r.case.danger.value
             found = r.reason or r.verdict.value
+            mark = MARK[r.verdict]
+            if r.verdict.bad and not r.deviates:
+                found, mark = f"{called(r)}: {found}", "!"
             table.add_row(
-                f"[{style}]{MARK[r.verdict]}[/]", f"[{style}]{r.case.id}[/]", f"[{DANGER[danger]}]{danger}[/]",
+                f"[{style}]{mark}[/]", f"[{style}]{r.case.id}[/]", f"[{DANGER[danger]}]{danger}[/]",
                 escape(r.case.title), f"[{style}]{escape(found)}[/]",
             )  # fmt: skip
         data.print(table)
-    counts = Counter(r.verdict for r in results)
-    parts = [f"[{STYLE[v]}]{counts[v]} {v.value}[/]" for v in STYLE if counts[v]]
+    styles = {called(r): style_of(r) for r in results}
+    counts = Counter(called(r) for r in results)
+    order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
+    parts = [f"[{styles[word]}]{counts[word]} {word}[/]" for word in order if counts[word]]
     data.print(", ".join(parts) or "no case was chosen")
 
 

@@ -34,6 +34,8 @@ from gateway.wallclock import run as run_precise
 from twin.data_files import find
 
 SHOWN = 20
+INCONCLUSIVE = 4
+"""Nothing that could be compared differs, but not everything could be compared."""
 
 
 @click.command("compare")
@@ -86,7 +88,7 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
     fieldtwin compare drive.log can:socketcan/can0 --node 5 --listen 10s
 
     Prints fidelity: the share of exchanges that are alike (values), and how near the latencies are (timing). Exit code 1
-    when it is not met. A device is only read, unless --writes.
+    when it is not met, 4 when too much could not be compared. A device is only read, unless --writes.
     """
     rules = Rules(*_tolerances(options["tolerances"]), _latency(options["latency"]), options["least"] / 100)
     live = other.partition(":")[0].lower() in SCHEMES and not Path(other).is_file()
@@ -100,13 +102,15 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
         result = _live(recording, other, rules, options) if live else _files(recording, Path(other), rules, options)
     if as_json:
         json.dump(
-            _headed(recording, other, live, options) | asdict(result) | {"values": result.values, "met": result.met},
+            _headed(recording, other, live, options)
+            | asdict(result)
+            | {"values": result.values, "met": result.met, "inconclusive": result.inconclusive},
             sys.stdout,
         )
         sys.stdout.write("\n")
     else:
         _show(result, recording, other, everything)
-    return 0 if result.met else 1
+    return 0 if result.met else INCONCLUSIVE if result.inconclusive else 1
 
 
 def _headed(recording: Path, other: str, live: bool, options: dict[str, Any]) -> dict[str, Any]:
@@ -327,6 +331,28 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
         data.print(f"{result.extra} more there, of which the recording says nothing", soft_wrap=True)
     if result.left_out:
         data.print(f"{result.left_out} left out: they may change the device, or cannot be asked", soft_wrap=True)
+    if result.left_out_writes and result.by_kind:
+        data.print(
+            f"{result.after_left_out} of the differences are in what {result.left_out_writes} left-out writes had set; "
+            "others may follow from these writes: --writes makes them again", soft_wrap=True,
+        )  # fmt: skip
+    _show_shifts(result)
     timing = "not known" if result.timing is None else f"{100 * result.timing:.1f} %"
-    verdict = "met" if result.met else "NOT met"
+    verdict = "met" if result.met else "INCONCLUSIVE" if result.inconclusive else "NOT met"
     data.print(f"fidelity: values {100 * result.values:.1f} %, timing {timing}: {verdict}", soft_wrap=True)
+
+
+def _show_shifts(result: Comparison) -> None:
+    """Where the dialogue continued the recorded one, and what the recording has nothing about."""
+    for shift in result.shifts[:SHOWN]:
+        data.print(
+            f"unit {shift.unit}, {shift.where}: was read before, continues at value {shift.at + 1} of {shift.recorded} recorded",
+            soft_wrap=True, markup=False,
+        )  # fmt: skip
+    if len(result.shifts) > SHOWN:
+        data.print(f"and {len(result.shifts) - SHOWN} more registers or bits", soft_wrap=True)
+    if result.not_compared:
+        data.print(
+            f"{result.not_compared} not compared: the recording has no values after that position. "
+            "Restart the emulator to compare everything", soft_wrap=True,
+        )  # fmt: skip

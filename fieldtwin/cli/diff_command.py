@@ -69,7 +69,7 @@ def command(
         click.echo(json.dumps(head | asdict(found)))
     else:
         _show(found, left.name, Path(right).name)
-    return DIFFERENT if found.found else 0
+    return DIFFERENT if found.found or not found.compared else 0  # of nothing compared, nothing is known
 
 
 def _against(one: Dump, right: str, folders: list[Path], leave: Leave) -> Differences:
@@ -141,4 +141,5 @@ def _show(found: Differences, left: str, right: str) -> None:
         data.print(table)
     for note in found.notes:
         talk.print(Text(note), soft_wrap=True)
-    talk.print(f"{found.compared} compared, {len(found.found)} different")
+    nothing = "" if found.compared else ": nothing in these two can be compared"
+    talk.print(f"{found.compared} compared, {len(found.found)} different{nothing}")

@@ -12,15 +12,15 @@ import click
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldtwin.cli.device_options import device_options, target_from, words
-from fieldtwin.cli.dump_view import estimate_text, notes, profile_gaps, summary
+from fieldtwin.cli.dump_view import estimate_text, notes, profile_gaps, summary, unknown_text
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.talk import data, talk
-from fieldtwin.commissioning.dump import Job
+from fieldtwin.commissioning.dump import DEFAULT_BUDGET_S, Job
 from fieldtwin.commissioning.dump import Progress as Told
 from fieldtwin.commissioning.dump_file import Dump, load_dump
 from fieldtwin.commissioning.dump_profile import dumped_tags
 from fieldtwin.commissioning.dumping import dump, estimate, frames, log_path, object_ranges, register_spans
-from gateway.core.errors import UsageError
+from gateway.core.errors import Unreachable, UsageError
 from gateway.wallclock import run as run_precise
 
 
@@ -40,6 +40,10 @@ from gateway.wallclock import run as run_precise
     "--rate", type=click.FloatRange(0, 1000), default=50, show_default=True, help="Requests a second; 0: any."
 )
 @click.option("--thorough", is_flag=True, help="Ask every address; else in a void every eighth, and round numbers.")
+@click.option(
+    "--budget", "budget_s", type=Duration(), default=f"{DEFAULT_BUDGET_S / 60:g}m", show_default=True,
+    help="Time for each table to look where nothing was read: beyond silence, and with other read lengths.",
+)  # fmt: skip
 @click.option("--longest", type=click.IntRange(1, 2000), help="Values in a read; default: as many as the device takes.")
 @click.option("--pairs", is_flag=True, help="The device knows pairs of registers only.")
 @click.option("--retries", type=click.IntRange(0, 10), default=2, show_default=True, help="After no good reply.")
@@ -55,6 +59,7 @@ def command(
     every_s: float,
     rate: float,
     thorough: bool,
+    budget_s: float,
     longest: int | None,
     pairs: bool,
     retries: int,
@@ -67,17 +72,19 @@ def command(
     """Dump the device at ENDPOINT: values, holes, longest read, latency, functions. It only reads.
 
     RANGEs are holding, holding:0..999 or 40001..40100, and 6000..6FFF on a CAN bus; without any, what the profile or EDS names,
-    else everything. All that is sent is logged beside the dump.
+    else everything. All that is sent is logged in a file next to the dump. Exit code 4 if most of the ranges is still unknown at
+    the end: no reply, no valid reply, or not asked.
 
     \b
     fieldtwin dump tcp://192.168.0.7 -o meter.jsonl
-    fieldtwin dump rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1 holding:0..999 --passes 20 --every 15s
+    fieldtwin dump 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' holding:0..999 --passes 20 --every 15s
     fieldtwin dump can:socketcan/can0 --node 5 --eds drive.eds
     """
     target = target_from(endpoint, options)
     if log is not None:
-        raise UsageError("a dump's log stands beside it", got="--log")
+        raise UsageError("a dump always writes its log next to itself", got="--log")
     modbus = target.protocol == "modbus"
+    spacing_s = 1 / rate if rate else 0.0
     job = Job(
         target,
         spans=register_spans(ranges) if modbus else (),
@@ -88,13 +95,14 @@ def command(
         passes=passes,
         every_s=every_s,
         functions=not no_functions,
+        budget_s=budget_s,
+        spacing_s=spacing_s,
     )
     if dry_run:
         for frame in frames(job):
             click.echo(frame)
         return 0
     out = out or Path(f"dump-{target.address}.jsonl")
-    spacing_s = 1 / rate if rate else 0.0
     talk.print(estimate_text(estimate(job, spacing_s), passes, rate), soft_wrap=True)
     _tell_what_is_left_out(job)
     try:
@@ -108,10 +116,13 @@ def command(
     found = load_dump(out)
     if as_json:
         click.echo(json.dumps(_described(found, out)))
-        return 0
-    for part in summary(found):
-        data.print(part)
-    talk.print(f"{out}, and what was sent in {log_path(out)}", soft_wrap=True)
+    else:
+        for part in summary(found):
+            data.print(part)
+        talk.print(f"{out}, and what was sent in {log_path(out)}", soft_wrap=True)
+    if found.is_mostly_unknown:
+        talk.print(unknown_text(found), soft_wrap=True)
+        return Unreachable.exit_code
     return 0
 
 
@@ -129,6 +140,8 @@ def _described(found: Dump, out: Path) -> dict[str, Any]:
         "passes": len(found.passes),
         "values": len(found.passes[-1].cells),
         "maps": list(found.maps.values()),
+        "unknown": dict(zip(("addresses", "of"), found.unknown, strict=True)),
+        "mostly_unknown": found.is_mostly_unknown,
         "functions": list(found.functions.values()),
         "latency": found.latency,
         "gaps": profile_gaps(found),

@@ -21,8 +21,9 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
     """List the faults, or say all of NAMES: of `exception` and `sdo-abort` the codes that the standards know as well.
 
     A fault file is `faults: [{name: silence, device: ctd, from: 5s, until: 12s}]`, for `fieldtwin run --prototype --faults
-    FILE` and `fieldtwin link --faults FILE`. What every fault takes: id, bus or device, unit, function, address or register,
-    cob_id, direction (request, reply, both), nth, every, from, until, probability.
+    FILE`, `fieldtwin emulate DEVICE --faults FILE` and `fieldtwin link --faults FILE`. What every fault takes: id, bus or
+    device, unit, function, address or register, registers, cob_id, direction (request, reply, both), nth, every,
+    from, until, probability.
     """
     from emulators.faults.registry import FAULTS, fault_class
 
@@ -73,8 +74,10 @@ def _code(code: int) -> str:
     return f"0x{code:08X}" if code > 0xFF else str(code)
 
 
-def _number(value: float | str) -> str:
+def _number(value: float | str | None) -> str:
     """Codes, which are large, as everybody writes them."""
+    if value is None:
+        return "by the tag's type"
     if isinstance(value, str | bool):
         return json.dumps(value)
     return f"0x{value:X}" if isinstance(value, int) and value >= 0x1000 else f"{value:g}"

@@ -39,7 +39,14 @@ UNREACHABLE = 4
 @click.option("--unit", type=click.IntRange(0, 255), help="Modbus unit id; default 1.")
 @click.option("--node", type=click.IntRange(1, 127), help="CANopen node id; default 1.")
 @click.option("--bitrate", type=click.IntRange(10_000, 1_000_000), help="CAN: bit/s; default: the bus's.")
-@click.option("--timeout", "timeout_s", type=Duration(), default="500ms", show_default=True, help="For each reply.")
+@click.option(
+    "--timeout",
+    "timeout_s",
+    type=Duration(),
+    default="1s",
+    show_default=True,
+    help="For each reply. Some devices take longer than 500 ms to refuse a request.",
+)
 @click.option("--rate", "per_s", type=click.FloatRange(0.1, 1000), default=20.0, help="Requests a second, at most.")
 @click.option("--echo", is_flag=True, help="Serial: what we send comes back first.")
 @click.option("--dry-run", is_flag=True, help="Print the first frames that would be sent, and open nothing.")
@@ -244,4 +251,5 @@ def _json(result: ModbusIdentity | CanIdentity) -> dict[str, Any]:
         "hardware": told.hardware,
         "software": told.software,
         "silence": told.silence,
+        "conflict": result.conflict,
     }

@@ -15,11 +15,11 @@ from emulators.can_link import CanLink
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.endpoints.can_end import open_can_end
 from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active
 from emulators.faults.frames import Framing, Way
 from emulators.faults.on_link import check_can_link, check_link, wire_faults
 from emulators.faults.schema import FaultSpec, load_faults
 from emulators.link import run_link
+from fieldtwin.cli.struck import struck
 from fieldtwin.cli.talk import talk
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CanConnection
@@ -103,16 +103,8 @@ async def _run(
             task.cancel()
             await asyncio.gather(task, return_exceptions=True)
         for active in put_in:
-            talk.print(_struck(active), soft_wrap=True, markup=False)
+            talk.print(struck(active), soft_wrap=True, markup=False)
     return 0
-
-
-def _struck(active: Active) -> str:
-    """How often a fault did anything: one that never did was no test."""
-    named = active.id if active.id.startswith(active.fault.name) else f"{active.id} ({active.fault.name})"
-    if active.struck and not active.matched:
-        return f"{named}: {active.struck} times"
-    return f"{named}: struck {active.struck} of {active.matched} frames"
 
 
 async def _bytes(near: Endpoint, far: Endpoint, faults: WireFaults | None) -> None:

@@ -11,12 +11,14 @@ from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.live import Live
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from fieldtwin.cli.plc_views import acts_text
+from fieldtwin.cli.plc_views import acts_text, waiting_texts, without_texts
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.running.session import RunSession
+from fieldtwin.scenarios.trace import refusal_text
 
 COLOUR = {"good": "green", "uncertain": "yellow", "bad": "red", "substituted": "magenta", "simulated": "cyan"}
 REFRESH_S = 0.25
@@ -24,6 +26,10 @@ LINE_S = 1.0
 MAX_TAGS = 40
 MAX_TROUBLES = 5
 MAX_FORCES = 6
+MAX_REFUSED = 5
+READ_ONLY = "read-only"
+"""The cause of a refusal that is by design: the plant runs without leave to write."""
+MOST_FAULTS = 20
 
 
 def print_mapping(session: RunSession) -> None:
@@ -97,7 +103,7 @@ class LiveView:
         while True:
             await asyncio.sleep(LINE_S)
             open_ports = self._tell_once(open_ports)
-            now = troubles(self._session)
+            now = [*troubles(self._session), *_waiting_once(self._session)]
             for trouble in now:
                 if trouble not in told:  # once, and again only when it had gone
                     talk.print(f"! {trouble}", soft_wrap=True, markup=False)
@@ -144,18 +150,37 @@ def troubles(session: RunSession) -> list[str]:
             found.append(f"{name}: {device['error']}")
     if error := (session.plc_status or {}).get("error"):
         found.append(f"PLC: {error}")
+    found += refused(gateway)
     thread = session.thread_status or {}
     found += [f"{what}: {text}" for what, key in THREAD_TROUBLES if (text := thread.get(key))]
     return found
 
 
+def refused(gateway: dict[str, Any]) -> list[str]:
+    """The outputs that are refused now, each with its value, the reason and the program's line. In a read-only plant one line
+    for all that are not written by design."""
+    entries = [e for e in gateway.get("refusals", {}).get("entries", []) if e["standing"]]
+    by_design = {e["tag"] for e in entries if e["cause"] == READ_ONLY}
+    found = [refusal_text(e["tag"], e) for e in entries if e["cause"] != READ_ONLY]
+    if by_design:
+        found.append(f"read-only plant: {', '.join(sorted(by_design))} not written (--allow-writes)")
+    return found
+
+
 def interference(session: RunSession) -> list[str]:
-    """What a person has taken out of the PLC's hands: that it is paused, and what is forced."""
+    """Why the PLC does not do what its programs say: it is paused, a program waits for its start, or something is forced."""
     plc = session.plc_status or {}
     found = ["PAUSED: the PLC executes nothing, its outputs stay as they are"] if plc.get("state") == "paused" else []
+    found += waiting_texts(plc)
     if forces := plc.get("forces"):
         found.append(f"FORCED: {forces_text(forces)}")
     return found
+
+
+def _waiting_once(session: RunSession) -> list[str]:
+    """For the lines of a log: each program that waits, without the seconds, so that it is told once."""
+    waiting = (session.plc_status or {}).get("waiting", {})
+    return [f"program {program} has not started; missing {start['reason']}" for program, start in waiting.items()]
 
 
 def forces_text(forces: dict[str, Any]) -> str:
@@ -184,6 +209,8 @@ def line(session: RunSession) -> str:
     parts.append(f"errors={len(session.errors)}")
     if plc.get("state") == "paused":
         parts.append("PLC PAUSED")
+    if plc.get("waiting"):
+        parts.append(f"PLC WAITING={','.join(plc['waiting'])}")
     if plc.get("forces"):
         parts.append(f"FORCED={','.join(plc['forces'])}")
     if not gateway.get("plc", {}).get("alive", True):
@@ -321,6 +348,7 @@ def print_summary(summary: dict[str, Any]) -> None:
         data.print(f"  {program:<14} {' → '.join(states) or 'no scan seen'}")
     for bus, row in summary["exchanges"].items():
         data.print(f"  {bus:<14} {_exchange_text(row)}", soft_wrap=True)
+    print_faults(summary["faults"])
     published = summary["published"]
     if summary["prototype"]:
         checked = f"{published['checked']} compared with what the devices held, {published['wrong']} wrong"
@@ -338,17 +366,53 @@ def print_summary(summary: dict[str, Any]) -> None:
         data.print(f"  thread         {_thread_text(thread)}", soft_wrap=True, markup=False, highlight=False)
     for name, learnt in summary["learnt"].items():
         data.print(f"  {name:<14} {_learnt_text(learnt, kind)}", soft_wrap=True, markup=False)
+    for text in without_texts(summary["plc"]):
+        data.print(f"  [yellow]start[/yellow]          {text}", soft_wrap=True, highlight=False)
     if acts := summary["plc"].get("acts"):
         left = summary["plc"].get("forces")
         data.print(f"  [yellow]by hand[/yellow]        the PLC: {acts_text(acts)}", soft_wrap=True)
         if left:
             data.print(f"  [yellow]FORCED[/yellow]         at the end: {forces_text(left)}", soft_wrap=True)
+    _print_refused(summary)
+    for one in summary["invariants"]:
+        if one["verdict"] != "failed":  # those that failed are among the errors
+            said = "holds" if one["verdict"] == "passed" else "not judged"
+            text = f"  {one['number']}: {one['text']}: {said}, {one['got']}"
+            data.print(text, soft_wrap=True, markup=False, highlight=False)
     told = {f"{name}: {device['error']}" for name, device in summary["devices"].items() if device["state"] != "good"}
     for error in summary["errors"]:
         if error in told:  # beside the device, above
             continue
-        data.print(f"  [red]error[/red]          {error}", soft_wrap=True)
+        data.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
+
+
+def _print_refused(summary: dict[str, Any]) -> None:
+    """The writes that did not reach their device and are no error, by cause: by design, tried again, or asked by a client."""
+    by_design = sorted({e["tag"] for e in summary["refused"] if e["cause"] == READ_ONLY})
+    if by_design:
+        text = f"{', '.join(by_design)}: not written, the plant is read-only (--allow-writes)"
+        data.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
+    others = [e for e in summary["refused"] if e["cause"] != READ_ONLY and not e["fault"]]
+    for entry in others[:MAX_REFUSED]:
+        text = refusal_text(entry["tag"], entry)
+        data.print(f"  not written    {text}", soft_wrap=True, markup=False, highlight=False)
+    if len(others) > MAX_REFUSED:
+        data.print(f"  not written    {len(others) - MAX_REFUSED} more, see the audit log", soft_wrap=True)
+
+
+def print_faults(faults: list[dict[str, Any]]) -> None:
+    """Print how often each fault of a run struck."""
+    from fieldtwin.running.struck import struck_of
+
+    for fault in faults[:MOST_FAULTS]:
+        colour = "yellow" if not fault["struck"] and not fault["optional"] else "default"
+        data.print(
+            f"  [{colour}]fault[/{colour}]          {escape(struck_of(fault).text)}", soft_wrap=True, highlight=False
+        )
+    if len(faults) > MOST_FAULTS:
+        idle = sum(not fault["struck"] for fault in faults)
+        data.print(f"  faults         {len(faults)} in all, {idle} of them never struck", soft_wrap=True)
 
 
 def _times(count: int) -> str:

@@ -169,6 +169,8 @@ def main() -> None:
         if os.environ.get("FIELDTWIN_TRACEBACK"):
             raise
         click.echo(f"fieldtwin: {e}", err=True)
+        for other in e.others if isinstance(e, FileInvalid) else ():
+            click.echo(f"fieldtwin: {other}", err=True)
         theirs = getattr(e, "child_exit_code", 0) or getattr(e, "remote_exit_code", 0)
         sys.exit(theirs if theirs > 0 else e.exit_code)  # below zero: a signal ended it
     except OSError as e:

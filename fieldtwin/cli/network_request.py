@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from fieldtwin.running.fault_schedule import RandomFaults
 
 
 class NetworkRequest(NamedTuple):
@@ -25,3 +28,4 @@ class NetworkRequest(NamedTuple):
     jobs: int = 1
     ledger: str | None = None
     trust: bool = False
+    random_faults: RandomFaults | None = None

@@ -16,9 +16,9 @@ from rich.table import Table
 from rich.text import Text
 
 from emulators.faults.schema import load_faults
-from fieldtwin.cli.live_view import troubles
+from fieldtwin.cli.live_view import print_faults, troubles
 from fieldtwin.cli.network_request import NetworkRequest
-from fieldtwin.cli.talk import data, talk
+from fieldtwin.cli.talk import data, show_warnings, talk
 from fieldtwin.cli.template_question import consent
 from fieldtwin.cli.virtual_view import parse_seeds, progress_bar, run_many, shown_time
 from fieldtwin.running.network_session import NetworkOptions, NetworkSession
@@ -78,6 +78,7 @@ def _commands(request: NetworkRequest) -> tuple[Scripted, ...]:
 
 def _print_network(network: Network) -> None:
     """Who is there, and who hears whom."""
+    show_warnings(dict.fromkeys(warning for member in network.members.values() for warning in member.system.warnings))
     sea = network.medium(network.seed)
     talk.print(f"[bold]network[/bold] {network.name}, prototypes of {len(network.members)} systems", highlight=False)
     for name in network.places:
@@ -94,7 +95,7 @@ def _options(request: NetworkRequest, network: Network) -> VirtualNetworkOptions
         tuple(Path(p) for p in request.profiles),
         _commands(request),
         _faults(request, network),
-        request.faults == "random",
+        request.random_faults,
         Path(request.trace) if request.trace else None,
     )
 
@@ -175,7 +176,7 @@ async def _on_this_host(request: NetworkRequest, network: Network) -> int:
         raise failed
     systems = {name: summarise(one) for name, one in session.sessions.items()}
     ship = session.shore.describe() if session.shore is not None else None
-    summary = summarise_network(network, systems, session.counters(), ship, [])
+    summary = summarise_network(network, systems, session.counters(), ship, [], session.faults.history.describe())
     summary["duration_s"] = round(elapsed_s, 3)
     if request.as_json:
         code = _as_json(summary)
@@ -279,6 +280,7 @@ def print_network_summary(summary: dict[str, Any]) -> None:
             soft_wrap=True,
             highlight=False,
         )
+        print_faults(one["faults"])
         for error in one["errors"]:
             data.print(f"  {'':<14} [red]error[/red] {error}", soft_wrap=True, highlight=False)
     for name, sea in summary["water"].items():
@@ -289,6 +291,7 @@ def print_network_summary(summary: dict[str, Any]) -> None:
             soft_wrap=True,
             highlight=False,
         )
+    print_faults(summary["faults"])
     if ship := summary["ship"]:
         data.print(f"  {SHIP:<14} commands {ship['commands_sent']}, heard {ship['responses']}", highlight=False)
     for error in summary["errors"]:

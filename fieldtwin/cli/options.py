@@ -12,7 +12,8 @@ from click.core import ParameterSource
 from gateway.core.errors import UsageError
 
 _DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|m|min|h)?$")
-_UNIT_S = {"ms": 0.001, "s": 1.0, "": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
+_NEGATIVE = re.compile(r"-(0x[0-9a-f]+|[0-9]+\.?[0-9]*(e[+-]?[0-9]+)?|\.[0-9]+(e[+-]?[0-9]+)?|inf)", re.IGNORECASE)
+_UNIT_S = {"ms": 0.001, "s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}
 
 
 if TYPE_CHECKING:
@@ -22,8 +23,22 @@ else:  # it takes a parameter since 8.4
     _OfFloat = _OfText = click.ParamType
 
 
+class NegativeNumbers(click.Command):
+    """A command whose arguments may be negative numbers, anywhere among its options: ``force TAG -1 --yes``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        known = {option for param in self.params for option in (*param.opts, *param.secondary_opts)} | {"--", "--help"}
+        words = [a for a in args if a.startswith("-") and a != "-" and not _NEGATIVE.fullmatch(a)]
+        if all(word.partition("=")[0] in known for word in words):  # an unknown option is still refused
+            ctx.ignore_unknown_options = True
+        return super().parse_args(ctx, args)
+
+
 class Duration(_OfFloat):
-    """``20s``, ``500ms``, ``2m``, ``1h``, or seconds."""
+    """A number with its unit: ``500ms``, ``20s``, ``2m`` (or ``2min``), ``1h``. Only ``0`` needs no unit.
+
+    ``--timeout 500`` is refused: one user means milliseconds, and another one seconds.
+    """
 
     name = "duration"
 
@@ -33,7 +48,19 @@ class Duration(_OfFloat):
         match = _DURATION.match(str(value))
         if not match:
             self.fail(f"{value!r} is no duration such as 20s, 500ms or 2m", param, ctx)
-        return float(match[1]) * _UNIT_S[match[2] or ""]
+        number, unit = float(match[1]), match[2]
+        if unit is None and number:
+            self.fail(f"{value!r} has no unit: write {match[1]}ms, {match[1]}s, {match[1]}m or {match[1]}h", param, ctx)
+        return number * _UNIT_S[unit or "s"]
+
+
+junit_flavour_option = click.option(
+    "--junit-flavour",
+    type=click.Choice(["common", "jenkins"]),  # the values of fieldtwin.report.junit.Flavour
+    default="common",
+    show_default=True,
+    help="With --junit: jenkins writes only what the schema of Jenkins' xUnit plugin (junit-10.xsd) allows.",
+)
 
 
 class Secret(_OfText):

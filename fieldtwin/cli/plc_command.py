@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from fieldtwin.cli.files import write_text
-from fieldtwin.cli.options import json_option, profiles_option
+from fieldtwin.cli.options import NegativeNumbers, json_option, profiles_option
 from fieldtwin.cli.talk import talk
 from fieldtwin.cli.template_question import consent, trust_option
 from gateway.core.errors import UsageError
@@ -113,7 +113,7 @@ def watch(tags: tuple[str, ...], once: bool, instance: str, as_json: bool) -> in
     return 0
 
 
-@command.command("force")
+@command.command("force", cls=NegativeNumbers)
 @click.argument("tag")
 @click.argument("value")
 @yes_option
@@ -166,13 +166,18 @@ def go(instance: str) -> int:
     return 0
 
 
-@command.command("step")
+@command.command("step", cls=NegativeNumbers)
 @click.argument("count", type=click.IntRange(1, 10_000), default=1)
 @instance_option
 def step(count: int, instance: str) -> int:
-    """While paused, execute COUNT scans (1)."""
-    _act(instance, "step", count=count)
-    talk.print(f"{count} scan{'s' if count > 1 else ''}")
+    """While paused, execute COUNT scans (1) of the fastest task, and of the others those that fall due in that time."""
+    import getpass
+
+    from fieldtwin.running.plc_client import step_and_wait, talk_to
+
+    scans = talk_to(instance, lambda client: step_and_wait(client.call, count, getpass.getuser()))
+    texts = [f"{name + ': ' if len(scans) > 1 else ''}{n} scan{'' if n == 1 else 's'}" for name, n in scans.items()]
+    talk.print(", ".join(texts), markup=False)
     return 0
 
 
@@ -192,13 +197,16 @@ def restart(cold: bool, yes: bool, instance: str) -> int:
 @instance_option
 @json_option
 def why(tag: str, instance: str, as_json: bool) -> int:
-    """Which program last changed TAG (an output or local), when, and what its inputs were then."""
+    """Which program last changed TAG (an output or local), when, and what its inputs were then.
+
+    Without --json it also says what the program waits for, where it has not started.
+    """
     from fieldtwin.cli.plc_views import print_why
 
-    changes = _call(instance, "why", tag=tag)["changes"]
+    answer = _call(instance, "why", tag=tag)
     if as_json:
-        return _emit(changes)
-    print_why(tag, changes)
+        return _emit(answer["changes"])
+    print_why(tag, answer["changes"], answer["waits_for"])
     return 0
 
 
@@ -283,6 +291,7 @@ def prove(
                 "depth": result.depth,
                 "invariants": list(proof.invariants),
                 "broken": result.broken,
+                "reason": result.reason,
                 "way": [given.describe() for given in result.way],
             }
         )

@@ -27,6 +27,12 @@ _WHOLE_TYPES = {
     for span in ((0, 2**bits - 1), (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1), (0, 2.0**bits))
 }
 
+AT_TIMEOUT = {
+    "wait": "reported as an error after {:g} s",
+    "stop": "the PLC stops after {:g} s",
+    "start_anyway": "it starts anyway after {:g} s",
+}
+
 Row = dict[str, Any]
 """One tag as the PLC's `image` verb describes it."""
 
@@ -140,6 +146,8 @@ def print_status(status: dict[str, Any]) -> None:
     data.print(f"PLC: {head}", markup=False)
     if status["error"]:
         data.print(f"  {status['error']}", markup=False, soft_wrap=True)
+    for text in [*waiting_texts(status), *without_texts(status)]:
+        data.print(f"  {text}", style="yellow", markup=False, soft_wrap=True)
     data.print(f"gateway: {'alive' if status['gateway_alive'] else 'DEAD: every input is bad'}", markup=False)
     table = Table(box=None, pad_edge=False)
     for name in (
@@ -155,8 +163,8 @@ def print_status(status: dict[str, Any]) -> None:
         "\np99",
         "\nmax",
     ):
-        text = name in ("task", "every")
-        table.add_column(name, justify="left" if text else "right", no_wrap=not text, overflow="fold")
+        is_text = name in ("task", "every")
+        table.add_column(name, justify="left" if is_text else "right", no_wrap=not is_text, overflow="fold")
     for name, task in status["tasks"].items():
         late, took = task["lateness_us"], task["duration_us"]
         every = f"on {task['single']}" if task["single"] else f"{task['cycle_ms']:g} ms"
@@ -184,6 +192,23 @@ def print_status(status: dict[str, Any]) -> None:
         data.print("nothing is forced")
 
 
+def waiting_texts(plc: dict[str, Any]) -> list[str]:
+    """One line for each program that has not started: what it waits for, how long already, and what happens at the timeout."""
+    return [
+        f"WAITING: program {program} starts after its inputs have been good once; missing {start['reason']}; "
+        f"{start['since_s']:.0f} s so far, {AT_TIMEOUT[start['at_timeout']].format(start['timeout_s'])}"
+        for program, start in plc.get("waiting", {}).items()
+    ]
+
+
+def without_texts(plc: dict[str, Any]) -> list[str]:
+    """One line for each program that started although inputs were missing."""
+    return [
+        f"program {program} started without " + ", ".join(f"{tag} ({reason})" for tag, reason in missing.items())
+        for program, missing in plc.get("started_without", {}).items()
+    ]
+
+
 def is_now(rows: list[Row], tag: str) -> str:
     """What a tag is before it is forced, with unit and limits; the command where it is read back, too."""
     if not rows:
@@ -198,8 +223,11 @@ def acts_text(acts: dict[str, int]) -> str:
     return ", ".join(f"{count} x {what}" for what, count in acts.items())
 
 
-def print_why(tag: str, changes: list[dict[str, Any]]) -> None:
-    if not changes:
+def print_why(tag: str, changes: list[dict[str, Any]], waits_for: str = "") -> None:
+    """`waits_for`: what the program that writes the tag waits for before it starts."""
+    if waits_for:
+        data.print(f"{tag}: its program has not started; missing {waits_for}", markup=False, soft_wrap=True)
+    elif not changes:
         data.print(f"{tag} has not changed since the programs began", markup=False)
     for change in changes:
         by = "a force, through" if change["forced"] else ""
@@ -222,8 +250,9 @@ def print_proof(name: str, proof: Proof, result: Result, text: str) -> None:
         data.print(f"{name}: broken after {len(result.way)} scans: {result.broken}", markup=False, soft_wrap=True)
         data.print(text, markup=False, highlight=False, soft_wrap=True, end="")
     else:
-        data.print(f"{name}: nothing broken in {seen}, but not everything was seen: no proof", markup=False)
-        talk.print("raise --max-states")
+        data.print(f"{name}: nothing broken in {seen}, but no proof: {result.reason}", markup=False, soft_wrap=True)
+        if result.bounded:
+            talk.print("raise --max-states")
 
 
 def _us(us: float) -> str:

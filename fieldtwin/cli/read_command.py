@@ -14,7 +14,7 @@ from fieldtwin.cli.talk import data
 from fieldtwin.cli.value_table import exit_code, value_table
 from fieldtwin.commissioning.address import tags_of
 from fieldtwin.commissioning.point import Answer
-from fieldtwin.commissioning.reading import Target, dry_point, point_at, row_of
+from fieldtwin.commissioning.reading import Target, dry_point, read_all, row_of
 from gateway.core.errors import NotAllowed
 from gateway.core.profile import Tag
 from gateway.wallclock import run as run_precise
@@ -32,19 +32,22 @@ def command(
 ) -> int:
     """Read ITEMs of the device at ENDPOINT: tags of a profile, or addresses; without any, the whole profile.
 
+    An item that cannot be read has its reason in its place; the others are read all the same. Exit code: 0 if every value
+    came, 4 if the wire lost one, else 5 if the device refused one.
+
     \b
     fieldtwin read tcp://192.168.0.7 holding:100 --count 4
-    fieldtwin read rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1 40101 --type float32 --order CDAB
+    fieldtwin read 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' 40101 --type float32 --order CDAB
     fieldtwin read rtu:/dev/ttyUSB0 --profile eastron-sdm630 'voltage_*' frequency
     fieldtwin read can:socketcan/can0 --node 5 6041h:00 1018h:01 --count 4
     """
     target = target_from(endpoint, options)
     tags = tags_of(items, target.protocol, raw_form(options), target.profile, target.dictionary)
-    unreadable = [t.name for t in tags if not t.readable]
-    if unreadable:
-        raise NotAllowed(f"cannot be read: {', '.join(unreadable)}", hint="the profile says `access: wo`")
+    readable = [t for t in tags if t.readable]
+    if not readable:
+        raise NotAllowed(f"cannot be read: {', '.join(t.name for t in tags)}", hint="the profile says `access: wo`")
     if dry_run:
-        for frame in dry_point(target).read_frames(tags):
+        for frame in dry_point(target).read_frames(readable):
             click.echo(frame)
         return 0
     answers = run_precise(_read(target, tags, log))
@@ -58,5 +61,4 @@ def command(
 
 async def _read(target: Target, tags: list[Tag], log: Path | None) -> dict[str, Answer]:
     with logged(log) as taps:
-        async with point_at(target, taps=taps) as point:
-            return await point.read(tags)
+        return await read_all(target, tags, taps=taps)

@@ -18,6 +18,7 @@ from rich.status import Status
 from fieldtwin.cli.device_options import device_options, logged, target_from, words
 from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.talk import data, talk
+from fieldtwin.commissioning.address import tags_of
 from fieldtwin.commissioning.reading import Target, dry_point
 from fieldtwin.recording.asking import frame_for
 from fieldtwin.recording.importing import TextSummary, import_capture
@@ -32,6 +33,7 @@ from fieldtwin.recording.polling import (
 )
 from fieldtwin.recording.rotating import MB, RotatingFile, exchanges_of, header_of
 from fieldtwin.recording.sinks import CanLogSink, ExchangeSink, LineSink
+from fieldtwin.recording.sniffing import LineSniffer
 from fieldtwin.recording.tapping import LineTap
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import Direction
@@ -55,6 +57,9 @@ REFRESH_S = 0.5
 )
 @click.option(
     "--tap", "taps", nargs=2, metavar="A B", help="Between a master (A) and its devices (B): pass all on, keep all."
+)
+@click.option(
+    "--sniff", metavar="PORT", help="Listen with one adapter to a serial line between other devices; nothing is sent."
 )
 @click.option(
     "--like",
@@ -85,6 +90,7 @@ def command(
     endpoint: str | None,
     out: Path,
     taps: tuple[str, str] | None,
+    sniff: str | None,
     like: Path | None,
     for_s: float | None,
     as_scenario: str,
@@ -97,6 +103,7 @@ def command(
     fieldtwin record rtu:/dev/ttyUSB0 --profile eastron-sdm630 -o meter.jsonl
     fieldtwin record tcp://192.168.0.7 --like old.jsonl --rounds 20 -o new.jsonl
     fieldtwin record --tap rtu:/dev/ttyUSB0 rtu:/dev/ttyUSB1 -o line.jsonl
+    fieldtwin record --sniff 'rtu:/dev/ttyUSB0?baudrate=9600' -o line.jsonl
     fieldtwin record --tap tcp://127.0.0.1:1502 tcp://192.168.0.7 -o line.jsonl
     fieldtwin record can:socketcan/can0 -o bus.log                 (listens only)
     fieldtwin record can:socketcan/can0 --profile drive-cia402 -o drive.log
@@ -111,8 +118,12 @@ def command(
         if endpoint or like or options["profile_name"]:
             raise UsageError("--tap takes two endpoints and nothing else to ask")
         return job.tap(*(_end(text) for text in taps))
+    if sniff is not None:
+        if endpoint or like or options["profile_name"]:
+            raise UsageError("--sniff takes one port and asks nothing")
+        return job.sniff(_end(sniff))
     if endpoint is None:
-        raise UsageError("what is to be recorded?", expected="ENDPOINT, or --tap A B")
+        raise UsageError("what is to be recorded?", expected="ENDPOINT, --tap A B, or --sniff PORT")
     target = target_from(endpoint, options)
     if target.protocol == "canopen":
         if like is not None:
@@ -196,8 +207,15 @@ class _Job:
         return 0
 
     def bus(self, target: Target) -> int:
+        polled = target.profile is not None or target.dictionary is not None
+        if not polled and self._options["node"] is not None:
+            raise UsageError(
+                "nothing to read from the node",
+                expected="--profile NAME or --eds FILE",
+                hint="without --node: only listen",
+            )
         if self._options["dry_run"]:
-            tags = [t for t in target.profile.tags.values() if t.readable] if target.profile else []
+            tags = tags_of((), "canopen", None, target.profile, target.dictionary) if polled else []
             return self._dry(dry_point(target).read_frames(tags))
         counters, lost = PollCounters(), 0
         if self._options["log"]:
@@ -207,7 +225,7 @@ class _Job:
 
             async def work(stop: asyncio.Event) -> None:
                 nonlocal lost
-                if target.profile is None:
+                if not polled:
                     lost = await follow_bus(target, sink, stop=stop, clock=self._clock)
                     return
                 await record_node(
@@ -216,22 +234,48 @@ class _Job:
                 )  # fmt: skip
 
             self._run(work, lambda: f"{file.lines} frames")
-        return self._summary(file, counters if target.profile else None, {"frames": file.lines, "lost_here": lost})
+        return self._summary(file, counters if polled else None, {"frames": file.lines, "lost_here": lost})
 
     def tap(self, near: Endpoint, far: Endpoint) -> int:
-        """The bytes first, as they come; what they say when it is over."""
+        """Record a line that passes through here."""
+
+        def tapped(sink: LineSink) -> Callable[[asyncio.Event], Coroutine[Any, Any, None]]:
+            return LineTap(near, far, sink, say=self._say, clock=self._clock).run
+
+        return self._line(far, tapped, "tapped", "bytes to the device", "back")
+
+    def sniff(self, port: Endpoint) -> int:
+        """Record a line between other devices that one adapter listens to."""
+        return self._line(
+            port,
+            lambda sink: LineSniffer(port, sink, say=self._say, clock=self._clock).run,
+            "sniffed",
+            "bytes of requests",
+            "of replies",
+        )
+
+    @staticmethod
+    def _say(text: str) -> None:
+        talk.print(text, soft_wrap=True, markup=False)
+
+    def _line(
+        self,
+        far: Endpoint,
+        listening: Callable[[LineSink], Callable[[asyncio.Event], Coroutine[Any, Any, None]]],
+        how: str,
+        there: str,
+        back: str,
+    ) -> int:
+        """Write the bytes first, as they come, then make a recording of what they say."""
         if self._out.exists():
             raise UsageError(f"{self._out} exists already", expected="another name")
         started = self._now()
         raw = self._out.with_suffix(f".tap{self._out.suffix or '.jsonl'}")
         with RotatingFile(raw, **self._parts) as file:
             sink = LineSink(file, far, self._clock, words())
-            line = LineTap(
-                near, far, sink, say=lambda text: talk.print(text, soft_wrap=True, markup=False), clock=self._clock
-            )
             self._run(
-                line.run,
-                lambda: f"{sink.bytes[Direction.SENT]} bytes to the device, {sink.bytes[Direction.RECEIVED]} back",
+                listening(sink),
+                lambda: f"{sink.bytes[Direction.SENT]} {there}, {sink.bytes[Direction.RECEIVED]} {back}",
             )
         said = {
             "bytes_sent": sink.bytes[Direction.SENT], "bytes_received": sink.bytes[Direction.RECEIVED], "raw": str(raw)
@@ -240,7 +284,7 @@ class _Job:
             talk.print("nothing passed")
             return self._summary(file, None, said)
         header = RecordingHeader(
-            version=1, device=f"tapped/{self._out.stem}", kind="exchanges", source="measured", endpoint=str(far),
+            version=1, device=f"{how}/{self._out.stem}", kind="exchanges", source="measured", endpoint=str(far),
             made_by=words(), start_utc=started, prototype=self._options["emulated"],
         )  # fmt: skip
         found: TextSummary = import_capture(raw, self._out, url=str(far), header=header)

@@ -19,6 +19,8 @@ from gateway.core.errors import UsageError
 from twin.system import System
 
 SHOWN = 30
+LENGTHS_S = 1.0
+"""Runs whose lengths differ by more are said to."""
 SUFFIX = ".scenario.yaml"
 
 
@@ -53,6 +55,9 @@ def show(verdict: Verdict, old: Path, *, as_json: bool) -> int:
                 "against": str(old),
                 "same": verdict.same,
                 "compared": verdict.compared,
+                "compared_s": verdict.common_s,
+                "old_s": verdict.old_s,
+                "new_s": verdict.new_s,
                 "differences": [{k: getattr(d, k) for k in d.__slots__} for d in verdict.differences],
             },
             sys.stdout,
@@ -71,7 +76,17 @@ def show(verdict: Verdict, old: Path, *, as_json: bool) -> int:
         said = "[red]nothing in these runs can be compared[/red]"
     else:
         said = f"[red]{len(verdict.differences)} differences[/red] from {escape(old.name)}"
-    data.print(f"{said}: {verdict.compared} fields and services compared", highlight=False, soft_wrap=True)
+    data.print(
+        f"{said}: {verdict.compared} fields and services compared over {verdict.common_s:.1f} s",
+        highlight=False,
+        soft_wrap=True,
+    )
+    if abs(verdict.old_s - verdict.new_s) > LENGTHS_S:
+        data.print(
+            f"  not compared: what one run has after that (lengths {verdict.old_s:.1f} s and {verdict.new_s:.1f} s)",
+            highlight=False,
+            soft_wrap=True,
+        )
     return 0 if verdict.same else 1
 
 

@@ -25,8 +25,10 @@ def command(instance: str, check: bool, as_json: bool) -> int:
 
     Periods, time-outs, retries, pauses, limits, scaling, safe values and what may be written change between two polls, none of
     which is lost or doubled. Ports, addresses, devices and programs need a restart: they are named, nothing is changed then, and
-    the exit code is 1. A file that is not right changes nothing either (3).
+    the exit code is 1. So is a program's file (.st, .xml, .py) that changed since the PLC read it. A file that is not right
+    changes nothing either (3).
     """
+    from fieldtwin.cli.talk import show_warnings
     from fieldtwin.running.reloading import reload_instance
     from gateway.core.control import RemoteError
 
@@ -34,6 +36,7 @@ def command(instance: str, check: bool, as_json: bool) -> int:
         done = asyncio.run(reload_instance(instance, _who(), check=check))
     except RemoteError as e:
         raise _NotReloaded(f"nothing was changed: {e.message}", e.remote_exit_code) from e
+    show_warnings(done.warnings)
     if as_json:
         json.dump({"applied": done.applied, "changes": done.changes, "hash": done.hash}, sys.stdout, indent=2)
         sys.stdout.write("\n")

@@ -57,7 +57,7 @@ def command(
     SITE is files, or folders of them: dumps, and the JSON of `check --out`, `diff` and `compare`. Print it from any browser.
     """
     from fieldtwin.checking.subject import who
-    from fieldtwin.sitereport.html import plural, write_html
+    from fieldtwin.sitereport.html import NOTED, plural, write_html
     from fieldtwin.sitereport.reading import read_site
 
     folder = next((path for path in files if path.is_dir()), files[0].parent)
@@ -83,5 +83,8 @@ def command(
         sys.stdout.write("\n")
     else:
         found = f"{plural(document.count('deviation'), 'deviation')}, {plural(document.count('open'), 'open point')}"
+        for weight, name in NOTED.items():
+            if count := document.count(weight):
+                found += f", {plural(count, name)}"
         click.echo(f"{out}: {plural(len(document.devices), 'device')}, {found}")
     return 0

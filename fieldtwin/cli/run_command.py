@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from fieldtwin.cli.campaign_options import Choice, fault_choice
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
@@ -29,6 +30,7 @@ from gateway.core.errors import FieldtwinError, UsageError
 from twin.data_files import network_file
 
 if TYPE_CHECKING:
+    from fieldtwin.running.fault_schedule import RandomFaults
     from fieldtwin.running.virtual_run import VirtualOptions
 
 NEITHER = """run needs --plant or --prototype; neither is a default.
@@ -127,6 +129,7 @@ NEITHER = """run needs --plant or --prototype; neither is a default.
     default=None,
     help="Instead of a live view, events: as text, JSON lines, or to the journal with fields.",
 )
+@fault_choice
 @trust_option
 @click.option("--cold", is_flag=True, help="Retained variables of the PLC begin with their initial values.")
 @profiles_option
@@ -164,6 +167,7 @@ def command(
     cold: bool,
     profiles: tuple[str, ...],
     as_json: bool,
+    choice: Choice,
 ) -> int:
     """Run SYSTEM: gateway and PLC, each in its own process.
 
@@ -175,6 +179,7 @@ def command(
     """
     if prototype == plant:
         raise UsageError(NEITHER if not plant else "--plant and --prototype exclude each other")
+    random_faults = choice.of(faults)
     network = network_file(system, [Path(p) for p in profiles])
     if network is not None:
         others = {
@@ -186,7 +191,7 @@ def command(
             NetworkRequest(
                 network, virtual, duration_s, seed, instance, profiles,
                 parse_periods(commands) if commands is not None else None, trace, cold, as_json, thread,
-                faults, seeds, jobs, ledger, trust,
+                faults, seeds, jobs, ledger, trust, random_faults,
             ),
             plant,
             [option for option, said in others.items() if said],
@@ -231,6 +236,7 @@ def command(
                 trace,
                 compare,
                 faults,
+                random_faults,
             ),
             seeds,
             jobs,
@@ -311,6 +317,7 @@ class VirtualRequest(NamedTuple):
     trace: str | None
     compare: str | None
     faults: str
+    random_faults: RandomFaults | None
 
 
 def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | None, as_json: bool) -> int:
@@ -330,7 +337,7 @@ def _run_virtual(request: VirtualRequest, seeds: str, jobs: int, ledger: Path | 
         faults=_faults(request.faults, request.system, request.profiles)
         if request.faults not in ("", "random")
         else (),
-        random_faults=request.faults == "random",
+        random_faults=request.random_faults,
     )
     if not seeds:
         if ledger is not None:
@@ -362,6 +369,7 @@ def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
 
 async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bool) -> int:
     from fieldtwin.cli.live_view import LiveView, print_mapping, print_metrics, print_summary
+    from fieldtwin.cli.talk import show_warnings
 
     check(service_options)
     notifier = Notifier.from_environment()
@@ -385,6 +393,7 @@ async def _run(options: RunOptions, service_options: ServiceOptions, as_json: bo
             started = True
             if service_options.log is None:
                 print_mapping(session)
+                show_warnings(session.system.warnings)
             async with Service(session, service_options, notifier) as service:
                 if service_options.log is None:
                     print_metrics(service.url)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -41,13 +42,13 @@ def show_modbus(scan: ModbusScan) -> None:
         table.add_row(str(unit), at, Text("answers another master", "dim"), "")
     if table.row_count:
         data.print(table)
-    for settings, unit in scan.damaged:
-        at = f" at {name_of(settings)}" if settings is not None else ""
-        talk.print(
-            f"unit {unit}{at} answers, damaged each time: two devices with one id, or a bad line", soft_wrap=True
-        )
+    for odd in scan.damaged:
+        at = f" at {name_of(odd.settings)}" if odd.settings is not None else ""
+        count = len(odd.units)
+        who = f"unit {odd.units[0]}" if count == 1 else f"{count} units ({unit_ranges(odd.units)})"
+        talk.print(f"{who}{at}: {odd.advice}", soft_wrap=True, markup=False)
     if heard is not None and heard.silent:
-        talk.print(f"asked by another master, and silent: {', '.join(map(str, heard.silent))}", soft_wrap=True)
+        talk.print(f"asked by another master, and silent: {unit_ranges(sorted(heard.silent))}", soft_wrap=True)
     if scan.behind_gateway:
         talk.print(f"a gateway says of {len(scan.behind_gateway)} units that they do not answer (exceptions 0A, 0B)")
     if scan.alike is not None:
@@ -56,6 +57,17 @@ def show_modbus(scan: ModbusScan) -> None:
     if scan.echo:
         talk.print("this line echoes what is sent: use --echo with the other verbs")
     _end(scan.notes, scan.asked, "question", bool(table.row_count))
+
+
+def unit_ranges(units: Sequence[int]) -> str:
+    """``1-9, 11, 17-247`` of ascending unit ids."""
+    spans: list[list[int]] = []
+    for unit in units:
+        if spans and spans[-1][-1] == unit - 1:
+            spans[-1][1:] = [unit]
+        else:
+            spans.append([unit])
+    return ", ".join("-".join(map(str, span)) for span in spans)
 
 
 def modbus_json(scan: ModbusScan) -> dict[str, Any]:
@@ -77,7 +89,11 @@ def modbus_json(scan: ModbusScan) -> dict[str, Any]:
         ],
         "one_device": scan.alike.one_device if scan.alike else False,
         "alike": asdict(scan.alike) if scan.alike else None,
-        "damaged": [{"settings": name_of(s) if s else None, "unit": u} for s, u in scan.damaged],
+        "damaged": [
+            {"settings": name_of(o.settings) if o.settings else None, "unit": unit, "reply": o.pdu.hex() or None}
+            for o in scan.damaged
+            for unit in o.units
+        ],
         "behind_gateway": sorted(scan.behind_gateway),
         "heard": {
             "bytes": heard.bytes,
@@ -134,6 +150,8 @@ def show_can(scan: CanScan) -> None:
     if scan.blocked:
         names = ", ".join(map(str, scan.blocked))
         talk.print(f"not asked, another master speaks SDO: nodes {names}", soft_wrap=True)
+    for number, why in sorted(scan.conflicts.items()):
+        talk.print(f"node {number}: {why}", soft_wrap=True, markup=False)
     _end(scan.notes, scan.asked, "node", bool(table.row_count or scan.unconfigured))
 
 
@@ -165,6 +183,7 @@ def can_json(scan: CanScan) -> dict[str, Any]:
             "nmt_commands": heard.nmt_commands,
             "syncs": heard.syncs,
         },
+        "conflicts": {str(number): why for number, why in sorted(scan.conflicts.items())},
         "blocked": scan.blocked,
         "unconfigured": [list(a.parts) for a in scan.unconfigured],
         "listened_s": round(scan.listened_s, 3),

@@ -96,7 +96,7 @@ def command(
         print_shadow(seen)
     if not seen["origins"]:
         raise Unreachable(f"the plant's thread: {why_nothing(seen, place)}", where=place)
-    return 0 if seen["agreed"] == seen["statuses"] else 1
+    return 0 if seen["statuses"] and seen["agreed"] == seen["statuses"] else 1  # of no status, nothing is known
 
 
 async def _run(

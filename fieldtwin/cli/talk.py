@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NoReturn
 
 from rich.console import Console
@@ -16,3 +17,9 @@ class _Console(Console):
 
 talk = _Console(stderr=True, highlight=False)
 data = _Console(highlight=False)
+
+
+def show_warnings(warnings: Iterable[str]) -> None:
+    """What the author of a file should know, one line each on stderr."""
+    for warning in warnings:
+        talk.print(f"warning: {warning}", style="yellow", soft_wrap=True, markup=False)

@@ -23,7 +23,7 @@ from twin.prototype_file import prototype_path
 from twin.software import modules_hash
 from twin.system import load_system
 from twin.template import DOCUMENTS, DocumentKind, Manifest
-from twin.template_check import Difference, differences, examine, put_together, unified
+from twin.template_check import Difference, differences, examine, put_together, software_difference, unified
 from twin.template_pack import Extras, collect, pack
 from twin.template_package import FolderPackage, open_package, unpack
 
@@ -161,11 +161,14 @@ def check_command(template: Path, trust: bool, as_json: bool) -> int:
 @click.option("--names", is_flag=True, help="Only which files differ.")
 @json_option
 def diff_command(before: Path, after: Path, names: bool, as_json: bool) -> int:
-    """Compare two templates, each as it was packed. Exit code 1 when they differ."""
-    with open_package(before) as a, open_package(after) as b:
-        a.verify()  # what was damaged since says what it said before: it would differ in nothing
-        b.verify()
-        found = differences(a.manifest, b.manifest)
+    """Compare two templates: zip files, folders, or one of each. Exit code 1 when they differ.
+
+    The files of a folder are compared as they are now, edited or not. A zip is compared as it was packed.
+    A damaged zip is refused.
+    """
+    with open_package(before, edited=True) as a, open_package(after, edited=True) as b:
+        old, new = a.contents(), b.contents()
+        found = [*software_difference(a.manifest.software, b.manifest.software), *differences(old, new)]
         if as_json:
             _print_json(
                 [{"path": d.path, "kind": d.kind, "what": d.what, "before": d.before, "after": d.after} for d in found]
@@ -173,8 +176,9 @@ def diff_command(before: Path, after: Path, names: bool, as_json: bool) -> int:
             return 1 if found else 0
         for difference in found:
             _print_difference(difference)
-            if not names and difference.path != "fieldtwin":
-                for line in unified(a, b, difference.path):
+            path = difference.path
+            if not names and difference.kind != "software":
+                for line in unified(path, (a, old.get(path)), (b, new.get(path))):
                     data.print(visible(line), style=_style(line), markup=False, soft_wrap=True)
     if not found:
         talk.print("no difference")

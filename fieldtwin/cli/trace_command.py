@@ -28,7 +28,7 @@ NS_PER_S = 1_000_000_000
 @click.option("--only", multiple=True, help="A bus, device, tag, program or fault; all its events. Repeatable.")
 @click.option("--from", "start_s", type=Duration(), default="0s", help="Leave out what was before.")
 @click.option("--to", "end_s", type=Duration(), help="Leave out what was later.")
-@click.option("--problems", is_flag=True, help="Only requests without a good answer.")
+@click.option("--problems", is_flag=True, help="Only requests without a good answer, and refused outputs.")
 @click.option(
     "--against",
     type=click.Path(path_type=Path),
@@ -111,6 +111,7 @@ def command(
         if event.t_ns < start_ns:
             continue
         if as_json or problems:
+            _show_refusal(event, decoded, only, as_json=as_json)
             _show_exchanges(decoded.exchanges, only, problems=problems, as_json=as_json)
         elif _wanted(only, event, decoded):
             click.echo(_line(event, decoded))
@@ -138,6 +139,16 @@ def _line(event: Event, decoded: Decoded) -> str:
     else:
         head = event.kind.value
     return f"{event.t_ns / NS_PER_S:12.6f}  {head:<10}  {decoded.text}"
+
+
+def _show_refusal(event: Event, decoded: Decoded, only: tuple[str, ...], *, as_json: bool) -> None:
+    """A write that did not reach its device is a problem that no exchange shows: nothing was sent."""
+    if event.kind is not Kind.REFUSED or not _wanted(only, event, decoded):
+        return
+    if as_json:
+        click.echo(json.dumps({"t_s": event.t_ns / NS_PER_S, "refused": event.where, **event.data}))
+    else:
+        click.echo(_line(event, decoded))
 
 
 def _show_exchanges(

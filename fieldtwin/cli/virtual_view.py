@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from rich.table import Table
 
 from fieldtwin.cli.files import write_text
 from fieldtwin.cli.live_view import print_summary
-from fieldtwin.cli.talk import data, talk
+from fieldtwin.cli.talk import data, show_warnings, talk
 from gateway.core.errors import UsageError
 from gateway.wallclock import WallClock
 
@@ -44,6 +44,7 @@ def run_one(options: VirtualOptions, as_json: bool) -> int:
     talk.print(
         f"{run.system.name} (prototype, virtual time), seed {run.seed}, {shown_time(options.duration_s)}", markup=False
     )
+    show_warnings(run.system.warnings)
     began_ns = WallClock().monotonic_ns()
     with progress_bar(options.duration_s) as at:
         run.run(at)
@@ -106,48 +107,92 @@ def run_many(
         results = run_seeds(options, left, jobs, ended)
     took_s = (WallClock().monotonic_ns() - began_ns) / 1e9
     failed = [r for r in results if not r.ok]
+    before = sorted(ledger.failed_of(what, seeds) - {r.seed for r in failed}) if ledger is not None else []
+    untested = (
+        options.random_faults is not None
+        and bool(results)
+        and not any(struck for r in results for _, _, struck in r.faults)
+    )
     if as_json:
-        json.dump({"results": [_plain(r) for r in results], "failed": [r.seed for r in failed]}, sys.stdout, indent=2)
+        json.dump(
+            {"results": [_plain(r) for r in results], "failed": sorted([*before, *(r.seed for r in failed)])},
+            sys.stdout,
+            indent=2,
+        )
         sys.stdout.write("\n")
-        return 1 if failed else 0
+        return 1 if failed or before or untested else 0
     for result in failed:
         data.print(f"[red]seed {result.seed}[/red]", soft_wrap=True)
         for error in result.errors:
             data.print(f"  {error}", soft_wrap=True, markup=False)
         data.print(f"  {again(result.seed)}", soft_wrap=True, markup=False)
-    if failed and (options.random_faults or len(options.faults) > 1):
+    if failed and (options.random_faults is not None or options.faults):
         _shrink(options, failed[0])
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_row("seeds", f"{len(results)}, {len(failed)} failed")
     table.add_row("virtual time", shown_time(options.duration_s * len(results)))
     checked, wrong = sum(r.checked for r in results), sum(r.wrong for r in results)
     table.add_row("published", f"{checked} compared with what the devices held, {wrong} wrong")
+    table.add_row("faults", faults_text([one for r in results for one in r.faults]))
     table.add_row("took", f"{took_s:.1f} s, {options.duration_s * len(results) / took_s:,.0f} times as fast as time")
     if ledger is not None:
         table.add_row("not run again", f"{len(seeds) - len(left)} seeds that the ledger has")
         bad = f", {len(ledger.failed)} runs failed, {ledger.wrong} wrong values" if ledger.failed else ", no run failed"
         table.add_row("the ledger", f"{ledger.hours:g} virtual hours in {len(ledger.entries)} runs{bad}")
     data.print(table)
-    data.print("[bold red]not ok[/bold red]" if failed else "[bold green]ok[/bold green]")
-    return 1 if failed else 0
+    for seed in before:
+        data.print(f"[red]seed {seed}[/red] failed before, by the ledger: {again(seed)}", soft_wrap=True)
+    if untested and not failed and not before:
+        data.print("no fault struck in any run, so nothing was tested with faults: try a longer --for", soft_wrap=True)
+        data.print("[bold yellow]inconclusive[/bold yellow]")
+        return 1
+    data.print("[bold red]not ok[/bold red]" if failed or before else "[bold green]ok[/bold green]")
+    return 1 if failed or before else 0
+
+
+def faults_text(faults: Sequence[tuple[str, int, int]]) -> str:
+    """Return how many faults all runs had, and how often they struck, by name."""
+    if not faults:
+        return "none was put in"
+    of = {name: [(put_in, struck) for other, put_in, struck in faults if other == name] for name, _, _ in faults}
+    parts = [f"{name} {sum(n for n, _ in each)} (struck {sum(m for _, m in each)} times)" for name, each in of.items()]
+    return f"{sum(n for _, n, _ in faults)} put in: {', '.join(sorted(parts))}"
 
 
 def _shrink(options: Options, failed: SeedResult) -> None:
-    """The first failing schedule, as few faults as it takes, as a scenario file in the working directory."""
+    """Write the smallest part of the first failing schedule as a scenario into the working directory, once it is confirmed."""
+    from fieldtwin.running.confirming import confirm_run
     from fieldtwin.running.many_seeds import shrunk
     from fieldtwin.running.shrink import as_scenario
 
     talk.print(f"shrinking the faults of seed {failed.seed}", markup=False)
-    faults, result = shrunk(options, failed.seed)
-    if result.ok:
-        talk.print("it does not fail again", markup=False)
+    small = shrunk(options, failed)
+    if small.result.ok:
+        data.print(
+            f"seed {failed.seed} does not fail again with the same faults: no scenario is written", soft_wrap=True
+        )
         return
     path = Path(f"{Path(options.system).stem}-seed{failed.seed}.scenario.yaml")
     title = f"what failed with seed {failed.seed}"
-    scripted = options.scripted
-    text = as_scenario(title, options.system, failed.seed, options.duration_s, faults, result.errors, scripted)
+    acts = [(at_s, {"send": {"period_s": period_s}}) for at_s, period_s in small.scripted]
+    text = as_scenario(title, options.system, failed.seed, options.duration_s, small.faults, small.result.errors, acts)
     write_text(path, text)
-    data.print(f"seed {failed.seed} takes {len(faults)} of its faults: {path}", soft_wrap=True, markup=False)
+    told = shrunk_texts(failed.seed, len(small.faults), small.minimal, small.without.ok, small.without.errors)
+    told += [f"it is written to {path}", confirm_run(path, small.result, options.profiles)]
+    for line in told:
+        data.print(line, soft_wrap=True, markup=False, highlight=False)
+
+
+def shrunk_texts(seed: int, count: int, minimal: bool, passes_without: bool, otherwise: Sequence[str]) -> list[str]:
+    """Return in words which faults the failure of a seed takes, and what happens without any of them."""
+    if not count:
+        return [f"seed {seed} fails without any fault: the faults are not the cause"]
+    what = f"{count} fault{'s' if count > 1 else ''}"
+    least = f"; none of {'them' if count > 1 else 'it'} can be left out" if minimal and count > 1 else ""
+    without = (
+        "without faults the run passes" if passes_without else f"without faults it fails otherwise: {otherwise[0]}"
+    )
+    return [f"seed {seed} fails with {what} of its schedule{least}; {without}"]
 
 
 def _plain(result: SeedResult) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from fieldtwin.commissioning.point import Answer
 from fieldtwin.commissioning.reading import Target, dry_point, point_at, row_of, text_of
 from fieldtwin.commissioning.watching import History, Sample, samples
 from gateway.core.clock import NS_PER_S
-from gateway.core.errors import NotAllowed, UsageError
+from gateway.core.errors import NotAllowed, Unreachable, UsageError
 from gateway.core.profile import Tag
 from gateway.wallclock import WallClock
 from gateway.wallclock import run as run_precise
@@ -40,7 +40,7 @@ LEAST_EVERY_S = 0.02
 @raw_options
 @click.option("--every", "every_s", type=Duration(), default="1s", show_default=True, help="From sample to sample.")
 @click.option("--samples", "most", type=click.IntRange(1), help="Stop after so many; default: Ctrl-C.")
-@click.option("--for", "for_s", type=Duration(), help="Stop after so long.")
+@click.option("--for", "for_s", type=Duration(), help="Stop after this time.")
 @click.option("--plot", "plot_path", type=click.Path(dir_okay=False, path_type=Path), help="A picture at the end.")
 @click.option("--dry-run", is_flag=True, help="Print the frames of one sample, and send nothing.")
 @json_option
@@ -76,11 +76,9 @@ def command(
         return 0
     if plot_path is not None:
         check_plot(plot_path)
-    if for_s is not None:
-        most = min(most or 1 << 62, int(for_s / every_s) + 1)
     watch = _Watch(target, tags, as_json=as_json)
     try:
-        run_precise(watch.run(every_s, most, log))
+        run_precise(watch.run(every_s, most, for_s or None, log))
     except KeyboardInterrupt:
         pass  # the way to stop it
     finally:
@@ -101,12 +99,29 @@ class _Watch:
         self._target, self._tags, self._json = target, tags, as_json
         self._live = Live(console=data, auto_refresh=False) if data.is_terminal and not as_json else None
 
-    async def run(self, every_s: float, most: int | None, log: Path | None) -> None:
+    async def run(self, every_s: float, most: int | None, for_s: float | None, log: Path | None) -> None:
+        """Take samples for `for_s` seconds; a sample that is not complete then is abandoned.
+
+        Raises `Unreachable` if none was complete: each tag of a silent device takes a whole reply timeout.
+        """
+        try:
+            async with asyncio.timeout(for_s) as limit:
+                await self._take_all(every_s, most, for_s, log)
+        except TimeoutError:
+            if not limit.expired():
+                raise
+            if not self.count:
+                hint = "a longer --for, or a shorter --timeout"
+                raise Unreachable(
+                    f"no sample was complete after {for_s:g} s", where=self._target.url, hint=hint
+                ) from None
+
+    async def _take_all(self, every_s: float, most: int | None, for_s: float | None, log: Path | None) -> None:
         with logged(log) as taps:
             async with point_at(self._target, taps=taps) as point:
                 if self._live is not None:
                     self._live.start()
-                async with aclosing(samples(point, self._tags, WallClock(), every_s, most)) as stream:
+                async with aclosing(samples(point, self._tags, WallClock(), every_s, most, for_s)) as stream:
                     async for sample in stream:
                         self._take(sample)
                         await asyncio.sleep(0)

@@ -17,6 +17,7 @@ from fieldtwin.cli.what_if_view import show
 from fieldtwin.running.template_here import system_file
 from fieldtwin.whatif.state import KnownState
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import open_input
 
 
 @click.command("what-if")
@@ -66,7 +67,7 @@ def command(
     """
     from fieldtwin.whatif.fork import Fork
     from fieldtwin.whatif.many import answers
-    from fieldtwin.whatif.plan import Plan, load_plans
+    from fieldtwin.whatif.plan import Plan, in_words, load_plans
     from fieldtwin.whatif.plan import command as parsed
     from twin.system import load_system
 
@@ -93,7 +94,8 @@ def command(
         return 0
     if commands or require or finally_ or fault_file or not plans:
         faults = _faults(fault_file, loaded)
-        plans.append(Plan("as said", tuple(parsed(c) for c in commands), faults, require, finally_))
+        own = tuple(parsed(c) for c in commands)
+        plans.append(Plan(in_words(own, faults), own, faults, require, finally_))
     fork = Fork(system, state, horizon_s, folders, prototype_file, seed, settle_s)
     talk.print(
         f"{loaded.name}: {len(plans)} plan{'s'[: len(plans) != 1]}, {_ahead(horizon_s)} ahead, from {escape(state.source)}",
@@ -146,9 +148,9 @@ def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> 
 
 def _is_sqlite(path: Path) -> bool:
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             return file.read(16) == b"SQLite format 3\0"
-    except OSError:
+    except (OSError, FileInvalid):
         return False
 
 

@@ -9,7 +9,7 @@ import click
 from rich.markup import escape
 
 from fieldtwin.cli.options import pairs, profiles_option
-from fieldtwin.cli.talk import talk
+from fieldtwin.cli.talk import show_warnings, talk
 from fieldtwin.cli.template_question import consent, trust_option
 from gateway.core.errors import UsageError
 
@@ -55,6 +55,7 @@ def command(
 
     A signal that ends CMD is 128 and its number, as in a shell. When the field side dies under a CMD that says 0, so does this.
     """
+    from fieldtwin.running.struck import struck_of
     from fieldtwin.running.template_here import system_file
     from fieldtwin.running.with_field import run_with
     from gateway.wallclock import run
@@ -87,9 +88,15 @@ def command(
         if quiet:
             return
         talk.print(f"[bold]field side[/bold] of {escape(loaded.name)}")
+        show_warnings(loaded.warnings)
         for name, value in env.items():
             if name.endswith(LONG):
                 continue
             talk.print(f"  {name}={escape(value)}", soft_wrap=True)
 
-    return run(run_with(config, words, instance=instance, faults=put_in, tell=tell))
+    def tell_struck(struck: list[dict[str, Any]]) -> None:
+        if not quiet:
+            for one in struck:
+                talk.print(f"fault {struck_of(one).text}", soft_wrap=True, markup=False, highlight=False)
+
+    return run(run_with(config, words, instance=instance, faults=put_in, tell=tell, tell_struck=tell_struck))

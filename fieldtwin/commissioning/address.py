@@ -69,13 +69,17 @@ def tags_of(
     profile: DeviceProfile | None = None,
     dictionary: ObjectDictionary | None = None,
 ) -> list[Tag]:
-    """The tags that `items` name, in their order and each once. Without items: every readable tag of the profile.
+    """Return the tags that `items` name, in their order and each once.
+
+    Without items: every readable tag of the profile, or else every readable object of the EDS except DOMAIN objects (files).
 
     A name is looked for in the profile first (a shell pattern takes all that it fits: ``voltage_*``), then in the EDS; the rest
     are raw addresses. Raises `UsageError` that names what was meant.
     """
     form = form or RawForm()
     if not items:
+        if profile is None and dictionary is not None:
+            return [tag_of_entry(e) for e in dictionary if e.access != "wo" and e.type_code != DataType.DOMAIN]
         if profile is None:
             example = "holding:100" if protocol == "modbus" else "6041h:00"
             raise UsageError("nothing to read", expected=f"an address such as {example}, or --profile NAME")

@@ -10,9 +10,18 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from fieldtwin.commissioning.dump_objects import ObjectKey
-from fieldtwin.commissioning.dump_sweep import Outcome, Refused, Silent, Taken
+from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent, Taken
 from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import Bug, CrcError, Desync, ModbusExceptionReply, ReplyTimeout, SdoAborted
+from gateway.core.errors import (
+    Bug,
+    CrcError,
+    Desync,
+    ModbusExceptionReply,
+    ReplyTimeout,
+    SdoAborted,
+    WireError,
+    WrongSize,
+)
 from gateway.core.profile import RegisterRange
 from gateway.protocols.canopen.abort_codes import TIMED_OUT
 from gateway.protocols.canopen.master import CanopenMaster
@@ -49,8 +58,8 @@ class Asked:
 class Asker(Protocol):
     """Asks one device."""
 
-    async def read(self, asked: RegisterRange | ObjectKey) -> Asked:
-        """Read that. Raises only what ends the connection."""
+    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Asked:
+        """Read that, without any retry unless `patient`. Raises only what ends the connection."""
         ...
 
     async def function(self, request: Request[Any]) -> Asked:
@@ -69,17 +78,17 @@ class ModbusAsker:
         self._retries, self._spacing_ns = retries, round(spacing_s * NS_PER_S)
         self._free_ns = 0
 
-    async def read(self, asked: RegisterRange | ObjectKey) -> Asked:
+    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Asked:
         if not isinstance(asked, RegisterRange):
             raise Bug("a unit has registers", got=str(asked))
-        return await self._patiently(lambda: self._read(asked))
+        return await self._patiently(lambda: self._read(asked), self._retries if patient else 0)
 
     async def function(self, request: Request[Any]) -> Asked:
         async def once() -> tuple[bytes, int]:
             reply = await self._client.execute(self._unit, request)
             return reply.raw, reply.t_ns
 
-        return await self._patiently(once)
+        return await self._patiently(once, self._retries)
 
     async def _read(self, at: RegisterRange) -> tuple[bytes, int]:
         if at.table == "coil" or at.table == "discrete":
@@ -88,8 +97,10 @@ class ModbusAsker:
         reply = await self._client.read_registers(self._unit, at.table, at.address, at.count)
         return reply.raw, reply.t_ns
 
-    async def _patiently(self, once: Callable[[], Awaitable[tuple[bytes, int]]]) -> Asked:
+    async def _patiently(self, once: Callable[[], Awaitable[tuple[bytes, int]]], retries: int) -> Asked:
         lost = busy = 0
+        invalid: WireError | None = None
+        first_ns = self._clock.monotonic_ns()
         while True:
             await self._clock.sleep_until_ns(self._free_ns)
             asked_ns = self._clock.monotonic_ns()
@@ -104,8 +115,10 @@ class ModbusAsker:
                 await self._clock.sleep_until_ns(self._clock.monotonic_ns() + round(BUSY_WAIT_S * NS_PER_S))
             except (ReplyTimeout, CrcError, Desync) as e:
                 lost += 1
-                if lost > self._retries:
-                    return Asked(Silent(e.message), self._us(asked_ns), lost + busy)
+                if not isinstance(e, ReplyTimeout):
+                    invalid = e
+                if lost > retries:
+                    return Asked(_without_result(invalid or e), self._us(first_ns), lost + busy)
             else:
                 return Asked(Taken(raw), max(0, t_ns - asked_ns) // 1000, lost + busy + 1)
             finally:
@@ -113,6 +126,13 @@ class ModbusAsker:
 
     def _us(self, since_ns: int) -> int:
         return (self._clock.monotonic_ns() - since_ns) // 1000
+
+
+def _without_result(error: WireError) -> Silent | Invalid:
+    """Silence and a reply that is no valid one are different findings about a device."""
+    if isinstance(error, ReplyTimeout):
+        return Silent(error.message)
+    return Invalid(error.message, values=error.got_bytes // 2 if isinstance(error, WrongSize) else 0)
 
 
 class CanopenAsker:
@@ -124,7 +144,7 @@ class CanopenAsker:
         self._master, self._node, self._clock = master, node, clock
         self._retries, self._spacing_ns = retries, round(spacing_s * NS_PER_S)
 
-    async def read(self, asked: RegisterRange | ObjectKey) -> Asked:
+    async def read(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Asked:
         if not isinstance(asked, ObjectKey):
             raise Bug("a node has objects", got=str(asked))
         lost = 0
@@ -138,13 +158,14 @@ class CanopenAsker:
                 else:
                     outcome = Silent(e.message)
             except (ReplyTimeout, CrcError, Desync) as e:
-                outcome = Silent(e.message)
+                outcome = _without_result(e)
             now_ns = self._clock.monotonic_ns()
-            lost += isinstance(outcome, Silent)
+            failed = isinstance(outcome, Silent | Invalid)
+            lost += failed
             if self._spacing_ns:
                 await self._clock.sleep_until_ns(now_ns + self._spacing_ns)
-            if not isinstance(outcome, Silent) or lost > self._retries:
-                return Asked(outcome, (now_ns - asked_ns) // 1000, lost + (not isinstance(outcome, Silent)))
+            if not failed or lost > (self._retries if patient else 0):
+                return Asked(outcome, (now_ns - asked_ns) // 1000, lost + (not failed))
 
     async def function(self, request: Request[Any]) -> Asked:
         raise Bug("a node has no functions", got=str(request))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
 from gateway.protocols.canopen.nmt import NmtState
+from gateway.protocols.canopen.sync_watch import SyncWatch
 
 _STUFF = 1.1
 """Bits on the wire per bit of a frame, with stuff bits of usual data."""
@@ -50,6 +51,8 @@ class BusHeard:
     commands: int = 0
     """RPDOs, by the predefined identifiers."""
     syncs: int = 0
+    sync_producers: str = ""
+    """Why there is more than one SYNC producer; empty where nothing shows it."""
     times: int = 0
     lss_requests: int = 0
     others: int = 0
@@ -70,6 +73,7 @@ class BusEar:
 
     def __init__(self) -> None:
         self.heard = BusHeard()
+        self._sync = SyncWatch()
 
     def feed(self, frame: CanFrame, t_ns: int) -> None:
         """A frame that came at `t_ns`."""
@@ -87,6 +91,8 @@ class BusEar:
             heard.nmt_commands += 1
         elif frame.can_id == 0x80:
             heard.syncs += 1
+            self._sync.feed(frame.data, t_ns)
+            heard.sync_producers = self._sync.verdict
         elif frame.can_id == 0x100:
             heard.times += 1
         elif frame.can_id == 0x7E5:

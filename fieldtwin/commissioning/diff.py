@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
 from fieldtwin.commissioning.address import tag_of_entry
+from fieldtwin.commissioning.coverage import INVALID, REFUSED, SILENT
 from fieldtwin.commissioning.dump_file import Cell, Dump, Pass
 from fieldtwin.commissioning.dump_profile import ProfileSweep, dumped_tags
 from fieldtwin.commissioning.point import Answer, decoded
 from fieldtwin.commissioning.reading import text_of
 from gateway.core.errors import FieldtwinError
-from gateway.core.profile import READ_FUNCTION, DeviceProfile, RegisterRange, Tag, resolve_gap
+from gateway.core.profile import READ_FUNCTION, DeviceProfile, RegisterRange, Tag
 from gateway.core.values import Reason, TagValue
 from gateway.devices.codec import apply_scale
 from gateway.protocols.canopen.datatypes import LengthMismatch, decode
@@ -101,7 +102,7 @@ def diff_dumps(
     if not leave.settings:
         alone += _diff_unnamed(out, left, right, named, leave)
     if alone:
-        out.notes.append(f"{alone} values are in one dump only, and the other did not ask for them")
+        out.notes.append(f"{alone} values are in one dump only: the other did not ask for them or got no valid reply")
     _diff_access(out, left, right)
     return out
 
@@ -119,7 +120,7 @@ def diff_profile(dump: Dump, profile: DeviceProfile, leave: Leave | None = None)
         value = value_in(last, tag, profile)
         if value is None:
             if not _refused(dump, cells_of(tag)):
-                out.notes.append(f"{tag.name} ({place(tag)}) was not dumped")
+                out.notes.append(f"{tag.name} ({place(tag)}) {_why_not(dump, cells_of(tag))}")
                 continue
             out.found.append(Difference("not there", tag.name, place(tag), "cannot be read", "read by the profile"))
         else:
@@ -260,16 +261,18 @@ def _implausible(tag: Tag, value: TagValue) -> list[Difference]:
 
 
 def _refused(dump: Dump, cells: Sequence[Cell]) -> bool:
-    """Whether the device was asked for one of `cells` and said no. What lies in a void was perhaps not asked for."""
-    if any(c in dump.passes[-1].refused for c in cells):
+    """Whether the device was asked for one of `cells` and said no. Silence, an invalid reply and what was not asked for do not
+    count."""
+    if any(c in dump.passes[-1].refused for c in cells) or any(dump.state_of(c) == REFUSED for c in cells):
         return True
-    table, first = cells[0][0], cells[0][1]
-    line = dump.maps.get(table) if isinstance(table, str) else None
-    if line is None:
-        return False
-    holes = [resolve_gap(text, "sent") for text in line["holes"]]
-    last = first + len(cells)
-    return any(h.address < last and first < h.end for h in holes) or bool(line.get("given_up"))
+    line = dump.maps.get(str(cells[0][0]))
+    return line is not None and bool(line.get("function_refused"))
+
+
+def _why_not(dump: Dump, cells: Sequence[Cell]) -> str:
+    """Why a dump has no value of `cells`, where the device did not refuse them."""
+    states = {dump.state_of(c) for c in cells}
+    return {INVALID: "got no valid reply", SILENT: "got no reply"}.get(max(states), "was not asked for")
 
 
 # -- access -------------------------------------------------------------------------------------------------------
@@ -290,7 +293,7 @@ def _diff_access(out: Differences, left: Dump, right: Dump) -> None:
 def _access(line: Mapping[str, object]) -> str:
     if "code" in line:
         return f"refused with {line['code']:02X}h"
-    return "answers" if "hex" in line else "no reply"
+    return "answers" if "hex" in line else "no valid reply" if "invalid" in line else "no reply"
 
 
 def _diff_limits(out: Differences, dump: Dump, profile: DeviceProfile) -> None:

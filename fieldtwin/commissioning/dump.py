@@ -14,18 +14,29 @@ from typing import Any
 
 from fieldtwin.checking.subject import who
 from fieldtwin.commissioning.asking import PROBES, Asked, Asker
-from fieldtwin.commissioning.dump_file import Dump, DumpWriter, key_of, outcome_of
+from fieldtwin.commissioning.dump_beyond import beyond_silence, other_lengths
+from fieldtwin.commissioning.dump_file import (
+    TABLES,
+    VERSION,
+    Dump,
+    DumpWriter,
+    Pass,
+    key_of,
+    map_line,
+    outcome_of,
+    take_read,
+)
 from fieldtwin.commissioning.dump_objects import EVERYTHING, ListedObjects, ObjectKey, ObjectSweep, of_dictionary
 from fieldtwin.commissioning.dump_profile import ProfileSweep, dumped_tags
-from fieldtwin.commissioning.dump_sweep import Outcome, Refused, Silent, Sweep, TableMap, Taken
+from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent, Sweep, TableMap, Taken
 from fieldtwin.commissioning.latency import Histogram
 from fieldtwin.commissioning.reading import Target
 from fieldtwin.commissioning.wire_log import WireLog
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.errors import FileInvalid, Unreachable
-from gateway.core.profile import RegisterRange, Table, gap_text
+from gateway.core.profile import RegisterRange, gap_text
 
-TABLES: tuple[Table, ...] = ("holding", "input", "coil", "discrete")
+DEFAULT_BUDGET_S = 600.0
 ALL_TABLES = tuple(RegisterRange(table, 0, 65536) for table in TABLES)
 NOT_OF_THE_JOB = ("ended", "latency", "resumed")
 """Lines that every session writes for itself."""
@@ -41,6 +52,8 @@ class Job:
 
     `stride` as in `Sweep`; `most` the longest read to try; `pairs`: the device knows pairs of registers only. `passes` times
     through, `every_s` from the start of one to the start of the next. `functions`: ask which harmless functions there are.
+    `budget_s`: how long each table (or the objects) may take for questions without a result, where the device is silent or gives
+    a value only whole. `spacing_s`: the pause after each request, which counts against it.
     """
 
     target: Target
@@ -52,13 +65,15 @@ class Job:
     passes: int = 1
     every_s: float = 0.0
     functions: bool = True
+    budget_s: float = DEFAULT_BUDGET_S
+    spacing_s: float = 0.0
 
     def header(self) -> dict[str, Any]:
         """What makes two dumps the same job; the endpoint may be called otherwise tomorrow."""
         target = self.target
         ranges = [gap_text(s) for s in self.spans] or [f"{a:04X}h..{b:04X}h" for a, b in self.objects]
         return {
-            "fieldtwin_dump": 1,
+            "fieldtwin_dump": VERSION,
             "protocol": target.protocol,
             "address": target.address,
             "ranges": ranges,
@@ -68,16 +83,18 @@ class Job:
             "stride": self.stride,
             "most": self.most,
             "pairs": self.pairs,
+            "budget_s": self.budget_s,
         }
 
     def sweeps(self) -> list[Sweeping]:
-        target = self.target
+        """What is to be asked, one sweep for each range or table."""
+        target, budget_us = self.target, round(self.budget_s * 1e6)
         if target.protocol == "canopen":
             if self.objects or target.dictionary is None:
-                return [ObjectSweep(self.objects or EVERYTHING)]
-            return [of_dictionary(target.dictionary)]
+                return [ObjectSweep(self.objects or EVERYTHING, budget_us)]
+            return [of_dictionary(target.dictionary, budget_us)]
         if not self.spans and target.profile is not None:
-            return [ProfileSweep(target.profile, dumped_tags(target.profile)[0])]
+            return [ProfileSweep(target.profile, dumped_tags(target.profile)[0], budget_us)]
         grain = 2 if self.pairs else 1
         return [
             Sweep(
@@ -85,6 +102,8 @@ class Job:
                 most=self.most,
                 stride=self.stride,
                 grain=1 if span.table in ("coil", "discrete") else grain,
+                budget_us=budget_us,
+                spacing_us=round(self.spacing_s * 1e6),
             )
             for span in self.spans or ALL_TABLES
         ]
@@ -100,7 +119,6 @@ class Result:
     requests: int = 0
     replayed: int = 0
     answered: int = 0
-    given_up: list[str] = field(default_factory=list)
 
 
 class Dumper:
@@ -120,6 +138,7 @@ class Dumper:
         lines = earlier.lines if earlier is not None else []
         self._recorded = deque(line for line in lines if not line.keys() & set(NOT_OF_THE_JOB))
         self._progress = progress
+        self._so_far = Dump("", job.header())
         self.result = Result()
 
     async def run(self) -> Result:
@@ -130,13 +149,18 @@ class Dumper:
         sweeps = self._job.sweeps()
         total, done = sum(_size(s) for s in sweeps), 0
         for sweep in sweeps:
-            await self._follow(sweep, done, total)
+            await self._follow(sweep, sweep.asking(), done, total)
             done += _size(sweep)
-            self._map(sweep)
         if self._job.functions and self._job.target.protocol == "modbus":
             await self._functions()
         if not result.answered:
             raise Unreachable("nobody answers", where=f"{self._job.target.url} address {self._job.target.address}")
+        for sweep in sweeps:  # only now: a device that is not there is told soon
+            if isinstance(sweep, Sweep):
+                await self._follow(sweep, beyond_silence(sweep), total, total)
+                await self._follow(sweep, other_lengths(sweep), total, total)
+        for sweep in sweeps:
+            self._map(sweep)
         for number in range(1, self._job.passes):
             await self._again(number, sweeps)
         self._writer.write({"latency": {name: h.describe() for name, h in sorted(result.latency.items())}})
@@ -145,25 +169,42 @@ class Dumper:
 
     # -- passes ---------------------------------------------------------------------------------------------------
 
-    async def _follow(self, sweep: Sweeping, done: int, total: int) -> None:
-        asking: Generator[Any, Outcome, None] = sweep.asking()
+    async def _follow(self, sweep: Sweeping, asking: Generator[Any, Outcome, None], done: int, total: int) -> None:
         try:
             asked = next(asking)
             while True:
-                outcome = await self._outcome(asked)
-                self._progress(done + _place(sweep, asked), total, self.result.requests)
+                outcome = await self._outcome(asked, patient=sweep.patient)
+                self._progress(min(total, done + _place(sweep, asked)), total, self.result.requests)
                 asked = asking.send(outcome)
         except StopIteration:
             pass
 
     def _map(self, sweep: Sweeping) -> None:
-        maps = list(sweep.maps.values()) if isinstance(sweep, ProfileSweep) else []
-        maps += [sweep.found] if isinstance(sweep, Sweep) else []
-        given_up = [m.given_up for m in maps] if isinstance(sweep, Sweep) else [sweep.given_up]
-        self.result.given_up += [text for text in given_up if text]
-        for found in maps:
+        if isinstance(sweep, ObjectSweep | ListedObjects):
+            self._write(self._objects_line(sweep))
+            return
+        for found in sweep.maps.values() if isinstance(sweep, ProfileSweep) else [sweep.found]:
             self.result.maps.append(found)
-            self._write(_map_line(found))
+            self._write(map_line(self._so_far, found.table, _map_line(found)))
+
+    def _objects_line(self, sweep: ObjectSweep | ListedObjects) -> dict[str, Any]:
+        """How many objects are in each state, and which were not asked for."""
+        first = self._so_far.passes[0]
+        indexes = {index for cells in (first.cells, first.refused, first.silent, first.invalid) for index, _ in cells}
+        if isinstance(sweep, ListedObjects):
+            known = {*first.cells, *first.refused, *first.silent, *first.invalid}
+            not_asked = sum((k.index, k.subindex) not in known for k in sweep.keys)
+        else:
+            not_asked = sum(i not in indexes for low, high in sweep.ranges for i in range(low, high + 1))
+        return {
+            "map": "objects",
+            "counts": {
+                "readable": len(first.cells), "refused": len(first.refused), "silent": len(first.silent),
+                "invalid": len(first.invalid), "not_asked": not_asked,
+                "unknown": len(first.silent) + len(first.invalid) + not_asked,
+            },
+            "stopped": sweep.stopped,
+        }  # fmt: skip
 
     async def _again(self, number: int, sweeps: Sequence[Sweeping]) -> None:
         """A later pass: what the first one found, in the fewest reads."""
@@ -190,12 +231,6 @@ class Dumper:
             await self._read_again(RegisterRange(asked.table, asked.address + half, asked.count - half))
 
     async def _functions(self) -> None:
-        for found in self.result.maps:
-            function = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}[found.table]
-            line = {"function": function, "cells": found.cells, "max_read": found.max_read}
-            known = self.result.functions.get(function)
-            if known is None or known.get("cells", 0) < found.cells:
-                self.result.functions[function] = line
         for number, request in PROBES:
             taken = self._next_recorded("function", number)
             if taken is None:
@@ -207,13 +242,15 @@ class Dumper:
 
     # -- one question ---------------------------------------------------------------------------------------------
 
-    async def _outcome(self, asked: RegisterRange | ObjectKey) -> Outcome:
+    async def _outcome(self, asked: RegisterRange | ObjectKey, *, patient: bool = True) -> Outcome:
         key = key_of(asked)
         line = self._next_recorded("read", key)
         if line is None:
-            line = {"read": key} | _line(await self._ask(lambda: self._asker.read(asked)))
+            line = {"read": key} | _line(await self._ask(lambda: self._asker.read(asked, patient=patient)))
             self._writer.write(line)
         outcome = outcome_of(line)
+        if len(self._so_far.passes) == 1:
+            take_read(self._so_far, line)
         if isinstance(asked, ObjectKey) and isinstance(outcome, Taken):
             self._objects_found[(asked.index, asked.subindex)] = None
         self._count(_function(asked), line)
@@ -229,7 +266,7 @@ class Dumper:
         return asked
 
     def _count(self, function: int, line: dict[str, Any]) -> None:
-        self.result.answered += "silent" not in line
+        self.result.answered += "silent" not in line and "invalid" not in line
         if "hex" in line:  # a refusal costs a device less
             name = f"{function:02X}" if function else "SDO"
             self.result.latency.setdefault(name, Histogram()).add(int(line["us"]))
@@ -239,6 +276,7 @@ class Dumper:
     def _pass(self, number: int) -> None:
         self._pass_ns = self._clock.monotonic_ns()
         self._objects_found: dict[tuple[int, int], None] = self._objects_found if number else {}
+        self._so_far.passes.append(Pass(0))
         self._write({"pass": number, "at": _iso(self._clock.utc_ns())})
 
     def _write(self, line: dict[str, Any]) -> None:
@@ -279,20 +317,17 @@ def started(job: Job, clock: Clock) -> dict[str, Any]:
 
 
 def _map_line(found: TableMap) -> dict[str, Any]:
-    def texts(spans: list[tuple[int, int]]) -> list[str]:
-        return [gap_text(RegisterRange(found.table, a, b - a)) for a, b in spans]
-
     return {
         "map": found.table,
-        "readable": texts(found.readable),
-        "holes": texts(found.holes),
-        "voids": texts(found.voids),
-        "borders": found.borders,
+        "borders": sorted(set(found.borders)),
+        "units": [list(unit) for unit in found.units],
         "max_read": found.max_read,
         "limit_proved": found.limit_proved,
         "pairs": found.grain == 2,
         "codes": {f"{code:02X}": n for code, n in found.codes.items()},
-        "given_up": found.given_up,
+        "function_refused": found.function_refused,
+        "lengths": found.lengths,
+        "stopped": found.stopped,
     }
 
 
@@ -302,8 +337,10 @@ def _line(asked: Asked) -> dict[str, Any]:
         return {"hex": outcome.raw.hex(), "us": asked.us}
     if isinstance(outcome, Refused):
         return {"code": outcome.code, "us": asked.us}
+    if isinstance(outcome, Invalid):
+        return {"invalid": outcome.problem, "us": asked.us} | ({"values": outcome.values} if outcome.values else {})
     assert isinstance(outcome, Silent)
-    return {"silent": outcome.problem}
+    return {"silent": outcome.problem, "us": asked.us}
 
 
 def _function(asked: RegisterRange | ObjectKey) -> int:

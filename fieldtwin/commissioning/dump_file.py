@@ -2,15 +2,19 @@
 
 ::
 
-    {"fieldtwin_dump": 1, "protocol": "modbus", "endpoint": ..., "address": 1, "ranges": ["holding:0..999"], ...}
+    {"fieldtwin_dump": 2, "protocol": "modbus", "endpoint": ..., "address": 1, "ranges": ["holding:0..999"], ...}
     {"pass": 0, "at": "2026-11-21T10:00:00.000+00:00"}
     {"read": "holding:0..124", "hex": "...", "us": 3120}        answered after 3120 us
     {"read": "holding:125..249", "code": 2, "us": 1800}         refused; an SDO abort has its code here too
-    {"read": "holding:125", "silent": "..."}                    no good reply
-    {"map": "holding", "readable": ["holding:0..124"], "holes": [], "voids": [...], "max_read": 125, ...}
-    {"function": 17, "hex": "..."}                              likewise `code`, `silent`
+    {"read": "holding:125", "silent": "...", "us": 3000000}     no reply
+    {"read": "holding:126", "invalid": "...", "us": 9000}       something came that is no valid reply; `values` as in `Invalid`
+    {"map": "holding", "readable": ["holding:0..124"], "refused": [], "silent": [...], "not_asked": [...], "max_read": 125, ...}
+    {"function": 17, "hex": "..."}                              likewise `code`, `silent`, `invalid`
     {"latency": {"03": {...}}}
     {"ended": "2026-11-21T10:00:09.000+00:00", "requests": 131}
+
+Version 1 had no `invalid` (it was among `silent`), and its `map` lines called silence a hole. It is still read; the states of
+addresses then come from its `read` lines.
 
 It must never know a wire.
 """
@@ -25,13 +29,26 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.commissioning.coverage import (
+    ADDRESSES,
+    INVALID,
+    NOT_ASKED,
+    READABLE,
+    REFUSED,
+    SILENT,
+    Coverage,
+    describe,
+    joined,
+)
 from fieldtwin.commissioning.dump_objects import ObjectKey
-from fieldtwin.commissioning.dump_sweep import Outcome, Refused, Silent, Taken
+from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent, Taken
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid
-from gateway.core.profile import RegisterRange, gap_text, resolve_gap
+from gateway.core.profile import RegisterRange, Table, gap_text, resolve_gap
 
-VERSION = 1
+VERSION = 2
+READABLE_VERSIONS = (1, 2)
+TABLES: tuple[Table, ...] = ("holding", "input", "coil", "discrete")
 MOST_LINE_BYTES = 1 << 20
 MOST_CELLS = 50_000_000
 """Cells of all passes together: what a computer holds. A file with more is refused, not loaded."""
@@ -42,11 +59,18 @@ Cell = tuple[str, int] | tuple[int, int]
 
 @dataclass
 class Pass:
-    """The values of one time through. Registers are 2 bytes, bits one (0 or 1); objects as the node sent them."""
+    """The values of one time through. Registers are 2 bytes, bits one (0 or 1); objects as the node sent them.
+
+    `refused` holds exception or abort codes; `silent` and `invalid` what got no reply and no valid one. For registers these three
+    hold only what was asked one by one. `failed` counts the reads of any length that brought no values.
+    """
 
     utc_ns: int
     cells: dict[Cell, bytes] = field(default_factory=dict)
     refused: dict[Cell, int] = field(default_factory=dict)
+    silent: dict[Cell, str] = field(default_factory=dict)
+    invalid: dict[Cell, str] = field(default_factory=dict)
+    failed: int = 0
 
     @property
     def at(self) -> datetime:
@@ -67,14 +91,52 @@ class Dump:
     lines: list[dict[str, Any]] = field(default_factory=list)
     ended: bool = False
     whole_bytes: int = 0
+    coverage: dict[str, Coverage] = field(default_factory=dict)
+    """What the first pass says about the addresses of each table that was asked."""
+    asked: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
 
     @property
     def protocol(self) -> str:
         return str(self.header["protocol"])
 
+    @property
+    def names_ranges(self) -> bool:
+        """Whether addresses were asked for, and not the tags of a profile."""
+        return bool(self.header["ranges"]) or not self.header.get("profile")
+
+    def scope(self, table: str) -> list[tuple[int, int]]:
+        """The addresses of a table that the dump was to ask for; with a profile, those that its tags were read at."""
+        if not self.names_ranges:
+            return joined(self.asked.get(table, []))
+        spans = [resolve_gap(text, "sent") for text in self.header["ranges"]]
+        return joined([(s.address, s.end) for s in spans if s.table == table]) if spans else [(0, ADDRESSES)]
+
     def holes(self, table: str) -> list[RegisterRange]:
-        """What was asked one by one and refused."""
-        return [resolve_gap(text, "sent") for text in self.maps.get(table, {}).get("holes", [])]
+        """Ranges in which the device refused every address."""
+        return [resolve_gap(text, "sent") for text in self.maps.get(table, {}).get("refused", [])]
+
+    @property
+    def unknown(self) -> tuple[int, int]:
+        """How many addresses or objects are unknown, and how many were to be asked for."""
+        counts = [line["counts"] for line in self.maps.values() if "counts" in line]
+        return sum(c["unknown"] for c in counts), sum(n for c in counts for key, n in c.items() if key != "unknown")
+
+    @property
+    def is_mostly_unknown(self) -> bool:
+        """Whether the device gave no definite answer for more than half of what the dump was to ask for."""
+        unknown, asked_for = self.unknown
+        return 2 * unknown > asked_for
+
+    def state_of(self, cell: Cell) -> int:
+        """One of the states in `coverage`, for a register or an object, from the first pass."""
+        if isinstance(cell[0], str):
+            known = self.coverage.get(cell[0])
+            return known.states[cell[1]] if known is not None else NOT_ASKED
+        first = self.passes[0] if self.passes else Pass(0)
+        for state, cells in ((READABLE, first.cells), (REFUSED, first.refused), (SILENT, first.silent)):
+            if cell in cells:
+                return state
+        return INVALID if cell in first.invalid else NOT_ASKED
 
 
 def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
@@ -88,6 +150,8 @@ def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
         try:
             if dump is None:
                 dump = Dump(str(path), _header(line))
+                if dump.protocol == "modbus":
+                    dump.scope("holding")  # the ranges must be ranges
             else:
                 cells += _take(dump, line)
                 if keep_lines:
@@ -99,7 +163,24 @@ def load_dump(path: Path, *, keep_lines: bool = False) -> Dump:
         dump.whole_bytes = end
     if dump is None:
         raise FileInvalid("an empty file is no dump", path=str(path))
+    if dump.protocol == "modbus":
+        for table in TABLES:
+            if table in dump.maps or table in dump.coverage:
+                dump.maps[table] = map_line(dump, table, dump.maps.get(table, {"map": table}))
     return dump
+
+
+def map_line(dump: Dump, table: Table, found: dict[str, Any]) -> dict[str, Any]:
+    """`found`, the line about the limits of a table, with the state of each address as the reads of `dump` tell it."""
+    states = describe(
+        table,
+        dump.coverage.get(table) or Coverage(),
+        dump.scope(table),
+        function_refused=bool(found.get("function_refused")),
+    )
+    defaults = {"borders": [], "max_read": 0, "limit_proved": False, "pairs": False, "codes": {}, "lengths": []}
+    kept = {key: value for key, value in found.items() if key not in ("holes", "voids", "given_up")}
+    return defaults | {"stopped": found.get("given_up", "")} | kept | states
 
 
 def _lines(path: Path) -> Iterator[tuple[int, int, dict[str, Any]]]:
@@ -126,7 +207,7 @@ def _lines(path: Path) -> Iterator[tuple[int, int, dict[str, Any]]]:
 
 
 def _header(line: dict[str, Any]) -> dict[str, Any]:
-    if line.get("fieldtwin_dump") != VERSION:
+    if line.get("fieldtwin_dump") not in READABLE_VERSIONS:
         raise ValueError(f"expected the header of a dump, version {VERSION}")
     if line["protocol"] not in ("modbus", "canopen") or not isinstance(line["ranges"], list):
         raise ValueError("header")
@@ -139,7 +220,7 @@ def _take(dump: Dump, line: dict[str, Any]) -> int:
         at = datetime.fromisoformat(line["at"])
         dump.passes.append(Pass(round(at.timestamp() * 1000) * 1_000_000))
     elif "read" in line:
-        return _take_read(dump.passes[-1], dump.protocol, line)
+        return take_read(dump, line)
     elif "map" in line:
         dump.maps[str(line["map"])] = line
     elif "function" in line:
@@ -153,34 +234,55 @@ def _take(dump: Dump, line: dict[str, Any]) -> int:
     return 0
 
 
-def _take_read(current: Pass, protocol: str, line: dict[str, Any]) -> int:
-    if protocol == "canopen":
+def take_read(dump: Dump, line: dict[str, Any]) -> int:
+    """Put an answer into the last pass, and into the coverage if that is the first. Return how many values it brought."""
+    current, outcome = dump.passes[-1], outcome_of(line)
+    if dump.protocol == "canopen":
         key = ObjectKey.parse(line["read"])
-        cell: Cell = (key.index, key.subindex)
-        if "hex" in line:
-            current.cells[cell] = bytes.fromhex(line["hex"])
-        elif "code" in line:
-            current.refused[cell] = int(line["code"])
+        _take_outcome(current, (key.index, key.subindex), outcome)
         return 1
     at = resolve_gap(line["read"], "sent")
-    if "hex" not in line:
-        if "code" in line and at.count == 1:
-            current.refused[(at.table, at.address)] = int(line["code"])
+    if len(dump.passes) == 1:
+        known = dump.coverage.setdefault(at.table, Coverage() if dump.names_ranges else Coverage(ADDRESSES))
+        known.note(at, STATE_OF[type(outcome)])
+        dump.asked.setdefault(at.table, []).append((at.address, at.end))
+    if not isinstance(outcome, Taken):
+        current.failed += 1
+        if at.count == 1:
+            _take_outcome(current, (at.table, at.address), outcome)
         return 0
-    raw = bytes.fromhex(line["hex"])
     width = 1 if at.table in ("coil", "discrete") else 2
-    if len(raw) != at.count * width:
-        raise ValueError(f"{len(raw)} bytes for {at.count} values")
+    if len(outcome.raw) != at.count * width:
+        raise ValueError(f"{len(outcome.raw)} bytes for {at.count} values")
     for i in range(at.count):
-        current.cells[(at.table, at.address + i)] = raw[i * width : i * width + width]
+        current.cells[(at.table, at.address + i)] = outcome.raw[i * width : i * width + width]
     return at.count
+
+
+def _take_outcome(current: Pass, cell: Cell, outcome: Outcome) -> None:
+    if isinstance(outcome, Taken):
+        current.cells[cell] = outcome.raw
+    elif isinstance(outcome, Refused):
+        current.refused[cell] = outcome.code
+    elif isinstance(outcome, Silent):
+        current.silent[cell] = outcome.problem
+    else:
+        current.invalid[cell] = outcome.problem
+
+
+STATE_OF = {Taken: READABLE, Refused: REFUSED, Silent: SILENT, Invalid: INVALID}
 
 
 def outcome_of(line: dict[str, Any]) -> Outcome:
     """What a recorded answer was."""
+    us = int(line.get("us", 0))
     if "hex" in line:
-        return Taken(bytes.fromhex(line["hex"]))
-    return Refused(int(line["code"])) if "code" in line else Silent(str(line["silent"]))
+        return Taken(bytes.fromhex(line["hex"]), us)
+    if "code" in line:
+        return Refused(int(line["code"]), us)
+    if "invalid" in line:
+        return Invalid(str(line["invalid"]), us, int(line.get("values", 0)))
+    return Silent(str(line["silent"]), us)
 
 
 def key_of(asked: RegisterRange | ObjectKey) -> str:

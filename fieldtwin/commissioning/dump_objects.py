@@ -8,12 +8,15 @@ from __future__ import annotations
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 
-from fieldtwin.commissioning.dump_sweep import MOST_SILENT, Outcome, Refused, Silent, Taken
+from fieldtwin.commissioning.coverage import coarse_to_fine
+from fieldtwin.commissioning.dump_sweep import MOST_SILENT, Invalid, Outcome, Refused, Silent, Taken
 from gateway.protocols.canopen.dictionary import ObjectDictionary
 
 NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
 MOST_MISSING = 8
 """After so many subindices in a row that do not exist an array has ended, whatever its subindex 0 says."""
+LEVELS = ((0x1000,), (0x100, 0x800), (0x40,), (0x10,))
+"""Where profiles begin groups of objects, the likeliest first."""
 EVERYTHING = ((0x1000, 0x9FFF),)
 """Communication, manufacturer and device profile area (CiA 301, 7.4.1)."""
 
@@ -39,24 +42,70 @@ class ObjectKey:
         return cls(int(index.removesuffix("h"), 16), int(sub, 16))
 
 
-class ObjectSweep:
-    """Asks every index of `ranges` (both ends included) for subindex 0, and what it finds for the others."""
+class _Patience:
+    """How long a node that does not answer is asked. `budget_us`: the time that questions without a result may take together."""
 
-    def __init__(self, ranges: Sequence[tuple[int, int]] = EVERYTHING) -> None:
+    def __init__(self, budget_us: int | None) -> None:
+        self.stopped = ""
+        self.patient = True
+        self._budget_us = budget_us
+        self._spent_us = self._silent = 0
+        self._heard = False
+
+    @property
+    def lost(self) -> bool:
+        """Whether the node was silent for the last `MOST_SILENT` questions."""
+        return self._silent >= MOST_SILENT
+
+    def note(self, outcome: Outcome) -> None:
+        """Take down what a question came to."""
+        self._silent = self._silent + 1 if isinstance(outcome, Silent) else 0
+        self._heard |= not isinstance(outcome, Silent)
+        self._spent_us += outcome.us if isinstance(outcome, Silent | Invalid) else 0
+        self.patient = not self.lost
+        if self.lost and not self._heard:
+            self.stopped = f"no reply {MOST_SILENT} times in a row"
+        elif self._budget_us is not None and self._spent_us > self._budget_us:
+            self.stopped = f"the time budget of {self._budget_us / 1e6:g} s for questions without a result is used up"
+
+
+class ObjectSweep(_Patience):
+    """Asks every index of `ranges` (both ends included) for subindex 0, and what it finds for the others.
+
+    After `MOST_SILENT` questions in a row without a reply the other indexes are sampled, the roundest first. Where the node
+    answers again, the sweep continues from there.
+    """
+
+    def __init__(self, ranges: Sequence[tuple[int, int]] = EVERYTHING, budget_us: int | None = None) -> None:
+        super().__init__(budget_us)
         self.ranges = ranges
-        self.given_up = ""
-        self._silent = 0
+        self._asked: set[int] = set()
 
     def asking(self) -> Asking:
         for first, last in self.ranges:
-            for index in range(first, last + 1):
-                outcome = yield from self._ask(index, 0)
-                if self.given_up:
+            yield from self._walk(first, last)
+            for index in coarse_to_fine(first, last + 1, 1, LEVELS):
+                if self.stopped:
                     return
-                if isinstance(outcome, Taken) and len(outcome.raw) == 1 and outcome.raw[0]:
-                    yield from self._members(index, outcome.raw[0])
-                elif isinstance(outcome, Refused) and outcome.code == NO_SUBINDEX:
-                    yield from self._members(index, 1)
+                if index not in self._asked:
+                    yield from self._one(index)
+                    if not self.lost:
+                        yield from self._walk(index + 1, last)
+
+    def _walk(self, first: int, last: int) -> Asking:
+        for index in range(first, last + 1):
+            if self.stopped or self.lost:
+                return
+            if index not in self._asked:
+                yield from self._one(index)
+
+    def _one(self, index: int) -> Asking:
+        self._asked.add(index)
+        outcome = yield from self._ask(index, 0)
+        if isinstance(outcome, Taken) and len(outcome.raw) == 1 and outcome.raw[0]:
+            yield from self._members(index, outcome.raw[0])
+        elif isinstance(outcome, Refused) and outcome.code == NO_SUBINDEX:
+            yield from self._members(index, 1)
 
     def _members(self, index: int, count: int) -> Generator[ObjectKey, Outcome, None]:
         """Where subindex 0 is a small number it may count the others: subindex 1 tells."""
@@ -64,34 +113,29 @@ class ObjectSweep:
         for sub in range(1, min(count, 254) + 1):
             outcome = yield from self._ask(index, sub)
             missing = missing + 1 if isinstance(outcome, Refused) and outcome.code in (NO_SUBINDEX, NO_OBJECT) else 0
-            if self.given_up or missing >= MOST_MISSING or (missing and sub == 1):
+            if self.stopped or self.lost or missing >= MOST_MISSING or (missing and sub == 1):
                 return
 
     def _ask(self, index: int, sub: int) -> Generator[ObjectKey, Outcome, Outcome]:
         outcome = yield ObjectKey(index, sub)
-        self._silent = self._silent + 1 if isinstance(outcome, Silent) else 0
-        if self._silent >= MOST_SILENT:
-            self.given_up = f"no reply {MOST_SILENT} times in a row"
+        self.note(outcome)
         return outcome
 
 
-class ListedObjects:
-    """Asks for `keys`, one after the other."""
+class ListedObjects(_Patience):
+    """Asks for `keys`, one after the other; without retries while the node is silent."""
 
-    def __init__(self, keys: Iterable[ObjectKey]) -> None:
+    def __init__(self, keys: Iterable[ObjectKey], budget_us: int | None = None) -> None:
+        super().__init__(budget_us)
         self.keys = list(keys)
-        self.given_up = ""
 
     def asking(self) -> Asking:
-        silent = 0
         for key in self.keys:
-            outcome = yield key
-            silent = silent + 1 if isinstance(outcome, Silent) else 0
-            if silent >= MOST_SILENT:
-                self.given_up = f"no reply {MOST_SILENT} times in a row"
+            self.note((yield key))
+            if self.stopped:
                 return
 
 
-def of_dictionary(dictionary: ObjectDictionary) -> ListedObjects:
-    """Every entry that can be read."""
-    return ListedObjects(ObjectKey(e.index, e.subindex) for e in dictionary if e.readable)
+def of_dictionary(dictionary: ObjectDictionary, budget_us: int | None = None) -> ListedObjects:
+    """A sweep of every entry that can be read."""
+    return ListedObjects((ObjectKey(e.index, e.subindex) for e in dictionary if e.readable), budget_us)

@@ -9,40 +9,55 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fieldtwin.commissioning.dump_sweep import MOST_SILENT, Asking, Refused, Silent, TableMap, Taken, joined
+from fieldtwin.commissioning.coverage import joined
+from fieldtwin.commissioning.dump_sweep import MOST_SILENT, Asking, Invalid, Refused, Silent, TableMap, Taken
 from fieldtwin.commissioning.point import asked_profile
 from gateway.core.profile import DeviceProfile, RegisterRange, Tag
 from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan
 
 
 class ProfileSweep:
-    """Reads `tags` of `profile`. `maps` say what was found, by table; `learnt` what the device taught."""
+    """Reads `tags` of `profile`. `maps` say what was found, by table.
 
-    def __init__(self, profile: DeviceProfile, tags: Sequence[Tag]) -> None:
+    Where the device is silent, reads are not repeated after `MOST_SILENT` in a row, and end when they have taken `budget_us`.
+    """
+
+    def __init__(self, profile: DeviceProfile, tags: Sequence[Tag], budget_us: int | None = None) -> None:
         asked = asked_profile(tags, profile)
         self.plan = GroupPlan(replace(asked, gaps=(*asked.gaps, *_let_alone(profile, tags))), "asked")
-        self.given_up = ""
+        self.stopped = ""
+        self.patient = True
         self.maps: dict[str, TableMap] = {}
+        self._budget_us = budget_us
 
     def asking(self) -> Asking:
-        todo, silent = list(self.plan.reads), 0
-        while todo and not self.given_up:
+        todo, silent, spent_us, heard = list(self.plan.reads), 0, 0, False
+        while todo and not self.stopped:
             read = todo.pop(0)
+            self.patient = silent < MOST_SILENT
             outcome = yield read.range
             found = self.maps.setdefault(read.range.table, TableMap(read.range.table))
-            silent = silent + 1 if isinstance(outcome, Silent) else 0
-            if silent >= MOST_SILENT:
-                self.given_up = f"no reply {MOST_SILENT} times in a row"
             if isinstance(outcome, Taken):
                 self.plan.taken(read)
                 found.readable = joined([*found.readable, (read.range.address, read.range.end)])
                 found.max_read = max(found.max_read, read.range.count)
             elif isinstance(outcome, Refused):
                 found.codes[outcome.code] = found.codes.get(outcome.code, 0) + 1
-                parts = self.plan.refused(read, outcome.code) if outcome.code in (ILLEGAL_ADDRESS, TOO_LONG) else ()
-                todo[:0] = parts
-                if not parts:
-                    found.holes = joined([*found.holes, (read.range.address, read.range.end)])
+            if isinstance(outcome, Refused) and outcome.code in (ILLEGAL_ADDRESS, TOO_LONG):
+                todo[:0] = self.plan.refused(read, outcome.code)
+            elif isinstance(outcome, Silent | Invalid) and heard:  # one register of several may be the reason
+                todo[:0] = self.plan.refused(read)
+            silent = silent + 1 if isinstance(outcome, Silent) else 0
+            heard |= not isinstance(outcome, Silent)
+            spent_us += outcome.us if isinstance(outcome, Silent | Invalid) else 0
+            if silent >= MOST_SILENT and not heard:
+                self.stopped = f"no reply {MOST_SILENT} times in a row"
+            elif self._budget_us is not None and spent_us > self._budget_us:
+                self.stopped = (
+                    f"the time budget of {self._budget_us / 1e6:g} s for questions without a result is used up"
+                )
+        for table, found in self.maps.items():
+            found.stopped = self.stopped if any(r.range.table == table for r in todo) else ""
         self.plan.pass_ended()
 
     def reads(self) -> list[RegisterRange]:

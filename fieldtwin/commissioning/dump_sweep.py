@@ -4,8 +4,9 @@ Pure: a sweep is a generator that yields what to ask and is sent what came of it
 questions, which is how an interrupted dump goes on: what was recorded is answered again, and nothing is asked twice.
 
 A read that is refused has a hole in it or is too long, and the exception code does not tell which (devices disagree). So a
-single register decides; behind a readable prefix the next register decides again, and a short read over the border.
-In a void only some addresses are asked (`Sweep.stride`): what is readable for at least that long is always found.
+single register decides; after a readable prefix the next register decides again, and a short read over the border.
+Where nothing can be read only some addresses are asked (`Sweep.stride`). Where the device is silent `asking` stops early, because
+each question costs a timeout; `dump_beyond` continues from there within a time budget.
 """
 
 from __future__ import annotations
@@ -14,24 +15,28 @@ from collections.abc import Generator
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from fieldtwin.commissioning.coverage import INVALID, READABLE, REFUSED, SILENT, Coverage, joined
 from gateway.core.profile import RegisterRange, Table
 from gateway.protocols.modbus.requests import MAX_READ_BITS, MAX_READ_REGISTERS
 
 ILLEGAL_FUNCTION = 0x01
 DENSE = 8
-"""So many addresses behind a readable one are all asked before a sweep strides."""
+"""So many addresses after a readable one are all asked before a sweep strides."""
 ROUND = 50
-"""A stride also stops at round numbers, as manuals like them."""
+"""A stride also stops at multiples of this, because manuals like round numbers."""
 MOST_SILENT = 10
-"""After so many reads in a row without a reply a table is given up."""
+"""After so many reads in a row without a reply a sweep stops asking address by address."""
+TRUSTED_SILENCE = 2
+"""Once so many patient questions got no reply, silence is how this device refuses: probes are not repeated any more."""
 MOST_PAIR_TRIALS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Taken:
-    """The device answered; `raw` as on the wire, bits one a byte."""
+    """The device answered; `raw` as on the wire, bits one a byte. It took `us` microseconds, as in the other outcomes."""
 
     raw: bytes
+    us: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,171 +44,252 @@ class Refused:
     """The device answered with this exception."""
 
     code: int
+    us: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class Silent:
-    """No good reply, however often it was asked."""
+    """Nothing that could be a reply arrived, however often the device was asked."""
 
     problem: str
+    us: int = 0
 
 
-Outcome = Taken | Refused | Silent
+@dataclass(frozen=True, slots=True)
+class Invalid:
+    """Something arrived and it was no valid reply. `values` is how many registers it carried where it was a reply of the wrong
+    size, else 0."""
+
+    problem: str
+    us: int = 0
+    values: int = 0
+
+
+Outcome = Taken | Refused | Silent | Invalid
 Asking = Generator[RegisterRange, Outcome, None]
 Trying = Generator[RegisterRange, Outcome, bool]
 
 
 @dataclass
 class TableMap:
-    """What was found out about a table. Intervals are [start, end) in the order of addresses.
+    """What was found out about a table and cannot be seen from single addresses. Intervals are [start, end).
 
-    `holes` were asked one by one and refused; in `voids` every address that was asked was refused, and not all were asked.
-    A border, at its address, is where a read may not go over although both sides can be read. `max_read` is the longest
-    read that was taken; `limit_proved` says that one more is refused (or that it is the standard's limit). `codes`
-    counts exceptions. `given_up` says why nothing more was asked.
+    A border, at its address, is where a read may not go over although both sides can be read. In ``(start, end, n)`` of `units`
+    reads take multiples of `n` registers from `start` on. `max_read` is the longest read that was taken; `limit_proved` says that
+    one more is refused (or that it is the standard's limit). `codes` counts exceptions. `stopped` says why not everything was
+    asked that the sweep intended to ask; `function_refused` that the device does not know the table's function.
+    `lengths` are the read lengths that were asked for wherever the sweep looked for registers among refusals.
     """
 
     table: Table
     readable: list[tuple[int, int]] = field(default_factory=list)
-    holes: list[tuple[int, int]] = field(default_factory=list)
-    voids: list[tuple[int, int]] = field(default_factory=list)
     borders: list[int] = field(default_factory=list)
+    units: list[tuple[int, int, int]] = field(default_factory=list)
     max_read: int = 0
     limit_proved: bool = False
     grain: int = 1
     codes: dict[int, int] = field(default_factory=dict)
-    given_up: str = ""
+    stopped: str = ""
+    function_refused: bool = False
+    lengths: list[int] = field(default_factory=list)
 
     @property
     def cells(self) -> int:
         """How many addresses can be read."""
         return sum(end - start for start, end in self.readable)
 
+    def add_unit(self, start: int, end: int, size: int) -> None:
+        """Take down that reads from `start` to before `end` take multiples of `size` registers."""
+        self.units = [u for u in self.units if not (start <= u[0] and u[1] <= end)] + [(start, end, size)]
+
     def reads(self) -> list[RegisterRange]:
         """The fewest reads that bring everything readable, never over a hole or a border."""
         most = self.max_read or 1
-        planned = []
+        planned: list[RegisterRange] = []
         for start, end in self.readable:
-            cuts = [start, *(b for b in self.borders if start < b < end), end]
+            inside = {edge for low, high, _ in self.units for edge in (low, high) if start < edge < end}
+            cuts = [start, *sorted({*inside, *(b for b in self.borders if start < b < end)}), end]
             for low, high in pairwise(cuts):
-                planned += [RegisterRange(self.table, a, min(most, high - a)) for a in range(low, high, most)]
+                unit = next((n for first, last, n in self.units if first <= low < last), 1)
+                step = max(unit, most - most % unit)
+                planned += [RegisterRange(self.table, a, min(step, high - a)) for a in range(low, high, step)]
         return planned
 
 
 class Sweep:
     """Finds out about `span`. `most` is the longest read to try (None: the standard's). `stride` 1 asks every address.
 
-    `found` grows as `asking` runs.
+    `found` and `coverage` grow as `asking` runs. `patient` says whether the question that was just yielded deserves retries.
+    `budget_us` limits the time that questions without a result take (None: no limit); `spacing_us` is the pause after each.
     """
 
-    def __init__(self, span: RegisterRange, *, most: int | None = None, stride: int = 8, grain: int = 1) -> None:
+    def __init__(
+        self,
+        span: RegisterRange,
+        *,
+        most: int | None = None,
+        stride: int = 8,
+        grain: int = 1,
+        budget_us: int | None = None,
+        spacing_us: int = 0,
+    ) -> None:
         bits = span.table in ("coil", "discrete")
         self.span = span
         self.stride = stride
+        self.coverage = Coverage()
+        self.asked: set[tuple[int, int]] = set()
+        self.patient = True
+        self.most_silent = MOST_SILENT
+        self.charges_everything = False
+        self.spent_us = 0
+        self._budget_us, self._spacing_us = budget_us, spacing_us
+        self._lost = False
+        self._silences = 0
+        self._hint = (-1, 0)
         self.found = TableMap(span.table, grain=grain)
-        self._standard = MAX_READ_BITS if bits else MAX_READ_REGISTERS
-        self._most = min(most or self._standard, self._standard)
+        self.standard = MAX_READ_BITS if bits else MAX_READ_REGISTERS
+        self._most = min(most or self.standard, self.standard)
         self._most -= self._most % grain
         self._silent = 0
-        self._in_words = not bits
-        self._singles = False
+        self.in_words = not bits
+        self.singles = False
         self._pair_trials = MOST_PAIR_TRIALS if not bits and grain == 1 else 0
 
-    def asking(self) -> Asking:
-        """Yields ranges to read, is sent outcomes, and ends when the span is known or the table given up."""
-        at, end = self.span.address, self.span.end
-        while at < end and not self.found.given_up:
-            if (yield from self._try(at, min(self._most, end - at))):
-                at += min(self._most, end - at)
-                continue
-            if self.found.given_up:
-                break
-            at = yield from self._behind_a_refusal(at, min(self._most, end - at))
-        self._settle()
+    @property
+    def halted(self) -> bool:
+        """Whether the sweep is to ask nothing more here: it was stopped, or the device has become silent."""
+        return bool(self.found.stopped) or self._lost
 
-    def _behind_a_refusal(self, at: int, count: int) -> Generator[RegisterRange, Outcome, int]:
-        """`count` cells from `at` were refused: where to go on. Finds the readable prefix, and why it ends."""
+    def asking(self) -> Asking:
+        """Yield ranges to read, take outcomes, and end when the span is known, the device silent, or the table given up."""
+        yield from self.walk(self.span.address)
+
+    def resume(self) -> None:
+        """Forget the silence so far: the device has answered again."""
+        self._lost, self._silent = False, 0
+
+    def walk(self, at: int) -> Asking:
+        """Ask from `at` on until the span ends or the device is silent. What is known further on is not asked again."""
+        self.resume()
+        end, begins = self.span.end, at
+        while at < end and not self.halted:
+            if self.coverage.states[at] == READABLE and at != begins:
+                at += 1
+                continue
+            count = min(self._most, end - at)
+            if (yield from self.ask(at, count)):
+                at += count
+                continue
+            if self.halted:
+                break
+            at = begins = yield from self._after_a_refusal(at, count)
+
+    def _after_a_refusal(self, at: int, count: int) -> Generator[RegisterRange, Outcome, int]:
+        """`count` cells from `at` were not taken: where to go on. Finds the readable prefix, and why it ends."""
         grain = self.found.grain
-        good = grain if count > grain and (yield from self._try(at, grain)) else 0
+        good = grain if count > grain and (yield from self.ask(at, grain)) else 0
+        if not good and (unit := (yield from self.ask_the_length_that_came(at))):
+            return at + unit
         if not good and count > 2 and (at in self.found.borders or (self._pair_trials and at % 2 == 0)):
             self._pair_trials -= 1
-            if (yield from self._try(at, 2)):
+            if (yield from self.ask(at, 2)):
                 good = 2
-                if not self._singles:  # a device that knows pairs only
+                if not self.singles:  # a device that knows pairs only
                     self.found.grain = grain = 2
                     self._most -= self._most % 2
         if not good:
-            self._add(self.found.holes, at, min(at + grain, self.span.end))
-            return (yield from self._through_a_void(at, at + grain))
+            return (yield from self.through_a_void(at + grain))
         self._pair_trials = 0
         good = yield from self._longest(at, good, count, forward=True)
         return (yield from self._why_it_ends(at, good))
+
+    def ask_the_length_that_came(self, at: int) -> Generator[RegisterRange, Outcome, int]:
+        """Where the last reply for `at` carried another number of registers than asked for, ask for that number. Return it if the
+        device then answers, else 0."""
+        (place, count), self._hint = self._hint, (-1, 0)
+        if place != at or not count or (at, count) in self.asked or at + count > self.span.end:
+            return 0
+        if not (yield from self.ask(at, count)):
+            return 0
+        self.found.add_unit(at, at + count, count)
+        self.found.borders += [at, at + count]
+        return count
 
     def _longest(self, at: int, good: int, bad: int, *, forward: bool) -> Generator[RegisterRange, Outcome, int]:
         """The longest read that is taken, from `at` on or up to it, between one that is and one that is not."""
         grain = self.found.grain
         while bad - good > grain:
             middle = good + max(grain, (bad - good) // 2 // 2 * 2)
-            if (yield from self._try(at if forward else at - middle, middle)):
+            if (yield from self.ask(at if forward else at - middle, middle)):
                 good = middle
             else:
                 bad = middle
         return good
 
     def _why_it_ends(self, at: int, good: int) -> Generator[RegisterRange, Outcome, int]:
-        """A read of `good` cells from `at` is taken and a longer one is not: a hole behind it, a border, or the limit?"""
+        """A read of `good` cells from `at` is taken and a longer one is not: a hole after it, a border, or the limit?"""
         grain, edge = self.found.grain, at + good
-        if edge + grain > self.span.end:
+        if edge + grain > self.span.end or self.halted:
             return edge
-        if not (yield from self._try(edge, grain)):
-            if grain == 1 and self._in_words and edge + 2 <= self.span.end and (yield from self._try(edge, 2)):
+        if not (yield from self.ask(edge, grain)):
+            if unit := (yield from self.ask_the_length_that_came(edge)):
+                return edge + unit
+            if grain == 1 and self.in_words and edge + 2 <= self.span.end and (yield from self.ask(edge, 2)):
                 self.found.borders.append(edge)  # a value of two registers that may not be cut
                 return edge
-            self._add(self.found.holes, edge, min(edge + grain, self.span.end))
-            return (yield from self._through_a_void(at, edge + grain))
-        if good > grain and not (yield from self._try(edge - grain, 2 * grain)):
+            return (yield from self.through_a_void(edge + grain))
+        if good > grain and not (yield from self.ask(edge - grain, 2 * grain)):
             self.found.borders.append(edge)
             return edge
         self._most = good
         self.found.limit_proved = True
         return edge
 
-    def _through_a_void(self, readable: int, at: int) -> Generator[RegisterRange, Outcome, int]:
-        """From `at`, just behind something refused, to the next address that can be read, or to the end."""
+    def through_a_void(self, at: int) -> Generator[RegisterRange, Outcome, int]:
+        """From `at`, right after an address that could not be read, to the next one that can, or to the end."""
         end, grain, dense = self.span.end, self.found.grain, at + DENSE
-        refused = at  # everything from here to the next probe is unknown
-        probe = at
-        while probe < end and not self.found.given_up:
-            if not (yield from self._probe(probe, strided=probe >= dense and self.stride > 1)):
-                self._refused_at(refused, probe, min(probe + grain, end))
-                refused = min(probe + grain, end)
-                probe = self._next_probe(probe, dense)
-                continue
-            grain, back = self.found.grain, 0
-            if probe > refused:  # it may begin before the probe
-                room = probe - refused
-                back = room
-                if not (yield from self._try(refused, room)):
-                    back = yield from self._longest(probe, 0, room, forward=False)
-                self._refused_at(refused, probe - back, probe - back)
-            return probe - back
-        if refused < end:
-            self._add(self.found.voids, refused, end)
+        unasked = probe = at  # nothing between these two was asked
+        while probe < end and not self.halted:
+            if (yield from self._probe(probe, strided=probe >= dense and self.stride > 1)):
+                return (yield from self.back_from(probe, unasked))
+            if unit := (yield from self.ask_the_length_that_came(probe)):
+                return probe + unit
+            unasked = min(probe + grain, end)
+            probe = self._next_probe(probe, dense)
         return end
+
+    def back_from(self, at: int, lowest: int) -> Generator[RegisterRange, Outcome, int]:
+        """The register at `at` can be read: where its block begins, at `lowest` or after it."""
+        grain = self.found.grain
+        while at > lowest and not self.halted:
+            room = min(at - lowest, self._most)
+            room -= room % grain
+            if not room:
+                break
+            if (yield from self.ask(at - room, room)):
+                at -= room
+                continue
+            back = yield from self._longest(at, 0, room, forward=False)
+            at -= back
+            if not back or at - grain < lowest or not (yield from self.ask(at - grain, grain)):
+                break
+        return at
 
     def _probe(self, at: int, *, strided: bool) -> Trying:
         """Whether something can be read at `at`. As long as nothing could be, the device may know pairs only: a pair is asked
         for too, and where not every address is asked, first."""
         grain = self.found.grain
-        if at + grain > self.span.end:
+        readable = self.coverage.states[at] == READABLE
+        if readable or (at, grain) in self.asked or at + grain > self.span.end:
+            return readable
+        self.patient = self._silences < TRUSTED_SILENCE
+        if self.singles or grain == 2 or not self.in_words or at % 2 or at + 2 > self.span.end:
+            return (yield from self.ask(at, grain))
+        if strided and not (yield from self.ask(at, 2)):
             return False
-        if self._singles or grain == 2 or not self._in_words or at % 2 or at + 2 > self.span.end:
-            return (yield from self._try(at, grain))
-        if strided and not (yield from self._try(at, 2)):
-            return False
-        if (yield from self._try(at, 1)):
+        if (yield from self.ask(at, 1)):
             return True
-        if strided or (yield from self._try(at, 2)):
+        if strided or (yield from self.ask(at, 2)):
             self.found.grain = 2
             self._most -= self._most % 2
             return True
@@ -217,33 +303,49 @@ class Sweep:
         jump = min(after + -after % self.stride, after + -after % ROUND)
         return max(jump + -jump % grain, probe + grain)
 
-    def _refused_at(self, unknown: int, probe: int, end: int) -> None:
-        """`probe` to `end` was refused by itself; before it, from `unknown` on, nothing was asked."""
-        if unknown < probe:
-            self._add(self.found.voids, unknown, probe)
-        if probe < end:
-            self._add(self.found.holes, probe, end)
-
-    def _try(self, address: int, count: int) -> Trying:
-        outcome = yield RegisterRange(self.span.table, address, count)
+    def ask(self, address: int, count: int) -> Trying:
+        """Ask for `count` cells from `address` and take down the outcome. Return whether the device gave them."""
+        if self.found.stopped:
+            return False
+        self.asked.add((address, count))
+        at = RegisterRange(self.span.table, address, count)
+        outcome = yield at
+        patient, self.patient = self.patient, True
         found = self.found
         if isinstance(outcome, Taken):
             self._silent = 0
-            self._singles |= count == 1
+            self.singles |= count == 1
+            self.coverage.note(at, READABLE)
             self._add(found.readable, address, address + count)
             found.max_read = max(found.max_read, count)
-            found.limit_proved |= count == self._standard
-            return True
-        if isinstance(outcome, Refused):
+            found.limit_proved |= count == self.standard
+        elif isinstance(outcome, Refused):
             self._silent = 0
+            self.coverage.note(at, REFUSED)
             found.codes[outcome.code] = found.codes.get(outcome.code, 0) + 1
-            if outcome.code == ILLEGAL_FUNCTION and not found.readable:
-                found.given_up = "the device has no such function"
+            if found.codes.get(ILLEGAL_FUNCTION, 0) >= 2 and not found.readable:
+                found.function_refused = True
+                found.stopped = "the device refuses the function of this table (exception 01)"
+        elif isinstance(outcome, Invalid):
+            self._silent = 0
+            self.coverage.note(at, INVALID)
+            self._hint = (address, outcome.values if outcome.values != count else 0)
         else:
             self._silent += 1
-            if self._silent >= MOST_SILENT:
-                found.given_up = f"no reply {MOST_SILENT} times in a row"
-        return False
+            self._silences += patient
+            self.coverage.note(at, SILENT)
+            self._lost |= self._silent >= self.most_silent
+        self._charge(outcome)
+        return isinstance(outcome, Taken)
+
+    def _charge(self, outcome: Outcome) -> None:
+        """Count the time of a question that brought nothing against the budget."""
+        if self.charges_everything or isinstance(outcome, Silent | Invalid):
+            self.spent_us += outcome.us + self._spacing_us
+        if self._budget_us is not None and self.spent_us > self._budget_us and not self.found.stopped:
+            self.found.stopped = (
+                f"the time budget of {self._budget_us / 1e6:g} s for questions without a result is used up"
+            )
 
     @staticmethod
     def _add(spans: list[tuple[int, int]], start: int, end: int) -> None:
@@ -254,22 +356,3 @@ class Sweep:
             spans[-1] = (spans[-1][0], max(spans[-1][1], end))
         else:
             spans[:] = joined([*spans, (start, end)])
-
-    def _settle(self) -> None:
-        """What was asked here and there inside a void is part of it: of both the same is known, that nothing answered."""
-        found = self.found
-        edges = {s for s, _ in found.voids} | {e for _, e in found.voids}
-        probes = [h for h in found.holes if h[1] - h[0] < DENSE and (h[0] in edges or h[1] in edges)]
-        found.holes = [h for h in found.holes if h not in probes]
-        found.voids = joined(found.voids + probes)
-
-
-def joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Intervals in order, those that touch or overlap made one."""
-    out: list[tuple[int, int]] = []
-    for start, end in sorted(spans):
-        if out and out[-1][1] >= start:
-            out[-1] = (out[-1][0], max(out[-1][1], end))
-        else:
-            out.append((start, end))
-    return out

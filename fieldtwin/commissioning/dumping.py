@@ -12,8 +12,8 @@ from pathlib import Path
 
 from fieldtwin.commissioning.address import raw_tag
 from fieldtwin.commissioning.asking import Asker, CanopenAsker, ModbusAsker
-from fieldtwin.commissioning.dump import TABLES, Dumper, Job, Progress, Result, check_resumable, started
-from fieldtwin.commissioning.dump_file import Dump, DumpWriter, load_dump
+from fieldtwin.commissioning.dump import Dumper, Job, Progress, Result, check_resumable, started
+from fieldtwin.commissioning.dump_file import TABLES, Dump, DumpWriter, load_dump
 from fieldtwin.commissioning.dump_objects import ListedObjects, ObjectSweep
 from fieldtwin.commissioning.dump_profile import ProfileSweep
 from fieldtwin.commissioning.dump_sweep import ROUND, Sweep
@@ -36,12 +36,16 @@ CAN_BITS = 2 * 130
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """How many requests a pass takes, and how long: at best (everything can be read), and where next to nothing can."""
+    """How many requests the first pass takes, and how long: where everything can be read, and where nearly nothing can.
+
+    `budgets_s` is how long questions without a result may take besides, in all tables together.
+    """
 
     least_requests: int
     most_requests: int
     least_s: float
     most_s: float
+    budgets_s: float
 
 
 def register_spans(texts: Sequence[str]) -> tuple[RegisterRange, ...]:
@@ -94,7 +98,8 @@ def estimate(job: Job, spacing_s: float) -> Estimate:
     else:
         long_s, short_s = (8 + 7 + 255) * char_s, (8 + 7 + 7) * char_s
     each = spacing_s + REPLY_S
-    return Estimate(least, most, least * (each + long_s), most * (each + short_s))
+    budgets_s = job.budget_s * len(job.sweeps())
+    return Estimate(least, most, least * (each + long_s), most * (each + short_s), budgets_s)
 
 
 def frames(job: Job) -> list[str]:

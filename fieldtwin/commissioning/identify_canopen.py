@@ -32,15 +32,19 @@ class CanIdentity:
     clues: CanClues = field(default_factory=CanClues)
     candidates: list[Candidate] = field(default_factory=list)
     answers: bool = False
+    conflict: str = ""
+    """Why there seem to be two nodes with this id; what was read is then of either."""
 
     @property
     def summary(self) -> str:
+        if self.conflict:
+            return f"{self.conflict}; what was read may be of either"
         return summary(self.candidates) if self.answers else f"node {self.node} answers no SDO"
 
     @property
     def certain(self) -> str | None:
         """The one profile that is certain, if there is one."""
-        return certain(self.candidates)
+        return None if self.conflict else certain(self.candidates)
 
 
 async def identify_canopen(
@@ -72,6 +76,7 @@ async def identify_canopen(
             for index, name in NAMES.items():
                 on_progress(f"{index:04X}h, {name}")
                 setattr(result.clues, name, await asker.text(index))
+        result.conflict = master.conflicts.get(node, "")
     if result.answers:
         result.candidates = rank(
             judge_canopen(p, _data_sheet(p, node), result.clues) for p in profiles if p.protocol == "canopen"

@@ -72,7 +72,7 @@ async def identify_modbus(
     unit: int,
     profiles: Iterable[DeviceProfile],
     *,
-    timeout_s: float = 0.5,
+    timeout_s: float = 1.0,
     per_s: float = 20.0,
     echo: bool = False,
     on_progress: Callable[[str], None] = lambda _: None,

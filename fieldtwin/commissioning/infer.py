@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from fieldtwin.commissioning.dump_file import Dump
+from fieldtwin.commissioning.infer_calibration import calibrated, kind_of
 from fieldtwin.commissioning.infer_costs import ORDER_COST, decode_series
 from fieldtwin.commissioning.infer_fields import LIKELY, Reading, Run, infer_run, run_of, runs_of
 from fieldtwin.commissioning.infer_marks import clock_fields, marked, with_scales
@@ -101,7 +102,8 @@ def infer(series: Series) -> Inference:
             runs += [run_of(table, *part) for part in _between(address, words, found)]
     orders = _orders_kept(_look(runs, ORDER_COST, seen.pairs))
     readings = with_scales([_marked(r, series) for r in _look(runs, orders, seen.pairs)])
-    readings = sorted([*_supported(readings), *clocks], key=lambda r: (r.table, r.address))
+    readings = [_as_observed(r) for r in _supported(readings)]
+    readings = sorted([*readings, *clocks], key=lambda r: (r.table, r.address))
     return Inference(series, tuple(readings), orders)
 
 
@@ -133,6 +135,15 @@ def _marked(reading: Reading, series: Series) -> Reading:
     values = decode_series(list(zip(*columns, strict=True)), reading.type, reading.order)
     seen = marked(replace(reading, values=tuple(values or reading.values)), series.times_s)
     return replace(reading, marks=seen.marks, notes=seen.notes)
+
+
+def _as_observed(reading: Reading) -> Reading:
+    """With the share of such readings that were right on generated maps as its probability."""
+    kind = kind_of(reading.type, reading.registers, moves=reading.moves, capped=reading.capped)
+    share = calibrated(reading.probability, kind)
+    left = (1 - share) / max(1e-9, 1 - reading.probability)
+    rivals = tuple((name, at, order, min(p * left, 1 - share)) for name, at, order, p in reading.rivals)
+    return replace(reading, probability=share, model=reading.probability, rivals=rivals)
 
 
 def _orders_kept(readings: Sequence[Reading]) -> dict[str, float]:

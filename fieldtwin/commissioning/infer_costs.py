@@ -14,6 +14,7 @@ from functools import lru_cache
 from itertools import pairwise
 from statistics import median
 
+from fieldtwin.commissioning.infer_joint import bits_cost, carry_evidence
 from gateway.core.profile import REGISTERS_OF
 from gateway.devices.codec import reorder
 
@@ -28,6 +29,8 @@ TYPE_COST = {
 ORDER_COST = {"ABCD": 0.3, "CDAB": 1.0, "BADC": 3.0, "DCBA": 2.5}
 """How rare each is among devices."""
 NUMBERS = tuple(kind for kind in TYPE_COST if kind != "string")
+SWAPPED_SINGLE_COST = 3.0
+"""A device that swaps the bytes of longer values seldom swaps those of single registers."""
 ZERO_COST = 0.7
 """A register that is always 0, as most that mean nothing are."""
 
@@ -102,15 +105,20 @@ def cost_of(wholes: Sequence[int], kind: str, order: str) -> float:
     if numbers is None:
         return IMPOSSIBLE
     rarity = TYPE_COST[kind]
+    carried = 0.0
+    if REGISTERS_OF[kind] == 2:
+        carried = carry_evidence([w >> 16 for w in wholes], [w & 0xFFFF for w in wholes])
     if kind in _MANTISSA_BITS:
-        return rarity + _float_cost(numbers, kind)
+        return rarity + _float_cost(numbers, kind) - carried
     integers = [int(x) for x in numbers]
     bits = 16 * REGISTERS_OF[kind]
     wild = WILD_COST if _is_wild(integers, bits) else 0.0
     if bits == 32 and abs(integers[0]) > LARGE and _wavers(integers):
         wild = max(wild, LARGE_COST)
     signed = kind.startswith("int")
-    return rarity + wild + _first_cost(integers[0], bits, signed=signed) + walk_cost(integers)
+    if kind == "uint16" and order == "ABCD" and (flags := bits_cost(integers)) < math.inf:
+        return rarity + min(wild + _first_cost(integers[0], bits, signed=False) + walk_cost(integers), flags)
+    return rarity + wild - carried + _first_cost(integers[0], bits, signed=signed) + walk_cost(integers)
 
 
 def order_cost(kind: str, order: str, orders: Mapping[str, float]) -> float:
@@ -120,7 +128,8 @@ def order_cost(kind: str, order: str, orders: Mapping[str, float]) -> float:
     if REGISTERS_OF[kind] > 1:
         return orders[order]
     pair = ("ABCD", "CDAB") if order == "ABCD" else ("BADC", "DCBA")
-    return -math.log(sum(math.exp(-orders[o]) for o in pair))
+    rare = SWAPPED_SINGLE_COST if order == "BADC" else 0.0
+    return rare - math.log(sum(math.exp(-orders[o]) for o in pair))
 
 
 def _wavers(numbers: Sequence[int]) -> bool:

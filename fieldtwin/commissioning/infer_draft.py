@@ -1,6 +1,8 @@
 """A draft profile from what was inferred: valid for the profile reader as it stands, with the doubts beside it as comments.
 
-It must never sound surer than the inference: what is a guess is marked so, and what stood at 0 all the time is left out.
+It must never sound surer than the inference: what is a guess is marked so, and a value of unknown type is drafted register by
+register.
+Every register and bit that could be read has a tag, so that an emulator of the draft answers what the device answers.
 """
 
 from __future__ import annotations
@@ -10,13 +12,15 @@ from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
+from fieldtwin.commissioning.coverage import STATE_KEYS, STATE_NAMES
 from fieldtwin.commissioning.dump_file import Dump
 from fieldtwin.commissioning.infer import BIT_TABLES, Inference, Series
 from fieldtwin.commissioning.infer_fields import Level, Reading
+from fieldtwin.commissioning.infer_joint import toggled_bits
 from gateway.core.profile import DeviceProfile, RegisterRange, gap_text, resolve
 from gateway.core.yaml_file import parse
 
-MOST_BITS = 200
+MOST_BITS = 4000
 FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}
 
 
@@ -27,7 +31,8 @@ def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -
     lines = [
         "# Drafted by `fieldtwin infer`: what the registers probably are. Check it against the manual, name the tags, add units.",
         f"# {series.passes} passes over {series.span_s:.0f} s, {_day(series.times_s[0])}. "
-        "certain: nothing else fits; likely: more than 80 %; guess: less.",
+        "certain: nothing else fits; likely: at least 80 %; guess: at least 50 %; unknown: less.",
+        *_states(dumps),
         f"device: draft/{slug}",
         f'source: "drafted by fieldtwin infer from {len(dumps)} dump{"s" if len(dumps) > 1 else ""}"',
         "protocol: modbus",
@@ -37,9 +42,8 @@ def draft_profile(inference: Inference, dumps: Sequence[Dump], name: str = "") -
     ]
     tags = [line for r in inference.readings for line in _tag(r)]
     bits, more_bits = _bits(series)
-    left = sum(_idle(r) for r in inference.readings)
-    if left or more_bits:
-        lines.append(f"# left out: {left} registers that were always 0" + (f", {more_bits} bits" if more_bits else ""))
+    if more_bits:
+        lines.append(f"# left out: {more_bits} bits; an emulator of this draft refuses them")
     lines += ["tags:", *tags, *bits] if tags or bits else ["tags: {}"]
     return "\n".join(lines) + "\n"
 
@@ -57,6 +61,8 @@ def tag_name(reading: Reading) -> str:
 def doubts(reading: Reading) -> str:
     """How sure, against what, and what else is worth knowing; one line."""
     parts = [f"{reading.level}" if reading.level is Level.CERTAIN else f"{reading.level} ({_percent(reading)})"]
+    if reading.level is Level.UNKNOWN:
+        parts = [f"unknown, perhaps {reading.type} {reading.order} ({_percent(reading)})"]
     if reading.sign_open:
         parts.append(f"or {reading.type[1:]}, no sign was seen")
     if reading.level is not Level.CERTAIN:
@@ -84,13 +90,13 @@ def _seen(reading: Reading) -> str:
     return f"always {low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
 
 
-def _idle(reading: Reading) -> int:
-    return reading.registers if not any(reading.values) and not reading.moves else 0
-
-
 def _tag(reading: Reading) -> list[str]:
-    if _idle(reading):
-        return []
+    """The lines of one value. One of unknown type is a plain number for each of its registers."""
+    if reading.level is Level.UNKNOWN and reading.type != "uint16":
+        return [
+            f'  {reading.table}_{a}: {{at: "{reading.table}:{a}", type: uint16}}  # {doubts(reading)}'
+            for a in range(reading.address, reading.address + reading.registers)
+        ]
     keys = [f'at: "{reading.table}:{reading.address}"', f"type: {reading.type}"]
     if reading.order != "ABCD":
         keys.append(f"order: {reading.order}")
@@ -103,20 +109,49 @@ def _tag(reading: Reading) -> list[str]:
     if "enumeration" in reading.marks:
         states = sorted({int(v) for v in reading.values})
         keys.append("values: {" + ", ".join(f"{s}: state_{s}" for s in states) + "}")
-    return [f"  {tag_name(reading)}: {{{', '.join(keys)}}}  # {doubts(reading)}"]
+    return [f"  {tag_name(reading)}: {{{', '.join(keys)}}}  # {doubts(reading)}", *_flags(reading)]
+
+
+def _flags(reading: Reading) -> list[str]:
+    """A tag for each bit of a status word that changed."""
+    if "bits" not in reading.marks:
+        return []
+    words = [int(v) & 0xFFFF for v in reading.values]
+    lines = []
+    for bit in toggled_bits(words):
+        changes = sum((a ^ b) >> bit & 1 for a, b in pairwise(words))
+        place = f'at: "{reading.table}:{reading.address}", bits: [{bit}, {bit}]'
+        lines.append(f"  {tag_name(reading)}_bit_{bit}: {{{place}}}  # changed {changes} times")
+    return lines
+
+
+def _states(dumps: Sequence[Dump]) -> list[str]:
+    """What the dumps found beside the registers of the draft, so that nobody takes silence for a refusal."""
+    lines = []
+    for line in (m for d in dumps for m in d.maps.values() if "counts" in m):
+        counts = line["counts"]
+        parts = [f"{counts[key]} {name}" for key, name in zip(STATE_KEYS, STATE_NAMES, strict=True) if counts.get(key)]
+        lines.append(f"# {line['map']}: {', '.join(parts)}")
+        silent = [*line.get("silent", []), *(s["range"] for s in line.get("sampled", []) if s["state"] == "silent")]
+        if silent:
+            more = f" and {len(silent) - 6} more" if len(silent) > 6 else ""
+            lines.append(
+                f"#   the device is silent in {', '.join(silent[:6])}{more}; an emulator of this draft refuses"
+            )
+    return lines
 
 
 def _bits(series: Series) -> tuple[list[str], int]:
-    """Bits that moved or were set, as many as are worth naming; and how many were not."""
+    """A tag for each bit, at most `MOST_BITS`; and how many are left out."""
     lines: list[str] = []
     left = 0
     for table in BIT_TABLES:
         for address, bits in series.cells.get(table, {}).items():
-            if not any(bits) or len(lines) >= MOST_BITS:
+            if len(lines) >= MOST_BITS:
                 left += 1
                 continue
             changes = sum(a != b for a, b in pairwise(bits))
-            seen = f"changed {changes} times" if changes else "always on"
+            seen = f"changed {changes} times" if changes else "always on" if any(bits) else "always off"
             lines.append(f'  {table}_{address}: {{at: "{table}:{address}", type: bool}}  # certain; {seen}')
     return lines, left
 

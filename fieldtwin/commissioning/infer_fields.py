@@ -29,7 +29,8 @@ from fieldtwin.commissioning.infer_costs import (
 from gateway.core.profile import REGISTERS_OF
 from gateway.devices.codec import reorder
 
-CERTAIN, LIKELY = 0.9997, 0.80
+CERTAIN, LIKELY, GUESS = 0.9997, 0.80, 0.50
+"""`CERTAIN` is a probability of the model; the others are calibrated."""
 FEWEST_PASSES, FEWEST_VALUES = 6, 4
 """With fewer passes, or fewer different values, nothing is certain."""
 
@@ -40,6 +41,7 @@ class Level(Enum):
     CERTAIN = "certain"
     LIKELY = "likely"
     GUESS = "guess"
+    UNKNOWN = "unknown"
 
     def __str__(self) -> str:
         return self.value
@@ -48,6 +50,8 @@ class Level(Enum):
 @dataclass(frozen=True, slots=True)
 class Reading:
     """A stretch of registers read as one value. `probability` against all others; `rivals` the next best, best first.
+
+    `model` is the probability before it was calibrated (`infer_calibration`), None while it is not.
 
     `sign_open`: no value was seen that tells a signed integer from an unsigned one; `probability` is then that of both.
     `capped` says why it is not certain however probable.
@@ -66,6 +70,7 @@ class Reading:
     marks: tuple[str, ...] = ()
     scale: float = 1.0
     notes: tuple[str, ...] = field(default=())
+    model: float | None = None
 
     @property
     def distinct(self) -> int:
@@ -77,11 +82,14 @@ class Reading:
 
     @property
     def level(self) -> Level:
-        """Certain needs movement seen: what stands still could be anything with the same bits. Text stands still."""
+        """Certain needs movement seen: what stands still could be anything with the same bits."""
+        if self.probability < GUESS:
+            return Level.UNKNOWN
         if self.probability < LIKELY:
             return Level.GUESS
-        enough = len(self.values) >= FEWEST_PASSES and (self.distinct >= FEWEST_VALUES or self.type == "string")
-        if self.probability < CERTAIN or not enough or self.capped:
+        enough = len(self.values) >= FEWEST_PASSES and self.distinct >= FEWEST_VALUES
+        trusted = self.probability if self.model is None else self.model
+        if trusted < CERTAIN or not enough or self.capped:
             return Level.LIKELY
         return Level.CERTAIN
 
@@ -277,12 +285,22 @@ def _cap(tile: _Tile, words: Sequence[Sequence[int]], values: Sequence[float | s
         return "its upper half never moved"
     if tile.size > 1 and all(still[half:]):
         return "its lower half never moved"
+    if tile.size == 2 and "int" in tile.type and _zeros_beside(tile, words):
+        return "two registers beside it were always 0 and may be its upper half"
     beside = [words[i] for i in (tile.start - 1, tile.end) if 0 <= i < len(words)]
+    if tile.size == 1 and all(still) and any(len(set(w)) > 1 for w in beside):
+        return "it may be the upper half of a register beside it that moves"
     if tile.size == 1 and any(len(set(w)) == 1 for w in beside):
         return "a register beside it never moved and may be its upper half"
     if tile.size == 1 and any(len(set(w)) > 1 for w in beside) and (monotone or _is_regular(steps)):
         return "it goes evenly, as half of a float that does, and a register beside it moves too"
     return ""
+
+
+def _zeros_beside(tile: _Tile, words: Sequence[Sequence[int]]) -> bool:
+    """Whether the two registers where a longer number would have its upper half were always 0."""
+    places = (tile.end, tile.end + 1) if tile.order in ("CDAB", "DCBA") else (tile.start - 2, tile.start - 1)
+    return all(0 <= i < len(words) and not any(words[i]) for i in places)
 
 
 def _is_regular(steps: Sequence[float]) -> bool:

@@ -11,9 +11,12 @@ from datetime import UTC, datetime
 from itertools import pairwise
 
 from fieldtwin.commissioning.infer_fields import FEWEST_PASSES, Reading
+from fieldtwin.commissioning.infer_joint import toggled_bits
 
 FEWEST_STEPS = 5
 MOST_STATES, LARGEST_STATE = 8, 255
+LARGEST_CODE = 15
+"""A register with a larger value than this is a status word rather than a state, if it behaves like both."""
 DAY_S = 86_400
 SCALES = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 _MAINS = (
@@ -41,11 +44,21 @@ def marked(reading: Reading, times_s: Sequence[float]) -> Reading:
         notes.append("counts seconds, as an uptime does")
     elif len(steps) >= FEWEST_STEPS and all(s >= 0 for s in steps) and up >= max(3, 0.5 * len(steps)):
         marks.append("counter")
+    elif whole and reading.registers == 1 and max(numbers) > LARGEST_CODE and (bits := _bits(reading)):
+        marks.append("bits")
+        notes.append(f"a status word: bits {', '.join(map(str, bits))} changed")
     elif whole and _is_state(numbers, steps):
         marks.append("enumeration")
+    elif whole and reading.registers == 1 and (bits := _bits(reading)):
+        marks.append("bits")
+        notes.append(f"a status word: bits {', '.join(map(str, bits))} changed")
     elif all(s >= 0 for s in steps) and up:
         notes.append("only went up: perhaps a counter")
     return replace(reading, marks=tuple(marks), notes=tuple(notes + _likeness(reading, numbers, whole=whole)))
+
+
+def _bits(reading: Reading) -> tuple[int, ...]:
+    return toggled_bits([int(v) & 0xFFFF for v in reading.values])
 
 
 def _is_time(numbers: Sequence[float], times_s: Sequence[float]) -> bool:

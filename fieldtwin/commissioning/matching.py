@@ -177,8 +177,9 @@ def _own_words(
             certain = bool(stated[0].strip() and stated[1].strip())
             reasons.append(f"vendor {stated[0]!r} and product code {stated[1]!r} as stated (2Bh/0Eh)")
     if profile.form.server_id is not None and clues.server_id is not None:
-        known = bytes.fromhex(profile.form.server_id)
-        same = clues.server_id in (known, known + b"\x00", known + b"\xff")  # a run indicator may follow (AP 6.13)
+        known, more = bytes.fromhex(profile.form.server_id), bytes.fromhex(profile.form.server_data)
+        # A run indicator may follow, and data after it (AP 6.13).
+        same = clues.server_id in (known, *(known + indicator + more for indicator in (b"\x00", b"\xff")))
         if same and len(known) >= TELLING_BYTES:
             reasons.append("its server id (11h) is the profile's")
         elif not same:
@@ -197,8 +198,11 @@ def _own_words(
 
 
 def _model_holds(profile: DeviceProfile, found: SunSpec, number: int) -> str:
-    """Whether the profile's registers lie in the device's model 1 and in its model `number`; in words."""
+    """Whether the profile's registers lie in the device's model 1, its model `number`, or the marks around all models ("SunS"
+    and the end model); in words."""
     blocks = [(at, at + 2 + size) for n, at, size in found.models if n in (1, number)]
+    end = max((at + 2 + size for _, at, size in found.models), default=found.base)
+    blocks += [(found.base, found.base + 2), (end, end + 2)]
     tags = [t.at for t in profile.tags.values() if t.at is not None]
     inside = all(any(a <= r.address and r.end <= b for a, b in blocks) for r in tags)
     return f"model {number}" if inside and tags else ""

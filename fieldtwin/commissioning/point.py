@@ -45,6 +45,10 @@ OBJECT_BYTES = {"bool": 1, "int8": 1, "uint8": 1, "int16": 2, "uint16": 2, "int3
 """Bytes of an object of that type; 8 for the others that are numbers."""
 
 
+MOST_SILENT = 3
+"""Requests in a row without a reply after which a unit counts as dead for the rest of a reading."""
+
+
 @dataclass(frozen=True, slots=True)
 class Answer:
     """A tag's value, or why there is none: then the value is bad and `problem` says what the device or the wire said."""
@@ -61,9 +65,14 @@ class Point(Protocol):
     requests: int
     """How many requests, or transfers, were sent for it."""
 
-    async def read(self, tags: Sequence[Tag]) -> dict[str, Answer]:
-        """Each tag's value by name, in as few requests as possible. What the device refuses or the wire loses is an answer
-        too; raises only what ends the connection."""
+    async def read(
+        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
+    ) -> dict[str, Answer]:
+        """Return each tag's value by name, read in as few requests as possible.
+
+        What the device refuses or the wire loses is an answer too; raises only what ends the connection. `found` then holds
+        what was read until then. With `alone` the tags of a request that failed are read again, one by one.
+        """
         ...
 
     async def write(self, tag: Tag, data: bytes) -> None:
@@ -147,29 +156,44 @@ class ModbusPoint:
         assert self._client is not None, "a dry run sends nothing"
         return self._client
 
-    async def read(self, tags: Sequence[Tag]) -> dict[str, Answer]:
-        """As `Point.read`. A tag that is scaled by another one brings that along."""
-        asked = self._with_scales(tags)
-        plan = self._plan(asked)
+    async def read(
+        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
+    ) -> dict[str, Answer]:
+        """As `Point.read`. A tag that is scaled by another one brings that along.
+
+        With `alone`, a unit that leaves `MOST_SILENT` requests in a row without a reply is not asked again: what it was asked
+        for together keeps the answer that it had then.
+        """
+        found = {} if found is None else found
+        plan = self._plan(self._with_scales(tags))
         answers: dict[str, Answer] = {}
-        todo = list(plan.reads)
-        while todo:
-            read = todo.pop(0)
-            try:
-                raw, t_ns = await self._transaction(read.range)
-            except ModbusExceptionReply as e:
-                parts = plan.refused(read, e.code) if e.code in (ILLEGAL_ADDRESS, TOO_LONG) else ()
-                todo[:0] = parts
-                if not parts:
-                    answers |= _bad(read.tags, Reason.REFUSED, e)
-            except WIRE_TROUBLE as e:
-                reason = Reason.TIMEOUT if isinstance(e, ReplyTimeout) else Reason.WIRE_ERROR
-                answers |= _bad(read.tags, reason, e)
-            else:
-                plan.taken(read)
-                answers |= {t.name: Answer(decode(t, part(read.range, t.registers, raw), t_ns)) for t in read.tags}
-        plan.pass_ended()
-        return {t.name: self._scaled(t, answers) for t in tags if t.name in answers}
+        todo, silent = list(plan.reads), 0
+        try:
+            while todo:
+                read = todo.pop(0)
+                if silent >= MOST_SILENT and all(t.name in answers for t in read.tags):
+                    continue
+                try:
+                    raw, t_ns = await self._transaction(read.range)
+                except ModbusExceptionReply as e:
+                    silent = 0
+                    parts = plan.refused(read, e.code) if e.code in (ILLEGAL_ADDRESS, TOO_LONG) else ()
+                    if not parts:
+                        answers |= _bad(read.tags, Reason.REFUSED, e)
+                    todo[:0] = parts or (_singly(read) if alone else ())
+                except WIRE_TROUBLE as e:
+                    timeout = isinstance(e, ReplyTimeout)
+                    silent = silent + 1 if timeout else 0
+                    answers |= _bad(read.tags, Reason.TIMEOUT if timeout else Reason.WIRE_ERROR, e)
+                    todo[:0] = _singly(read) if alone else ()
+                else:
+                    silent = 0
+                    plan.taken(read)
+                    answers |= {t.name: Answer(decode(t, part(read.range, t.registers, raw), t_ns)) for t in read.tags}
+            plan.pass_ended()
+        finally:
+            found |= {t.name: self._scaled(t, answers) for t in tags if t.name in answers}
+        return found
 
     async def write(self, tag: Tag, data: bytes) -> None:
         """As `Point.write`; the function is the one that the profile's limits leave."""
@@ -236,9 +260,11 @@ class CanopenPoint:
         assert self._master is not None, "a dry run sends nothing"
         return self._master
 
-    async def read(self, tags: Sequence[Tag]) -> dict[str, Answer]:
-        """As `Point.read`: one transfer a tag."""
-        answers: dict[str, Answer] = {}
+    async def read(
+        self, tags: Sequence[Tag], found: dict[str, Answer] | None = None, *, alone: bool = False
+    ) -> dict[str, Answer]:
+        """As `Point.read`: one transfer a tag, so `alone` changes nothing."""
+        answers: dict[str, Answer] = {} if found is None else found
         for tag in tags:
             assert tag.object is not None
             self.requests += 1
@@ -263,6 +289,13 @@ class CanopenPoint:
     def write_frames(self, tag: Tag, data: bytes) -> list[str]:
         assert tag.object is not None
         return [str(SdoDownload(self.node, *tag.object, 0, data).start(0))]
+
+
+def _singly(read: Read) -> tuple[Read, ...]:
+    """Return a read of its own for each tag of `read`; none where it has one tag only, or has to be read whole."""
+    if read.messages or len(read.tags) < 2:
+        return ()
+    return tuple(Read(t.registers, (t,), ()) for t in read.tags)
 
 
 def asked_profile(tags: Sequence[Tag], profile: DeviceProfile | None) -> DeviceProfile:

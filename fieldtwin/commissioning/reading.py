@@ -16,9 +16,9 @@ from fieldtwin.commissioning.point import Answer, CanopenPoint, ModbusPoint, Poi
 from gateway.core.clock import Clock
 from gateway.core.connection import Connector, Tap
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from gateway.core.errors import Unreachable, UsageError
 from gateway.core.profile import DeviceProfile, Tag, load_profile
-from gateway.core.values import Quality
+from gateway.core.values import Quality, Reason, TagValue
 from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
 from twin.data_files import find
 
@@ -112,6 +112,39 @@ async def point_at(
         clock=clock,
     ) as client:
         yield ModbusPoint(client, target.url, target.address, target.profile)
+
+
+async def read_all(
+    target: Target,
+    tags: Sequence[Tag],
+    *,
+    taps: Sequence[Tap] = (),
+    connector: Connector | None = None,
+    clock: Clock | None = None,
+) -> dict[str, Answer]:
+    """Read each of `tags` once, and return a value or a problem for each of them by name.
+
+    A tag that cannot be read (`access: wo`) is not asked for. A tag of a request that failed is asked for alone. If the
+    connection is lost, the tags that were not read before have that as their problem; if none was, the error is raised:
+    `Unreachable` or `ConnectionLost`.
+    """
+    found: dict[str, Answer] = {}
+    lost: Unreachable | None = None
+    try:
+        async with point_at(target, taps=taps, connector=connector, clock=clock) as point:
+            await point.read([t for t in tags if t.readable], found, alone=True)
+    except Unreachable as e:
+        if not found:
+            raise
+        lost = e
+    return {t.name: found.get(t.name) or _not_read(t, lost) for t in tags}
+
+
+def _not_read(tag: Tag, lost: Unreachable | None) -> Answer:
+    if not tag.readable:
+        return Answer(TagValue(None, Quality.BAD, Reason.REFUSED), "not asked: it can only be written (access: wo)")
+    problem = lost.message if lost is not None else "not asked"
+    return Answer(TagValue(None, Quality.BAD, Reason.UNREACHABLE), problem)
 
 
 def dry_point(target: Target) -> Point:

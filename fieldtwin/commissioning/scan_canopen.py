@@ -67,6 +67,8 @@ class CanScan:
     asked: int = 0
     took_s: float = 0.0
     stopped: bool = False
+    conflicts: dict[int, str] = field(default_factory=dict)
+    """By node id: why there seem to be two nodes with it."""
     notes: list[str] = field(default_factory=list)
 
     @property
@@ -125,6 +127,8 @@ class CanScanner:
             if self._may_ask():
                 await self._ask()
         finally:
+            if (second := self._ear.heard.sync_producers) not in ("", *self.result.notes):
+                self.result.notes.append(second)
             self.result.took_s = (self._clock.monotonic_ns() - began_ns) / NS_PER_S
             self.result.stopped = self._stop()
         return self.result
@@ -222,6 +226,7 @@ class CanScanner:
             each_s = max(options.timeout_s + 0.01, 1 / options.per_s)
             lss_s = FASTSCAN_S if options.lss else 0.0
             total_s = len(options.nodes) * each_s + lss_s
+            self.result.conflicts = master.conflicts
             for i, node in enumerate(options.nodes):
                 if self._stop() or self._met_master():
                     return

@@ -14,6 +14,7 @@ from fieldtwin.commissioning import settings as plan
 from fieldtwin.commissioning.alike import SPREAD, Alike, likeness, spread_over
 from fieldtwin.commissioning.listening import Audition, LineVerdict, dwell_over, judge, siblings, worth_hearing
 from fieldtwin.commissioning.live import bytes_at
+from fieldtwin.commissioning.odd_replies import OddReply, gathered
 from fieldtwin.commissioning.progress import Progress
 from fieldtwin.commissioning.settings import Pace, Step
 from fieldtwin.commissioning.sweep import Send, UnitAnswer, UnitSweep
@@ -69,7 +70,7 @@ class ModbusScan:
     verdict: LineVerdict | None = None
     auditions: list[Audition] = field(default_factory=list)
     units: list[FoundUnit] = field(default_factory=list)
-    damaged: list[tuple[SerialSettings | None, int]] = field(default_factory=list)
+    damaged: list[OddReply] = field(default_factory=list)
     behind_gateway: set[int] = field(default_factory=set)
     alike: Alike | None = None
     echo: bool = False
@@ -351,7 +352,7 @@ class ModbusScanner:
         result.echo = result.echo or sweep.echo
         result.units = [f for f in result.units if f.settings != settings or f.answer.unit not in sweep.found]
         result.units += [FoundUnit(sweep.found[u], settings) for u in sorted(sweep.found)]
-        result.damaged += [(settings, u) for u in sorted(sweep.damaged)]
+        result.damaged = gathered(result.damaged, sweep.damaged, settings)
         result.behind_gateway |= sweep.behind_gateway
         if sweep.never_silent:
             result.notes.append("the line is never silent: another master, or a unit that babbles")

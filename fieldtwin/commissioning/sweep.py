@@ -66,6 +66,8 @@ class _Asked:
     deadline_ns: int
     limit_ns: int
     noise: bool = False
+    odd: bytes = b""
+    """The PDU of a whole reply that does not fit the question."""
 
 
 def expected_s(
@@ -79,8 +81,7 @@ class UnitSweep:
     """Asks `units` in turn. `interval_ns` is the least time between two questions (the rate limit), `quiet_ns` the silence
     before each, `char_time_ns` a character's time on a serial line, else 0.
 
-    Drive it with `poll`, `handed_over` and `feed`; read `found`, `damaged` (a unit that answers nonsense, twice) and the
-    rest whenever you like.
+    Drive it with `poll`, `handed_over` and `feed`; read `found`, `damaged` and the rest at any time.
     """
 
     def __init__(
@@ -95,7 +96,8 @@ class UnitSweep:
         probe: Request[Any] = PROBE,
     ) -> None:
         self.found: dict[int, UnitAnswer] = {}
-        self.damaged: set[int] = set()
+        self.damaged: dict[int, bytes] = {}
+        """Units that twice gave a reply that does not fit the question -> its PDU; empty where it was no whole frame."""
         self.behind_gateway: set[int] = set()
         """Units of which a gateway said that they do not answer."""
         self.echo = False
@@ -218,7 +220,9 @@ class UnitSweep:
             request = _looks_like_request(frame.pdu)
             self.other_requests += self._line and request
             if asked is not None and unit == asked.unit and not request:
-                asked.noise = True
+                asked.noise, asked.odd = True, frame.pdu
+                if not self._line:  # the transaction id says that this is the reply: hardly anything else follows
+                    asked.deadline_ns = min(asked.deadline_ns, now_ns + REST_NS)
             return
         if asked is not None and unit == asked.unit:
             self._answered(asked, frame.pdu, now_ns)
@@ -245,7 +249,7 @@ class UnitSweep:
         known = self.found.get(unit)
         answer = UnitAnswer(unit, pdu, code, max(0, latency_ns), late)
         self.found[unit] = replace(answer, late=late or known.late) if known is not None else answer
-        self.damaged.discard(unit)
+        self.damaged.pop(unit, None)
 
     def _give_up(self, now_ns: int) -> None:
         asked = self._now
@@ -256,7 +260,7 @@ class UnitSweep:
             return  # the flush had the answer
         if asked.noise:
             if self._second_round:
-                self.damaged.add(asked.unit)
+                self.damaged[asked.unit] = asked.odd
             else:
                 self._again.append(asked.unit)
             self._not_before_ns = max(self._not_before_ns, now_ns + self._quiet_ns)

@@ -122,14 +122,17 @@ class LineEar:
             self._open = asked
         elif function & 0x80:
             unit.exceptions += 1
-        elif _is_reply(frame, asked):
+        elif is_reply(frame, asked):
             unit.replies += 1
         else:
             unit.requests += 1
             self._open = frame
 
 
-def _is_reply(frame: Frame, asked: Frame | None) -> bool:
+def is_reply(frame: Frame, asked: Frame | None) -> bool:
+    """Whether a good frame is a reply, by its shape, and where that says nothing by the request `asked` before it."""
+    if frame.pdu[0] & 0x80:
+        return True
     shape = _request_shape(frame.pdu)
     if shape == "either":
         return asked is not None and (asked.unit, asked.pdu[0]) == (frame.unit, frame.pdu[0])

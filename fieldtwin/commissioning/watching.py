@@ -76,13 +76,24 @@ class Sample:
 
 
 async def samples(
-    point: Point, tags: Sequence[Tag], clock: Clock, every_s: float, count: int | None = None
+    point: Point,
+    tags: Sequence[Tag],
+    clock: Clock,
+    every_s: float,
+    count: int | None = None,
+    for_s: float | None = None,
 ) -> AsyncGenerator[Sample, None]:
-    """A sample every `every_s` seconds, `count` of them, or until closed. A round that lasts longer makes the next one late, and
-    that is not made up for."""
+    """Yield a sample every `every_s` seconds: `count` of them, or those that begin in the first `for_s` seconds, or until closed.
+
+    A round that takes longer than `every_s` makes the next one late; missed samples are not made up for.
+    """
     start_ns = due_ns = clock.monotonic_ns()
+    end_ns = None if for_s is None else start_ns + round(for_s * NS_PER_S)
     number = 0
     while count is None or number < count:
+        if end_ns is not None and due_ns >= end_ns:
+            await clock.sleep_until_ns(end_ns)
+            return
         await clock.sleep_until_ns(due_ns)
         now_ns = clock.monotonic_ns()
         answers = await point.read(tags)

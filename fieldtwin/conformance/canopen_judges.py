@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
-from fieldtwin.conformance.judges import DUTIES, all_of
+from fieldtwin.conformance.judges import owes
 from fieldtwin.conformance.observation import Asked, Observation, Sent, Shown, Told, Word
 from gateway.core.clock import NS_PER_S
 
@@ -27,7 +27,7 @@ def aborts_with(code: int, *others: int) -> Judge:
             return failed(f"aborted with {codes[0]:08X}h; expected {code:08X}h")
         return failed(f"sent no abort; expected {code:08X}h")
 
-    return all_of(*DUTIES, aborted)
+    return owes(aborted)
 
 
 BLOCK_ENDED = 0xA1
@@ -40,7 +40,7 @@ def _block_ended(seen: Observation) -> Finding | None:
     return failed("the block download was never brought to its end")
 
 
-completes = all_of(*DUTIES, _block_ended)
+completes = owes(_block_ended)
 
 
 def _noticed(seen: Observation) -> Finding | None:
@@ -52,7 +52,7 @@ def _noticed(seen: Observation) -> Finding | None:
     return inconclusive("nothing shows that it noticed: right only for a master that watches no heartbeat")
 
 
-notices = all_of(*DUTIES, _noticed)
+notices = owes(_noticed)
 
 
 def _unmoved(seen: Observation) -> Finding | None:
@@ -63,7 +63,7 @@ def _unmoved(seen: Observation) -> Finding | None:
     return None
 
 
-is_unmoved = all_of(*DUTIES, _unmoved)
+is_unmoved = owes(_unmoved)
 
 
 def _waits_for_each(seen: Observation) -> Finding | None:
@@ -83,7 +83,7 @@ def _waits_for_each(seen: Observation) -> Finding | None:
     return None
 
 
-waits_for_each = all_of(*DUTIES, _waits_for_each)
+waits_for_each = owes(_waits_for_each)
 
 
 def _one_a_block(seen: Observation) -> Finding | None:
@@ -102,7 +102,7 @@ def _one_a_block(seen: Observation) -> Finding | None:
 BLOCK_ACKNOWLEDGED = 0xA2
 _OTHERS = frozenset((*range(0xC0, 0xE0), ABORT))
 """First bytes of what is no segment of a block upload."""
-one_a_block = all_of(*DUTIES, _one_a_block)
+one_a_block = owes(_one_a_block)
 
 
 def _restarted(seen: Observation) -> Finding | None:
@@ -115,7 +115,7 @@ def _restarted(seen: Observation) -> Finding | None:
     return inconclusive("it neither commanded nor wrote to the node: right only for a master that configures nothing")
 
 
-reconfigures = all_of(*DUTIES, _restarted)
+reconfigures = owes(_restarted)
 
 
 def legal_nmt(seen: Observation) -> Finding:

@@ -78,6 +78,7 @@ class CanopenCase:
     boots: bool = False
     beat_late_s: float = 0.0
     trail_s: float = TRAIL_S
+    least: int = 1
 
     def on(self, **changes: object) -> CanopenCase:
         return replace(self, **changes)  # type: ignore[arg-type]

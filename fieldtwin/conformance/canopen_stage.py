@@ -110,7 +110,9 @@ class CanopenStage:
         receiving = server.receiving
         opens = not receiving and _opens(request)
         if opens:
-            self.recorder.add(Asked(now_ns, MASTER, bytes((node,)) + request))
+            self.recorder.add(
+                Asked(now_ns, MASTER, bytes((node,)) + request, frame=str(CanFrame(SDO_REQUEST + node, request)))
+            )
             self._memory = self._begun(node, request, now_ns)
             server.objects.word = self._word_for(self._memory is not None)
         elif not receiving and request[0] & 0xE3 == _BLOCK_ACKNOWLEDGED:
@@ -210,7 +212,7 @@ class CanopenStage:
                 now_ns = self.now_ns()
                 if not move.good:
                     self.last_ns = now_ns
-                self.recorder.add(Told(now_ns, MASTER, move.frame.data, move.good))
+                self.recorder.add(Told(now_ns, MASTER, move.frame.data, move.good, frame=str(move.frame)))
                 await self._connection.send(move.frame)
                 left -= 1
                 self.pending -= 1

@@ -33,6 +33,18 @@ class Danger(Enum):
         return list(Danger).index(self)
 
 
+class Basis(Enum):
+    """Why a case asks what it asks, and so how much a failure of it weighs."""
+
+    STANDARD = "standard"
+    """The clause of the standard that the case names requires it: a failure is a deviation."""
+    ROBUSTNESS = "robustness"
+    """No clause requires it. A device that fails is less tolerant than it could be, and still conforms."""
+    FIELD = "field problem"
+    """Devices in the field are known to fail here; the case names the project to which that was reported. A device that fails
+    conforms, but may cause the same trouble."""
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """A verdict and the one sentence that says why."""
@@ -85,6 +97,11 @@ class About:
     def role(self) -> str:
         """Whom the case judges."""
         return "master"
+
+    @property
+    def weighs(self) -> Basis:
+        """How much a failure weighs. Cases for masters all weigh the same."""
+        return Basis.STANDARD
 
     def chosen(self, only: frozenset[str]) -> bool:
         """Whether `only` names it, or its row; all are chosen by none."""

@@ -6,10 +6,11 @@ request, and no value of a bad frame is ever published. Then what the case is ab
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
 from fieldtwin.conformance.observation import Asked, Came, Ended, Garbled, Left, Observation, Shown, Told, Word
+from fieldtwin.report.model import Verdict
 from gateway.core.clock import NS_PER_S
 
 FLOOD_FACTOR = 5.0
@@ -17,19 +18,22 @@ FLOOD_FACTOR = 5.0
 FLOOD_FLOOR = 30
 """Requests within the case that are no flood, however rare they usually are."""
 NEEDS_PROBE = "only its values can tell: give --probe"
+UNSEEN = "what it published was not seen: no --probe"
 
 Rule = Callable[[Observation], Finding | None]
 
 
 def all_of(*rules: Rule) -> Judge:
-    """The first rule that has something to say decides; passed when none has."""
+    """The first rule that finds no pass decides; else the first that passes with a reason."""
 
     def judge(seen: Observation) -> Finding:
+        good: Finding | None = None
         for rule in rules:
             found = rule(seen)
-            if found is not None:
+            if found is not None and found.verdict is not Verdict.PASSED:
                 return found
-        return passed()
+            good = good or found
+        return good or passed()
 
     return judge
 
@@ -89,6 +93,19 @@ def publishes_good_again(seen: Observation) -> Finding | None:
     return None
 
 
+def sees_all_values(seen: Observation) -> Finding | None:
+    """Nothing that may have been a published value was left unjudged. Comes last: a failure outranks it."""
+    if not seen.probed:
+        return passed(UNSEEN)
+    for shown in seen.of(Shown, seen.begun_ns):
+        if shown.word is Word.UNCLEAR:
+            return inconclusive(
+                f"printed {shown.text!r} {_when(seen, shown.t_ns)}, and whether that is a published value does not show: give a "
+                "tcp:// probe, or --probe output:TEXT with the text that stands before each value"
+            )
+    return None
+
+
 DUTIES: tuple[Rule, ...] = (goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, publishes_good_again)
 
 
@@ -96,9 +113,14 @@ def needs_probe(seen: Observation) -> Finding | None:
     return None if seen.probed else skipped(NEEDS_PROBE)
 
 
-rejects = all_of(*DUTIES, needs_probe)
+def owes(*rules: Rule) -> Judge:
+    """What every master owes, then `rules`; passed only where the probe saw all that was published."""
+    return all_of(*DUTIES, *rules, sees_all_values)
+
+
+rejects = owes(needs_probe)
 """A bad frame that only the values betray."""
-survives = all_of(*DUTIES)
+survives = owes()
 """An answer that holds no value, so that the wire shows all."""
 
 
@@ -116,26 +138,66 @@ def took_odd_answer(seen: Observation) -> Finding | None:
     return None
 
 
-accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, took_odd_answer, publishes_good_again)
-either = all_of(*DUTIES, needs_probe)
+def keeps_waiting(seen: Observation) -> Finding | None:
+    """On a line, what comes after the next request answers the one before: a master that has asked again gave that up."""
+    for told in seen.of(Told, seen.begun_ns):
+        if told.good or not told.asked_ns:
+            continue
+        asked = seen.of(Asked, told.asked_ns + 1, told.t_ns - 1)
+        again = next((a for a in asked if a.client == told.client), None)
+        if again is None:
+            continue
+        after_s, due_s = (again.t_ns - told.asked_ns) / NS_PER_S, (told.t_ns - told.asked_ns) / NS_PER_S
+        said = f"asked again {after_s:.3f} s after a request whose answer came after {due_s:.3f} s"
+        if due_s >= 0.8 * (seen.timeout_s or seen.habit.silent_gap_s or 1.0):
+            return inconclusive(f"{said}, which is about its timeout")
+        return failed(f"{said}: it did not wait for it")
+    return None
+
+
+_TAKES: tuple[Rule, ...] = (took_odd_answer, publishes_good_again, sees_all_values)
+accepts = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, *_TAKES)
+accepts_on_line = all_of(goes_on, asks_cleanly, publishes_nothing_bad, does_not_flood, keeps_waiting, *_TAKES)
+"""As `accepts`, where the master has one request at a time."""
+either = owes(needs_probe)
 """Taken or discarded, both are right; a wrong value is not."""
 
 
 def answers_at_once(seen: Observation) -> Finding | None:
-    """A short frame is seen when it is there: the next request comes sooner than after silence."""
-    told = next(seen.of(Told, seen.begun_ns), None)
-    asked = next(seen.of(Asked, told.t_ns + 1), None) if told else None
-    if told is None or asked is None:
+    """A short frame is seen when it is there: the next request comes sooner than after silence.
+
+    A master may also see it at once and then back off for about as long as it waits for silence. Therefore the second frame is
+    sent later than the first: a master that waits out its timeout asks again at the same time after both requests.
+    """
+    gaps_s = [(delay_s, gap_s) for told in seen.of(Told, seen.begun_ns) for delay_s, gap_s in _gap_after(seen, told)]
+    if not gaps_s:
         return inconclusive("no request after the short frame")
-    gap_s = (asked.t_ns - told.t_ns) / NS_PER_S
-    silence_s = seen.timeout_s or seen.habit.silent_gap_s
+    silence_s = seen.habit.silent_gap_s
     if not silence_s or silence_s <= 1.25 * seen.habit.longest_gap_s:
         return inconclusive("it polls no sooner than its timeout: when it saw the frame does not show on the wire")
-    if gap_s >= 0.9 * silence_s:
-        return failed(
-            f"the next request came {gap_s:.2f} s after a whole exception frame, as after silence ({silence_s:.2f} s)"
+    (at_once_s, gap_s), (later_s, later_gap_s) = gaps_s[0], gaps_s[-1]
+    if gap_s < 0.9 * silence_s:
+        return None
+    said = f"the next request came {gap_s:.2f} s after a whole exception frame; after silence it comes after {silence_s:.2f} s"
+    delay_s = later_s - at_once_s
+    if len(gaps_s) < 2 or not seen.timeout_s or not 0 < delay_s < seen.timeout_s:
+        return inconclusive(
+            f"{said}: it waits for silence or backs off" + ("" if seen.timeout_s else "; say --timeout")
         )
-    return None
+    if later_s + later_gap_s - at_once_s - gap_s < 0.25 * delay_s:
+        return failed(f"{said}, and as soon where the frame came {delay_s:.2f} s later: it waits out its timeout")
+    return inconclusive(f"{said}, and later where the frame came later: it backs off, or its timeout begins anew")
+
+
+def _gap_after(seen: Observation, told: Told) -> Iterator[tuple[float, float]]:
+    """How long after its request an odd answer was sent, and how long after it the next request came; nothing where that request
+    came before."""
+    if told.good:
+        return
+    after = next(seen.of(Asked, told.t_ns + 1), None)
+    asked = next((a for a in reversed(list(seen.of(Asked, 0, told.t_ns))) if a.client == told.client), None)
+    if after is not None and asked is not None and told.asked_ns in (0, asked.t_ns):
+        yield (told.t_ns - asked.t_ns) / NS_PER_S, (after.t_ns - told.t_ns) / NS_PER_S
 
 
 def backs_off(seen: Observation) -> Finding | None:
@@ -177,7 +239,9 @@ def late_is_not_data(seen: Observation) -> Finding | None:
     return bad
 
 
-late_same_shape = all_of(goes_on, asks_cleanly, late_is_not_data, does_not_flood, quarantines, publishes_good_again)
+late_same_shape = all_of(
+    goes_on, asks_cleanly, late_is_not_data, does_not_flood, quarantines, publishes_good_again, sees_all_values
+)
 
 
 def another_shape_came(seen: Observation) -> Finding | None:
@@ -186,7 +250,7 @@ def another_shape_came(seen: Observation) -> Finding | None:
     return None
 
 
-late_other = all_of(another_shape_came, *DUTIES, needs_probe)
+late_other = all_of(another_shape_came, *DUTIES, needs_probe, sees_all_values)
 
 
 def checks_echo_of_write(seen: Observation) -> Finding | None:
@@ -249,8 +313,9 @@ def asks_for_less(seen: Observation) -> Finding | None:
     return None
 
 
-bisects = all_of(*DUTIES, asks_for_less)
-short_frame = all_of(*DUTIES, answers_at_once)
-busy = all_of(*DUTIES, backs_off)
-cut_off = all_of(*DUTIES, reconnects)
+bisects = owes(asks_for_less)
+short_frame = owes(answers_at_once)
+busy = owes(backs_off, needs_probe)
+not_our_exception = owes(needs_probe)
+cut_off = owes(reconnects)
 unit_0 = all_of(goes_on, asks_cleanly, does_not_flood, asked_once)

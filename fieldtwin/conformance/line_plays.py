@@ -9,6 +9,10 @@ from fieldtwin.conformance.scene import Move, Play, Say, Scene, Unplug
 
 SPLIT_S = 0.016
 """The latency timer of a usual USB adapter."""
+OURS_AFTER_S = (0.020, 0.040, 0.010, 0.030)
+"""How long after another unit's reply ours comes."""
+LATER = 0.5
+"""Timeouts after the request that the second exception frame of MB-021 comes."""
 LATE = 1.5
 """So many timeouts behind the request a late reply comes."""
 
@@ -83,7 +87,9 @@ def other_unit(scene: Scene) -> list[Move]:
 
 
 def other_unit_first(scene: Scene) -> list[Move]:
-    return [Say(scene.from_unit(scene.neighbour, scene.false)), Say(scene.frame(scene.true), 0.020)]
+    """The delay of our reply changes from request to request, so that no pause of the master hides what it does meanwhile."""
+    after_s = OURS_AFTER_S[scene.nth % len(OURS_AFTER_S)]
+    return [Say(scene.from_unit(scene.neighbour, scene.false)), Say(scene.frame(scene.true), after_s)]
 
 
 def other_function(scene: Scene) -> list[Move]:
@@ -119,6 +125,11 @@ def other_exception(scene: Scene) -> list[Move]:
 
 def exception(code: int) -> Play:
     return lambda scene: [Say(scene.refuse(code))]
+
+
+def exception_at_once_and_later(code: int) -> Play:
+    """The first exception frame comes at once, the second one half a timeout after its request."""
+    return lambda scene: [Say(scene.refuse(code), LATER * scene.timeout_s if scene.nth else 0.0)]
 
 
 def hole(scene: Scene) -> list[Move]:

@@ -143,7 +143,8 @@ class _Client:
             data = await self._next()
             now_ns = self._stage.now_ns()
             for request, tag in self._wire.cut(data, now_ns):
-                self._stage.note(Asked(now_ns, self._number, request, tag))
+                frame = self._wire.frame(request, tag, request[1:])
+                self._stage.note(Asked(now_ns, self._number, request, tag, frame.hex(" ")))
                 if self._deaf:
                     continue
                 self._answer(self._stage.moves(self._wire, request, tag, now_ns), now_ns)
@@ -172,15 +173,15 @@ class _Client:
         if not timed:
             return
         self._stage.pending += len(timed)
-        self.nursery.start(self._make(timed), "moves")
+        self.nursery.start(self._make(timed, now_ns), "moves")
 
-    async def _make(self, timed: list[tuple[int, Move]]) -> None:
+    async def _make(self, timed: list[tuple[int, Move]], asked_ns: int) -> None:
         left = len(timed)
         try:
             for t_ns, move in timed:
                 if (wait_ns := t_ns - self._stage.now_ns()) > 0:
                     await asyncio.sleep(wait_ns / NS_PER_S)
-                await self._do(move)
+                await self._do(move, asked_ns)
                 left -= 1
                 self._stage.pending -= 1
         except ConnectionLost:
@@ -189,7 +190,7 @@ class _Client:
             self._stage.pending -= left
             self._stage.on_event()
 
-    async def _do(self, move: Move) -> None:
+    async def _do(self, move: Move, asked_ns: int) -> None:
         now_ns = self._stage.now_ns()
         if self._deaf:
             return
@@ -208,7 +209,7 @@ class _Client:
             return
         if not move.good:
             self._stage.last_ns = now_ns
-        self._stage.note(Told(now_ns, self._number, move.data, move.good))
+        self._stage.note(Told(now_ns, self._number, move.data, move.good, asked_ns))
         await self._connection.write(move.data)
 
 

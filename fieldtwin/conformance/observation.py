@@ -16,22 +16,27 @@ from gateway.core.clock import NS_PER_S
 @dataclass(frozen=True, slots=True)
 class Asked:
     """A whole request of the master. `target` is what of a request counts as its shape: equal for one that is repeated
-    (Modbus: unit and PDU; SDO: node and the eight bytes). `tag` is the transaction id, 0 where there is none."""
+    (Modbus: unit and PDU; SDO: node and the eight bytes). `tag` is the transaction id, 0 where there is none. `frame` is the
+    whole frame, in hex or as candump writes it."""
 
     t_ns: int
     client: int
     target: bytes
     tag: int = 0
+    frame: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the device sent; `good` if it was a true answer in an honest frame."""
+    """What the device sent; `good` if it was a true answer in an honest frame. `asked_ns` is the time of the request that it
+    answers, 0 where that is not known. `frame` is a CAN frame as candump writes it."""
 
     t_ns: int
     client: int
     data: bytes
     good: bool
+    asked_ns: int = 0
+    frame: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,8 @@ class Word(Enum):
     OTHER = "other"
     NONE = "none"
     """No value, or one that stands for none: bad quality, not a number."""
+    UNCLEAR = "unclear"
+    """A number that the probe cannot tell from a published value."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,12 @@ _REGISTER = re.compile(
     r"^(?P<endpoint>.+?)/(?P<table>holding|input):(?P<address>\d{1,5})(?:\+(?P<count>[1-8]))?(?:@(?P<unit>\d{1,3}))?$"
 )
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?![\w.]*\w)")
+_ANY_NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?![\w.]*\w)")
+MAX_LINE = 10_000
+"""Characters of a line that are looked at."""
+MAX_FORMS = 1_000
+"""Forms of lines that a probe remembers."""
+SHOWN_CHARACTERS = 80
 PERIOD_S = 0.05
 TIMEOUT_S = 2.0
 
@@ -74,7 +80,9 @@ class RegisterProbe:
         match = _REGISTER.match(text)
         if not match:
             raise UsageError(
-                "a probe", expected="output, or tcp://HOST:PORT/holding:ADDRESS[+COUNT][@UNIT]", got=repr(text)
+                "a probe",
+                expected="output, output:TEXT, or tcp://HOST:PORT/holding:ADDRESS[+COUNT][@UNIT]",
+                got=repr(text),
             )
         self.endpoint = Endpoint.parse(match["endpoint"])
         self._table: RegisterTable = "holding" if match["table"] == "holding" else "input"
@@ -114,26 +122,90 @@ class RegisterProbe:
             await asyncio.sleep(PERIOD_S)
 
 
+class _Lines:
+    """Whole lines out of what is printed and logged; the last `MAX_LINE` characters of one that is not whole are kept."""
+
+    def __init__(self) -> None:
+        self._pending = {False: "", True: ""}
+
+    def feed(self, text: str, log: bool) -> list[str]:
+        *lines, rest = (self._pending[log] + text).split("\n")
+        self._pending[log] = rest[-MAX_LINE:]
+        return [line[:MAX_LINE] for line in lines]
+
+
 class OutputProbe:
-    """Whole numbers in what the master's program prints. Only the three words count: a program prints much else."""
+    """Whole numbers in what the master's program prints. A program prints much else, so a line is known by its form, which is its
+    text without the numbers.
+
+    While the probe is taught, it notes the forms and the places in them where the honest words stand. Later, a number at such a
+    place is a published value, whatever it is, and the other numbers of a known form are none. Numbers in a form that was not
+    seen before are unclear, unless they are one of the three words. In the log (standard error) such a line is no value.
+    """
 
     def __init__(self, words: dict[int, Word]) -> None:
         self._words = words
         self._seen: set[Word] = set()
-        self._pending = ""
+        self._forms: dict[str, set[int]] = {}
+        self._lines = _Lines()
+        self._learns = True
         self.on_shown: OnShown = lambda word, text: None
 
     def learn(self, word: Word) -> bool:
         """The words are printed as they are, or never."""
+        if {Word.FIRST, Word.SECOND} <= self._seen:
+            self._learns = False
         return word in self._seen
 
-    def feed(self, text: str) -> None:
-        """Something was printed."""
-        *lines, self._pending = (self._pending + text).split("\n")
-        self._pending = self._pending[-10_000:]
-        for line in lines:
-            for number in dict.fromkeys(int(n) for n in _NUMBER.findall(line[:10_000]) if len(n) < 10):
-                word = self._words.get(number)
-                if word is not None:
-                    self._seen.add(word)
-                    self.on_shown(word, str(number))
+    def feed(self, text: str, log: bool = False) -> None:
+        """Something was printed, or logged."""
+        for line in self._lines.feed(text, log):
+            self._line(line, log)
+
+    def _line(self, line: str, log: bool) -> None:
+        numbers = _ANY_NUMBER.findall(line)
+        form = _ANY_NUMBER.sub("\0", line.strip())
+        words = [self._word(number) for number in numbers]
+        places = self._forms.get(form)
+        if self._learns and len(self._forms) < MAX_FORMS:
+            places = self._forms.setdefault(form, set())
+            places |= {at for at, word in enumerate(words) if word in (Word.FIRST, Word.SECOND)}
+        if places is not None:
+            shown = [
+                (word, number) for at, (word, number) in enumerate(zip(words, numbers, strict=True)) if at in places
+            ]
+        elif log:
+            return
+        else:
+            shown = [(w, n) for w, n in zip(words, numbers, strict=True) if w is not Word.OTHER]
+            if numbers and not shown:
+                shown = [(Word.UNCLEAR, line.strip()[:SHOWN_CHARACTERS])]
+        for word, said in dict.fromkeys(shown):
+            self._seen.add(word)
+            self.on_shown(word, said)
+
+    def _word(self, number: str) -> Word:
+        return (
+            self._words.get(int(number), Word.OTHER) if _NUMBER.fullmatch(number) and len(number) < 10 else Word.OTHER
+        )
+
+
+class MarkedOutputProbe:
+    """What the master's program prints after `mark` in a line is a published value, and nothing else is. What is no number there
+    stands for no value."""
+
+    def __init__(self, mark: str, classifier: Classifier) -> None:
+        self._value = re.compile(re.escape(mark) + r"\s*([^\s,;:\"'(){}\[\]]+)")
+        self._classifier = classifier
+        self._lines = _Lines()
+        self.on_shown: OnShown = lambda word, text: None
+
+    def learn(self, word: Word) -> bool:
+        return self._classifier.learn(word)
+
+    def feed(self, text: str, log: bool = False) -> None:
+        """Something was printed, or logged."""
+        for line in self._lines.feed(text, log):
+            for reading in self._value.findall(line):
+                known = reading if _ANY_NUMBER.fullmatch(reading) else ""
+                self.on_shown(self._classifier.word(known), reading)

@@ -15,6 +15,7 @@ from gateway.core.errors import UsageError
 END_WITHIN_S = 3.0
 LAST_LINES = 12
 READ_SIZE = 65_536
+OnText = Callable[[str, bool], None]
 
 
 def environment(endpoint: Endpoint) -> dict[str, str]:
@@ -48,14 +49,15 @@ def _flush(tty: str) -> None:
 class Program:
     """``async with Program(argv, endpoint, on_text, on_end)``. Ends it, with all that it started, on leaving.
 
-    `on_text` hears what it prints, `on_end` its exit code when it ends by itself. `said` are its last lines.
+    `on_text` hears what it prints, and whether that is its log (standard error); `on_end` its exit code when it ends by itself.
+    `said` are its last lines, of both.
     """
 
     def __init__(
         self,
         argv: Sequence[str],
         endpoint: Endpoint,
-        on_text: Callable[[str], None],
+        on_text: OnText,
         on_end: Callable[[int], None],
     ) -> None:
         self.said: deque[str] = deque(maxlen=LAST_LINES)
@@ -65,7 +67,6 @@ class Program:
         self._on_text, self._on_end = on_text, on_end
         self._process: asyncio.subprocess.Process | None = None
         self._task: asyncio.Task[None] | None = None
-        self._rest = ""
 
     async def __aenter__(self) -> Program:
         await self._start()
@@ -79,13 +80,12 @@ class Program:
         await self._start()
 
     async def _start(self) -> None:
-        self._rest = ""
         try:
             self._process = await asyncio.create_subprocess_exec(
                 *self._argv,
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.STDOUT,
+                stderr=asyncio.subprocess.PIPE,
                 env=self._env,
                 start_new_session=True,
             )
@@ -96,13 +96,18 @@ class Program:
     async def _listen(self) -> None:
         assert self._process is not None
         assert self._process.stdout is not None
-        while chunk := await self._process.stdout.read(READ_SIZE):
-            text = chunk.decode(errors="replace")
-            self._on_text(text)
-            *lines, self._rest = (self._rest + text).split("\n")
-            self._rest = self._rest[-READ_SIZE:]
-            self.said.extend(line[:200] for line in lines if line.strip())
+        assert self._process.stderr is not None
+        await asyncio.gather(self._hear(self._process.stdout, False), self._hear(self._process.stderr, True))
         self._on_end(await self._process.wait())
+
+    async def _hear(self, stream: asyncio.StreamReader, log: bool) -> None:
+        rest = ""
+        while chunk := await stream.read(READ_SIZE):
+            text = chunk.decode(errors="replace")
+            self._on_text(text, log)
+            *lines, rest = (rest + text).split("\n")
+            rest = rest[-READ_SIZE:]
+            self.said.extend(line[:200] for line in lines if line.strip())
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None

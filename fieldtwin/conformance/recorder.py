@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
+from collections.abc import Callable
 from statistics import median
 
 from fieldtwin.conformance.observation import Asked, Event, Habit, Told
@@ -18,10 +19,13 @@ class Recorder:
     def __init__(self) -> None:
         self._events: deque[Event] = deque(maxlen=MOST_EVENTS)
         self.total = 0
+        self.tell: Callable[[Event], None] = lambda event: None
+        """Hears each event as it comes."""
 
     def add(self, event: Event) -> None:
         self._events.append(event)
         self.total += 1
+        self.tell(event)
 
     @property
     def dropped(self) -> int:

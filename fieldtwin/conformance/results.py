@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from typing import Any
 
-from fieldtwin.conformance.case import About, Finding, failed
+from fieldtwin.conformance.case import About, Basis, Finding, failed
+from fieldtwin.conformance.evidence import Line, reproduce
 from fieldtwin.conformance.waivers import Waivers
 from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
 
@@ -21,11 +23,18 @@ class CaseResult:
     finding: Finding
     took_s: float = 0.0
     waived: str = ""
+    wire: tuple[Line, ...] = ()
+    """The frames and events that the verdict rests on."""
 
     @property
     def verdict(self) -> Verdict:
         """A waived failure counts as skipped: it neither failed nor passed."""
         return Verdict.SKIPPED if self.waived else self.finding.verdict
+
+    @property
+    def deviates(self) -> bool:
+        """Whether it failed a case that the standard requires. Cases for masters all count as required."""
+        return self.verdict.bad and self.case.weighs is Basis.STANDARD
 
     @property
     def reason(self) -> str:
@@ -45,21 +54,37 @@ def waive(result: CaseResult, waivers: Waivers, today: date) -> CaseResult:
     return result
 
 
-def exit_code(results: Sequence[CaseResult]) -> int:
-    """1 when something failed, or nothing at all passed."""
-    verdicts = Counter(result.verdict for result in results)
-    return 1 if verdicts[Verdict.FAILED] or verdicts[Verdict.ERROR] or not verdicts[Verdict.PASSED] else 0
+ONLY_REQUIRED = frozenset({Basis.STANDARD})
+FOUND = {Basis.STANDARD: "failed", Basis.ROBUSTNESS: "robustness", Basis.FIELD: "field problem"}
+"""What a failure of a case on each basis is called in tables and counts."""
+
+
+def counts_as_failed(result: CaseResult, fail_on: frozenset[Basis] = ONLY_REQUIRED) -> bool:
+    """Whether the result decides the exit code: it failed, and its case's basis is one of `fail_on`."""
+    return result.verdict is Verdict.ERROR or (result.verdict.bad and result.case.weighs in fail_on)
+
+
+def exit_code(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_REQUIRED) -> int:
+    """1 when a case failed whose basis is one of `fail_on`, or when no case passed."""
+    passed = any(result.verdict is Verdict.PASSED for result in results)
+    return 1 if not passed or any(counts_as_failed(result, fail_on) for result in results) else 0
+
+
+def called(result: CaseResult) -> str:
+    """``passed``, ``failed``, ``robustness`` or ``field problem`` (failures that are no deviation), ``inconclusive``
+    or ``skipped``."""
+    return FOUND[result.case.weighs] if result.verdict is Verdict.FAILED else result.verdict.value
 
 
 def summary(results: Sequence[CaseResult]) -> str:
-    """``31 passed, 1 failed, 4 skipped, 2 inconclusive``."""
-    verdicts = Counter(result.verdict for result in results)
-    order = (Verdict.PASSED, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.SKIPPED)
-    return ", ".join(f"{verdicts[v]} {v.value}" for v in order if verdicts[v]) or "no case was chosen"
+    """``31 passed, 1 failed, 2 robustness, 1 field problem, 2 inconclusive, 4 skipped``."""
+    counts = Counter(called(result) for result in results)
+    order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
+    return ", ".join(f"{counts[word]} {word}" for word in order if counts[word]) or "no case was chosen"
 
 
-def as_json(results: Sequence[CaseResult]) -> list[dict[str, Any]]:
-    """One object a case."""
+def as_json(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str, Any]]:
+    """One object a case. `argv` is the command line that was given, for `reproduce`."""
     return [
         {
             "id": r.case.id,
@@ -73,22 +98,24 @@ def as_json(results: Sequence[CaseResult]) -> list[dict[str, Any]]:
             "reason": r.reason,
             "waived": bool(r.waived),
             "took_s": round(r.took_s, 3),
+            "reproduce": reproduce(argv, r.case.id),
+            "wire": [line.as_json() for line in r.wire],
         }
         for r in results
     ]
 
 
-def as_report(results: Sequence[CaseResult], title: str, reproduce: str, started: str) -> Report:
+def as_report(results: Sequence[CaseResult], title: str, argv: Sequence[str], started: str) -> Report:
     """For `fieldtwin.report`: a scenario a case."""
-    return Report(
-        title, [_scenario(r, title, reproduce) for r in results], started=started, reproduce=reproduce, target=title
-    )
+    again = shlex.join(["fieldtwin", *argv])
+    return Report(title, [_scenario(r, title, argv) for r in results], started=started, reproduce=again, target=title)
 
 
-def _scenario(result: CaseResult, target: str, reproduce: str) -> ScenarioResult:
+def _scenario(result: CaseResult, target: str, argv: Sequence[str]) -> ScenarioResult:
     case = result.case
     check = CheckResult("1", f"{case.does}: {case.must}", result.verdict, expected=case.must, got=result.reason)
     return ScenarioResult(
         f"{case.id} {case.title}", result.verdict, [check], requirements=(case.row,), target=target, reason=result.reason,
-        reproduce=f"{reproduce} --only {case.id}", took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
+        reproduce=reproduce(argv, case.id), took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
+        evidence=tuple(map(str, result.wire)),
     )  # fmt: skip

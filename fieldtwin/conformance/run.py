@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 from fieldtwin.conformance.case import TRAIL_S, Case, Danger, Finding, inconclusive, skipped
-from fieldtwin.conformance.observation import Asked, Ended, Habit, Observation, Shown, Told, Word
+from fieldtwin.conformance.evidence import Line, lines
+from fieldtwin.conformance.observation import Asked, Ended, Event, Habit, Observation, Shown, Told, Word
 from fieldtwin.conformance.probe import Probe
 from fieldtwin.conformance.recorder import Recorder
 from fieldtwin.conformance.results import CaseResult
@@ -43,6 +44,8 @@ class Playable(Protocol):
     def needs(self) -> str: ...
     @property
     def trail_s(self) -> float: ...
+    @property
+    def least(self) -> int: ...
 
 
 C = TypeVar("C", bound=Playable)
@@ -193,7 +196,8 @@ class MasterRun(Generic[C]):
                 why = f"the master had ended, exit code {self._ended.status}"
             self._done(case, inconclusive(f"all was not well before it began: {why}"), since_ns)
         else:
-            self._done(case, await self._play(case), since_ns)
+            finding, events = await self._play(case)
+            self._done(case, finding, since_ns, lines(events, self.stage.first_ns))
 
     def _not_here(self, case: C) -> str:
         if not self.traits & set(case.framings):
@@ -231,7 +235,7 @@ class MasterRun(Generic[C]):
             return True
         return any(isinstance(e, Shown) and e.word is word for e in self.stage.recorder.since(since_ns))
 
-    async def _play(self, case: C) -> Finding:
+    async def _play(self, case: C) -> tuple[Finding, tuple[Event, ...]]:
         stage, before = self.stage, self._word
         after = Word.SECOND if before is Word.FIRST else Word.FIRST
         start_ns = stage.now_ns()
@@ -241,9 +245,9 @@ class MasterRun(Generic[C]):
         fits = await self._until(lambda: stage.struck > 0, min(self.plan.patience_s, 4 * self.habit.longest_gap_s + 1))
         if not fits:
             stage.end()
-            return skipped(f"it sent no {case.wants} to answer so")
+            return skipped(f"it sent no {case.wants} to answer so"), ()
         done = (
-            (lambda: self._seen(after, start_ns))
+            (lambda: self._seen(after, start_ns) and stage.struck >= case.least)
             if case.holds_good and self.probe
             else (lambda: stage.struck >= case.strikes)
         )
@@ -264,7 +268,7 @@ class MasterRun(Generic[C]):
             events, stage.first_ns, over_ns, until_ns, self.habit, before, after, last,
             self.probe is not None, self.plan.timeout_s, self.plan.patience_s,
         )  # fmt: skip
-        return case.about.judge(seen)
+        return case.about.judge(seen), events
 
     def _watched(self, case: C) -> None:
         now_ns = self.stage.now_ns()
@@ -275,8 +279,8 @@ class MasterRun(Generic[C]):
         events = self.stage.recorder.since(0)
         self._done(case, case.about.judge(Observation(events, 0, 0, now_ns, self.habit)), now_ns)
 
-    def _done(self, case: C, finding: Finding, since_ns: int) -> None:
-        result = CaseResult(case.about, finding, (self.stage.now_ns() - since_ns) / NS_PER_S)
+    def _done(self, case: C, finding: Finding, since_ns: int, wire: tuple[Line, ...] = ()) -> None:
+        result = CaseResult(case.about, finding, (self.stage.now_ns() - since_ns) / NS_PER_S, wire=wire)
         self.results.append(result)
         self.tell(result)
 

@@ -113,6 +113,8 @@ class ModbusCase:
     framings: tuple[str, ...] = ("rtu", "ascii", "tcp")
     needs: str = ""
     trail_s: float = TRAIL_S
+    least: int = 1
+    """At least so many requests are misanswered, even where the honest word was seen before."""
 
     def on(self, **changes: object) -> ModbusCase:
         return replace(self, **changes)  # type: ignore[arg-type]

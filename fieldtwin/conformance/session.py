@@ -15,9 +15,9 @@ from fieldtwin.conformance.canopen_cases import SILENT as CANOPEN_SILENT
 from fieldtwin.conformance.canopen_stage import CanopenStage
 from fieldtwin.conformance.modbus_cases import CASES, SILENT
 from fieldtwin.conformance.modbus_stage import Stage, traits, wire_for
-from fieldtwin.conformance.observation import Word
-from fieldtwin.conformance.probe import Classifier, OutputProbe, Probe, RegisterProbe
-from fieldtwin.conformance.program import Program
+from fieldtwin.conformance.observation import Event, Word
+from fieldtwin.conformance.probe import Classifier, MarkedOutputProbe, OutputProbe, Probe, RegisterProbe
+from fieldtwin.conformance.program import OnText, Program
 from fieldtwin.conformance.pty_line import PtyLine
 from fieldtwin.conformance.results import CaseResult
 from fieldtwin.conformance.run import C, MasterRun, Plan
@@ -34,9 +34,9 @@ LISTENING = "tcp://HOST:PORT, rtu+tcp://HOST:PORT, pty:PATH, rtu:PORT or ascii:P
 
 @dataclass(frozen=True)
 class Options:
-    """What a user asked for. `words`: the two honest ones and the poison. `probe` as `RegisterProbe` reads it, ``output``, or
-    empty. `ascii`: what is on the line is Modbus ASCII. From `objects` on it is for CANopen only: fixed objects, bytes of all
-    others, nodes that boot by themselves."""
+    """What a user asked for. `words`: the two honest ones and the poison. `probe` as `RegisterProbe` reads it, ``output``,
+    ``output:TEXT``, or empty. `ascii`: what is on the line is Modbus ASCII. From `objects` on it is for CANopen only: fixed
+    objects, bytes of all others, nodes that boot by themselves."""
 
     listen: Endpoint
     plan: Plan
@@ -55,10 +55,11 @@ class Options:
 
 @dataclass(frozen=True)
 class Listener:
-    """Who hears what happens: `say` one line of talk, `tell` each result."""
+    """Who hears what happens: `say` one line of talk, `tell` each result, `log` each event on the wire."""
 
     say: Callable[[str], None]
     tell: Callable[[CaseResult], None]
+    log: Callable[[Event], None] = lambda event: None
 
 
 async def judge_modbus_master(options: Options, listener: Listener) -> list[CaseResult]:
@@ -109,12 +110,13 @@ async def judge_canopen_master(options: Options, listener: Listener) -> list[Cas
 
 
 async def _judged(
-    run: MasterRun[C], options: Options, theirs: Endpoint, on_text: Callable[[str], None], listener: Listener
+    run: MasterRun[C], options: Options, theirs: Endpoint, on_text: OnText, listener: Listener
 ) -> list[CaseResult]:
     """The run, beside the program if there is one."""
     task = asyncio.current_task()
     assert task is not None
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+    run.stage.recorder.tell = listener.log
     listener.say(f"listening on {options.listen}; the master's side is {theirs}")
     if not options.command:
         return await run.run()
@@ -147,17 +149,21 @@ async def _open(listen: Endpoint, stage: Stage, nursery: Nursery, closing: Async
     return Endpoint(framing, path=line.named.path, params=listen.params)
 
 
-def _probe(options: Options, nursery: Nursery) -> tuple[Probe | None, Callable[[str], None]]:
+def _probe(options: Options, nursery: Nursery) -> tuple[Probe | None, OnText]:
     """The probe, and who hears what the program prints."""
     if not options.probe:
-        return None, lambda text: None
-    if options.probe == "output":
+        return None, lambda text, log: None
+    kind, _, mark = options.probe.partition(":")
+    if kind == "output":
         if not options.command:
-            raise UsageError("nothing prints", expected="a program behind -- for --probe output")
+            raise UsageError("nothing prints", expected="a program after -- for --probe output")
+        if mark:
+            marked = MarkedOutputProbe(mark, Classifier(options.words[2], options.stands_for_none))
+            return marked, marked.feed
         words = dict(zip(options.words, (Word.FIRST, Word.SECOND, Word.POISON), strict=True))
         printed = OutputProbe(words)
         return printed, printed.feed
     classifier = Classifier(options.words[2], options.stands_for_none)
     probe = RegisterProbe(options.probe, OsConnector(), WallClock(), classifier)
     nursery.start(probe.run(), "probe")
-    return probe, lambda text: None
+    return probe, lambda text, log: None

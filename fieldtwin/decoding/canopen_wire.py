@@ -76,6 +76,11 @@ class CanopenWire:
         dropped = [(node, watch.drop()) for node, watch in self._sdo.items()]
         return [self._transferred(node, t, t.t_ns, "no reply") for node, t in dropped if t] + self._lss.finish()
 
+    def pending(self) -> list[Exchange]:
+        """Return the requests whose reply may still come. Changes nothing."""
+        open_ = [(node, watch.open) for node, watch in self._sdo.items()]
+        return [self._transferred(node, t, t.t_ns, "pending") for node, t in open_ if t] + self._lss.pending()
+
     # -- what nobody answers --------------------------------------------------------------------------------------------
 
     def _message(
@@ -190,6 +195,7 @@ class CanopenWire:
         tags, value = self._value(node, transfer, t_ns)
         text = self._asked(node, transfer)
         failed = transfer.abort is not None or bool(problem)
+        ended = problem not in ("no reply", "pending")
         known_node = None if failed else self._nodes.get(node)
         if known_node is not None and known_node.learn(transfer.index, transfer.subindex, bytes(transfer.data)):
             self._find_pdos()
@@ -206,7 +212,7 @@ class CanopenWire:
         return Exchange(
             transfer.t_ns, t_ns, self.bus, self._device(node), node, 0, transfer.service, (span,),
             tags=tags if known else dict.fromkeys(tags), abort=transfer.abort,
-            latency_ns=None if problem == "no reply" else t_ns - transfer.t_ns, request=transfer.request,
+            latency_ns=t_ns - transfer.t_ns if ended else None, request=transfer.request,
             reply=transfer.reply, problem=problem, text=text, reply_text=reply_text,
             value=value if known else None, secrets=self._secrets(node, (span,)),
         )  # fmt: skip

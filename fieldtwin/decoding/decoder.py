@@ -17,7 +17,7 @@ from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Decoded, Exchange
 from fieldtwin.decoding.modbus_wire import ModbusWire, Unit
 from fieldtwin.decoding.tags import TagMap, show_value
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.scenarios.trace import Event, Kind, refusal_text
 from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
@@ -59,6 +59,11 @@ class Decoder:
         """Nothing follows: what is still awaited has no answer."""
         wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
         return sorted((e for wire in wires for e in wire.finish()), key=lambda e: e.t_ns)
+
+    def pending(self) -> list[Exchange]:
+        """Return the requests whose reply may still come, the oldest first. Changes nothing, so it may be called at any time."""
+        wires: list[ModbusWire | CanopenWire] = [*self._modbus.values(), *self._canopen.values()]
+        return sorted((e for wire in wires for e in wire.pending()), key=lambda e: e.t_ns)
 
     def _frame(self, event: Event) -> tuple[str, list[Exchange]]:
         data = event.data
@@ -111,6 +116,8 @@ class Decoder:
             case Kind.FAULT:
                 state = "on" if data.get("on") else "off"
                 return f"fault {where}: {data.get('name', '')} {state} {data.get('target') or ''}".rstrip()
+            case Kind.REFUSED:
+                return refusal_text(where, data)
             case Kind.STEP:
                 verdict = f": {data['verdict']}" if data.get("verdict") else ""
                 return f"step {where}: {data.get('text', '')}{verdict}"

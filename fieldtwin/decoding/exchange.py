@@ -51,10 +51,11 @@ class Exchange:
     engineering units, None for those that were only asked for; `registers` the words, or for bits 0 and 1.
 
     `problem` says why there is no good answer, "" where there is: ``no reply``, ``check sum``, ``exception``, ``abort``,
-    ``stray`` (a frame that answers nothing), ``malformed``. `latency_ns` is from the request to the last byte of the
-    answer, None without one. `t_ns` is when the request was seen, `end_ns` when the last byte of all was. `text` says what was
-    asked, `reply_text` what was answered. `value` is what an SDO transfer moved (engineering units where it is a tag, hex where
-    its type is not known), an EMCY's code, a heartbeat's state.
+    ``stray`` (a frame that answers nothing), ``malformed``; ``pending`` while the answer may still come, which only
+    `Decoder.pending` gives. `transaction` is the transaction id on Modbus TCP, None elsewhere. `latency_ns` is from the request
+    to the last byte of the answer, None without one. `t_ns` is when the request was seen, `end_ns` when the last byte of all
+    was. `text` says what was asked, `reply_text` what was answered. `value` is what an SDO transfer moved (engineering units
+    where it is a tag, hex where its type is not known), an EMCY's code, a heartbeat's state.
     """
 
     t_ns: int
@@ -78,6 +79,7 @@ class Exchange:
     value: Scalar | None = None
     secrets: frozenset[str] = frozenset()
     """Tags of it that nobody is to see; with "" among them, no raw word of it either. Checks still know the values."""
+    transaction: int | None = None
 
     @property
     def access(self) -> str:
@@ -93,6 +95,11 @@ class Exchange:
     def count(self) -> int:
         """Registers, bits or objects of the first span."""
         return self.spans[0].count if self.spans else 0
+
+    @property
+    def is_stray(self) -> bool:
+        """Whether this is a frame that answers no request. It is not a request and must never be counted as one."""
+        return self.problem == "stray"
 
     @property
     def ok(self) -> bool:

@@ -42,6 +42,10 @@ class LssWatch:
             return "LSS without data", []
         return self._reply(data, t_ns) if reply else self._request(data, t_ns)
 
+    def pending(self) -> list[Exchange]:
+        """Return the request whose reply may still come. Changes nothing."""
+        return [] if self._open is None else [replace(self._open, problem="pending", reply_text="pending")]
+
     def finish(self) -> list[Exchange]:
         """Nothing follows."""
         now, self._open = self._open, None

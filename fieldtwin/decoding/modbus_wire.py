@@ -19,6 +19,9 @@ from gateway.core.values import Scalar
 MAX_OPEN = 64
 """Requests without an answer that are remembered on an MBAP wire; an older one will have none."""
 
+STRAY_SHOWN = 32
+"""Bytes of a stray frame that its text shows; the exchange has all of them."""
+
 
 @dataclass(frozen=True, slots=True)
 class Unit:
@@ -67,6 +70,12 @@ class ModbusWire:
         done += [self._unanswered(o) for o in self._open.values()]
         self._open.clear()
         return done
+
+    def pending(self) -> list[Exchange]:
+        """Return the requests whose reply may still come, the oldest first. Changes nothing."""
+        size = self._replies.pending
+        text = f"pending, {_bytes(size)} of a reply so far" if size else "pending"
+        return [self._exchange(opened, None, "pending", text) for opened in self._open.values()]
 
     # -- requests -----------------------------------------------------------------------------------------------------
 
@@ -185,11 +194,15 @@ class ModbusWire:
         name = unit.name if unit else ""
         late = frame.transaction in self._given_up
         why = "an answer that comes too late" if late else "a frame that answers nothing"
-        text = f"{name or f'unit {frame.unit}'}: {why}"
+        transaction = frame.transaction if frame.transaction >= 0 else None
+        hidden = unit is not None and unit.tags.has_secrets
+        text = f"{name or f'unit {frame.unit}'}: {why}: {_identified(frame.unit, transaction)}, "
+        text += SECRET if hidden else _shortened(frame.raw)
         done.append(
             Exchange(
                 frame.t_ns, frame.t_ns, self.bus, name, frame.unit, frame.pdu[0] & 0x7F if frame.pdu else 0, "stray",
-                reply=frame.raw, problem="stray", text=text, reply_text=text,
+                reply=frame.raw, problem="stray", text=text, reply_text=text, secrets=frozenset({""}) if hidden else frozenset(),
+                transaction=transaction,
             )
         )  # fmt: skip
         return text
@@ -248,6 +261,7 @@ class ModbusWire:
             text=opened.text,
             reply_text=reply_text,
             secrets=opened.tags.secrets(asked.spans) if opened.tags is not None else frozenset(),
+            transaction=frame.transaction if frame.transaction >= 0 else None,
         )
 
 
@@ -265,6 +279,16 @@ def _shown(tags: TagMap | None, span: Span, found: dict[str, Scalar | None], reg
     most = 8
     numbers = " ".join(str(r) if span.table in ("coil", "discrete") else f"{r:04X}" for r in registers[:most])
     return numbers + (f" ... ({len(registers)})" if len(registers) > most else "")
+
+
+def _identified(unit: int, transaction: int | None) -> str:
+    return f"unit {unit}" if transaction is None else f"transaction {transaction}, unit {unit}"
+
+
+def _shortened(raw: bytes) -> str:
+    """The bytes in hex, the first `STRAY_SHOWN` of them."""
+    more = f" ... ({_bytes(len(raw))})" if len(raw) > STRAY_SHOWN else ""
+    return raw[:STRAY_SHOWN].hex(" ") + more
 
 
 def _bytes(count: int) -> str:

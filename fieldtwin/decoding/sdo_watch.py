@@ -166,7 +166,8 @@ class SdoWatch:
 
     def _aborted(self, data: bytes, by: str) -> Seen:
         code, now = int.from_bytes(data[4:8], "little"), self.open
-        if now is None or data[1:4] != now.request[1:4]:
+        unnamed = by == "client" and data[1:4] == bytes(3)  # canopen-python leaves the multiplexer 0
+        if now is None or not (unnamed or data[1:4] == now.request[1:4]):
             return Seen(f"abort {code:08X}h {meaning(code)}, of no transfer")
         now.abort, now.aborted_by, now.reply = code, by, data
         return self._over(now)

@@ -46,6 +46,11 @@ class TagMap:
         plan = self._plan(span)
         return [t.name for t, *_ in plan.tags] + [n for n, *_ in plan.blocks] + [b.name for b, _ in plan.boxes]
 
+    @property
+    def has_secrets(self) -> bool:
+        """Whether the device has any secret tag, so that a frame of unknown content may hold one."""
+        return bool(self._secrets)
+
     def secret(self, span: Span) -> bool:
         """Whether any part of `span` is nobody's business."""
         return any(_touches(tag, span) for tag in self._secrets)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from fieldtwin.decoding.decoder import frame_events
 from fieldtwin.formats.pcap import MAX_LINE_BYTES, read_capture
-from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.scenarios.trace import Event, Kind, refusal_data
 from gateway.core.errors import FileInvalid
+from gateway.core.input_file import open_input
 from twin.system import System
 
 _EXPECTED = "[ns, kind, where, data], as `fieldtwin run --virtual --trace` writes it"
@@ -21,20 +23,23 @@ def read_events(path: Path, system: System) -> Iterator[Event]:
     off is left out. Raises `FileInvalid` with the line at any other flaw.
     """
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             first = file.read(1)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     if first == b"{":
-        captured = list(read_capture(path))
-        yield from frame_events(captured, system, captured[0].t_ns if captured else 0)
+        refusals: list[dict[str, Any]] = []
+        captured = list(read_capture(path, refusals))
+        start_ns = captured[0].t_ns if captured else 0
+        refused = [Event(r["t_ns"] - start_ns, Kind.REFUSED, r["tag"], refusal_data(r)) for r in refusals]
+        yield from sorted([*frame_events(captured, system, start_ns), *refused], key=lambda event: event.t_ns)
         return
     yield from _trace(path)
 
 
 def _trace(path: Path) -> Iterator[Event]:
     decoder, kinds = msgspec.json.Decoder(tuple[int, str, str, dict[str, object]]), {k.value: k for k in Kind}
-    with path.open("rb") as file:
+    with open_input(path) as file:
         number = 0
         while line := file.readline(MAX_LINE_BYTES):
             number += 1

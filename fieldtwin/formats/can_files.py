@@ -7,6 +7,7 @@ frames are counted and left out. These formats lose things: .trc has no error fr
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections.abc import Iterator
@@ -14,8 +15,10 @@ from pathlib import Path
 from typing import IO, Any
 
 from fieldtwin.formats.candump import LeftOut
+from fieldtwin.formats.packed import most_unpacked, too_much
 from gateway.core.canframe import CanFrame
 from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from gateway.core.input_file import open_input
 
 SUFFIXES = (".asc", ".blf", ".trc")
 MAX_TIME_S = 1 << 33
@@ -40,7 +43,7 @@ def read_can_file(path: Path, left: LeftOut) -> Iterator[tuple[int, str, CanFram
     number = 0
     try:
         (_check_blocks if kind == ".blf" else _check_lines)(path)
-        with path.open("rb") if kind == ".blf" else path.open(encoding="utf-8", errors="replace") as file:
+        with open_input(path) if kind == ".blf" else path.open(encoding="utf-8", errors="replace") as file:
             for message in _guarded(readers[kind], file, path):
                 number += 1
                 found = _frame(message, left)
@@ -76,7 +79,7 @@ def _guarded(reader: Any, file: IO[Any], path: Path) -> Iterator[Any]:
 def _check_lines(path: Path) -> None:
     """A reader takes a line into memory whatever its length."""
     since = number = 0
-    with path.open("rb") as file:
+    with open_input(path) as file:
         while block := file.read(_BLOCK):
             for i, piece in enumerate(block.split(b"\n")):
                 since, number = (since + len(piece), number) if i == 0 else (len(piece), number + 1)
@@ -88,11 +91,12 @@ def _check_lines(path: Path) -> None:
 
 def _check_blocks(path: Path) -> None:
     """A reader unpacks a container into memory whatever it becomes."""
-    with path.open("rb") as file:
+    with open_input(path) as file:
         head = file.read(8)
         if len(head) < 8 or head[:4] != b"LOGG":
             raise FileInvalid("offset 0: not a .blf file", path=str(path), expected="LOGG", got=head[:4].hex())
         at, rest = max(int.from_bytes(head[4:8], "little"), 8), b""
+        on_disk, held = os.fstat(file.fileno()).st_size, 0
         while True:
             file.seek(at)
             head = file.read(32)
@@ -113,6 +117,9 @@ def _check_blocks(path: Path) -> None:
                     raise FileInvalid(
                         f"offset {at}: a container that is too large", path=str(path), expected=f"{MAX_CONTAINER} bytes"
                     )
+                held += len(data)
+                if held > most_unpacked(on_disk):
+                    raise too_much(path, on_disk)
                 rest = _check_objects(rest + data, path, at)
             at += size + size % 4
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from gateway.core.canframe import CanFrame
 from gateway.core.errors import FileInvalid
+from gateway.core.input_file import open_input
 
 _LINE = re.compile(
     rb"\((\d{1,12})\.(\d{6,9})\)\s+(\S{1,64})\s+([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R[0-8]?|(?:[0-9A-Fa-f]{2}){0,8})(?:_\d)?(?:\s+[RT])?"
@@ -47,7 +48,7 @@ def read_log(path: Path, left: LeftOut | None = None) -> Iterator[tuple[int, str
     left = left if left is not None else LeftOut()
     number = 0
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             while line := file.readline(MAX_LINE + 1):
                 number += 1
                 text = line.strip()

@@ -8,8 +8,6 @@ emulators or the command line.
 
 from __future__ import annotations
 
-import bz2
-import gzip
 import math
 import os
 import re
@@ -20,7 +18,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.formats.packed import unpacked
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import open_input
 from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
 
 DEVICE = "fieldtwin/ctd-reference"
@@ -150,17 +150,11 @@ class _Lines:
         self.number = 0
         self._progress = progress
         try:
-            self._raw: BinaryIO = path.open("rb")
+            self._raw = open_input(path)
         except OSError as error:
             raise FileInvalid(f"cannot read the cast: {error.strerror}", path=str(path)) from error
         self._total = os.fstat(self._raw.fileno()).st_size
-        magic = self._raw.read(3)
-        self._raw.seek(0)
-        self._text: BinaryIO | gzip.GzipFile | bz2.BZ2File = self._raw
-        if magic[:2] == b"\x1f\x8b":
-            self._text = gzip.GzipFile(fileobj=self._raw)
-        elif magic == b"BZh":
-            self._text = bz2.BZ2File(self._raw)
+        self._text: BinaryIO = unpacked(self._raw, path) or self._raw
 
     def __enter__(self) -> _Lines:
         return self

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import open_input
 from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
 
 MAX_LINE = 65_536
@@ -86,7 +87,7 @@ def _copy(
 
 def _open(path: Path) -> BinaryIO:
     try:
-        return path.open("rb")
+        return open_input(path)
     except OSError as e:
         raise FileInvalid(f"cannot read the table: {e.strerror or e}", path=str(path)) from e
 

@@ -8,15 +8,16 @@ Sources: draft-ietf-opsawg-pcap (pcap), draft-ietf-opsawg-pcapng (pcapng).
 
 from __future__ import annotations
 
-import gzip
 import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self, cast
+from typing import BinaryIO, Self
 
+from fieldtwin.formats.packed import unpacked
 from gateway.core.errors import FileInvalid
+from gateway.core.input_file import open_input
 
 MAX_PACKET = 262_144
 """Bytes of a packet; the largest snapshot length that libpcap allows."""
@@ -53,10 +54,9 @@ class PacketFile:
             tuple[int, int, int, int]
         ] = []  # link type, ticks a second, offset in s, snapshot length
         try:
-            raw = path.open("rb")
-            zipped = raw.peek(2)[:2] == b"\x1f\x8b"
+            raw = open_input(path)
             self._raw = raw
-            self._file: IO[bytes] = cast(IO[bytes], gzip.GzipFile(fileobj=raw)) if zipped else raw
+            self._file: BinaryIO = unpacked(raw, path) or raw
         except OSError as e:
             raise FileInvalid(f"cannot read the capture: {e.strerror or e}", path=str(path)) from e
 

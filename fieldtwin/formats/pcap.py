@@ -15,12 +15,14 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, FileInvalid
+from gateway.core.input_file import open_input
 
 LINKTYPE_ETHERNET = 1
 LINKTYPE_USER0 = 147
@@ -43,13 +45,14 @@ MAX_LINE_BYTES = 1 << 20
 """Longer lines are refused; the longest chunk that a tap sees is a fraction of it."""
 
 
-def read_capture(path: Path) -> Iterator[Captured]:
-    """What a `TapFile` wrote, in order, a line at a time. A last line that was cut off is left out.
+def read_capture(path: Path, refusals: list[dict[str, Any]] | None = None) -> Iterator[Captured]:
+    """What a `TapFile` wrote, in order, a line at a time. A last line that was cut off is left out. Writes that did not reach
+    their device are no traffic: they go to `refusals`.
 
     Raises `FileInvalid` when the file cannot be read, and at any other flaw with its line.
     """
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             number = 0
             while line := file.readline(MAX_LINE_BYTES):
                 number += 1
@@ -57,6 +60,10 @@ def read_capture(path: Path) -> Iterator[Captured]:
                     read = json.loads(line)
                     if "started" in read:
                         continue  # a session of `WireLog`
+                    if "refused" in read:
+                        if refusals is not None:
+                            refusals.append(dict(read["refused"]))
+                        continue
                     captured = captured_of(read)
                 except (ValueError, KeyError, TypeError, FieldtwinError) as e:
                     if not line.endswith(b"\n") and not file.read(1):

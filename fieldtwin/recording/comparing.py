@@ -17,6 +17,7 @@ from typing import TypeVar
 from fieldtwin.decoding.exchange import Span
 from fieldtwin.decoding.modbus_pdu import Answer, Asked, parse_reply, parse_request, words
 from fieldtwin.decoding.tags import TagMap
+from fieldtwin.recording.aligning import Shift
 from gateway.core.profile import DeviceProfile
 from gateway.core.recording import Exchange
 from gateway.core.values import Scalar
@@ -26,6 +27,8 @@ MAX_LATENCIES = 200_000
 """Latencies that are kept of each side; later ones are counted only."""
 LOOK_AHEAD = 10_000
 """How far the other recording may be out of step before an exchange is taken as missing there."""
+MAX_UNWRITTEN = 100_000
+"""Cells that left-out writes had set, of which it is remembered."""
 QUANTILES = tuple(q / 100 for q in range(5, 100, 5))
 FLOOR_S = 0.001
 """Added to both quantiles of a ratio: a tenth of a millisecond beside none is no difference between devices."""
@@ -61,7 +64,7 @@ class Rules:
 @dataclass(frozen=True, slots=True)
 class Difference:
     """An exchange that went otherwise. `what` is value, exception, silence, reply or missing; `where` a tag or
-    register."""
+    register. `after_left_out`: a write that was left out had set what was read."""
 
     t_s: float
     unit: int
@@ -70,6 +73,7 @@ class Difference:
     where: str
     recorded: str
     other: str
+    after_left_out: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +96,12 @@ class Comparison:
     differences: list[Difference] = field(default_factory=list)
     by_kind: dict[str, int] = field(default_factory=dict)
     left_out: int = 0
+    left_out_writes: int = 0
+    after_left_out: int = 0
+    """Exchanges that differ and read what a left-out write had set."""
+    not_compared: int = 0
+    """Exchanges that were asked, and for which the recording has nothing at the position that was found."""
+    shifts: list[Shift] = field(default_factory=list)
     extra: int = 0
     latency: list[LatencyRow] = field(default_factory=list)
     timing: float | None = None
@@ -105,19 +115,29 @@ class Comparison:
     @property
     def met(self) -> bool:
         """Whether the one can stand for the other."""
-        return self.compared > 0 and self.values >= self.least and all(row.alike for row in self.latency)
+        if not self.compared or not all(row.alike for row in self.latency):
+            return False
+        return self.alike >= self.least * (self.compared + self.not_compared)
+
+    @property
+    def inconclusive(self) -> bool:
+        """Whether it is not met only because of what could not be compared."""
+        if self.met or not self.not_compared or not all(row.alike for row in self.latency):
+            return False
+        return self.alike + self.not_compared >= self.least * (self.compared + self.not_compared)
 
 
 class Comparer:
     """Takes pairs, one after the other; `result` may be asked for once all are in."""
 
     def __init__(self, rules: Rules | None = None, profile: DeviceProfile | None = None) -> None:
-        self._rules = rules or Rules()
+        self._rules, self._profile = rules or Rules(), profile
         self._maps = (TagMap(profile), TagMap(profile)) if profile is not None else None
         self._counters = {t.name for t in profile.tags.values() if t.counter} if profile is not None else set()
         self._result = Comparison(least=self._rules.least)
         self._latencies: dict[int, tuple[array[float], array[float]]] = {}
         self._requests: dict[bytes, Asked] = {}
+        self._unwritten: set[tuple[int, str, int]] = set()
 
     def add(self, recorded: Exchange | None, other: Exchange | None) -> None:
         """One exchange on both sides; None where a side does not have it."""
@@ -138,9 +158,31 @@ class Comparer:
                 kept[0].append(recorded.latency_s)
                 kept[1].append(other.latency_s)
 
-    def left_out(self, count: int = 1) -> None:
-        """Exchanges that were not asked again."""
-        self._result.left_out += count
+    def is_alike(self, recorded: Exchange, other: Exchange) -> bool:
+        """Whether the two are alike by the rules. Counts nothing."""
+        if recorded.reply == other.reply and recorded.error == other.error:
+            return True
+        trial = Comparer(self._rules, self._profile)
+        trial.add(recorded, other)
+        return not trial._result.by_kind
+
+    def left_out(self, exchange: Exchange) -> None:
+        """An exchange that was not asked again. What a write set is not there, and may be missed later."""
+        self._result.left_out += 1
+        asked = self._asked(exchange.request)
+        if asked.write_span is None or not exchange.reply or exchange.reply[0] & 0x80:
+            return
+        self._result.left_out_writes += 1
+        if len(self._unwritten) < MAX_UNWRITTEN:
+            self._unwritten.update((exchange.unit, *cell) for cell in _cells(asked.write_span))
+
+    def not_compared(self) -> None:
+        """An exchange that was asked and that the recording says nothing about."""
+        self._result.not_compared += 1
+
+    def shifted(self, shifts: Iterable[Shift]) -> None:
+        """Where the dialogue continued the recorded one."""
+        self._result.shifts += shifts
 
     def result(self) -> Comparison:
         """What came of all."""
@@ -213,11 +255,15 @@ class Comparer:
         kinds = self._result.by_kind
         kinds[what] = kinds.get(what, 0) + 1
         asked = self._asked(exchange.request)
+        unwritten = asked.read_span is not None and not self._unwritten.isdisjoint(
+            (exchange.unit, *cell) for cell in _cells(asked.read_span)
+        )
+        self._result.after_left_out += unwritten
         text = f"{asked.service} {' and '.join(map(str, asked.spans))}".rstrip()
         for place, mine, theirs in ((where, recorded, other), *more):
             if len(self._result.differences) < MAX_DIFFERENCES:
                 self._result.differences.append(
-                    Difference(exchange.t_s, exchange.unit, text, what, place, mine, theirs)
+                    Difference(exchange.t_s, exchange.unit, text, what, place, mine, theirs, unwritten)
                 )
 
 
@@ -266,6 +312,10 @@ def pairs_of(
 def request_of(exchange: Exchange) -> Hashable:
     """What an exchange is paired by: unit and request."""
     return exchange.unit, exchange.request
+
+
+def _cells(span: Span) -> Iterator[tuple[str, int]]:
+    return ((span.table, span.address + at) for at in range(span.count))
 
 
 def _outcome(exchange: Exchange | None) -> str:

@@ -24,6 +24,7 @@ from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import open_input
 from gateway.core.profile import DeviceProfile
 from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, SignalRow
 from gateway.core.values import Scalar
@@ -156,6 +157,10 @@ def _outcome(e: Exchange) -> str:
     return f"exception {e.reply[1]:02X}" if len(e.reply) == 2 and e.reply[0] & 0x80 else "ok"
 
 
+_FORMULA = frozenset("=+-@\t\r\n\0")
+"""What a cell of text may not begin with."""
+
+
 def _write_table(out: Path, kind: str, columns: Sequence[Column], rows: Rows) -> int:
     return _write_csv(out, columns, rows) if kind == ".csv" else _write_parquet(out, columns, rows)
 
@@ -168,11 +173,16 @@ def _write_csv(out: Path, columns: Sequence[Column], rows: Rows) -> int:
         raise FileInvalid(f"cannot write the table: {e.strerror or e}", path=str(out)) from e
     with file:
         writer = csv.writer(file)
-        writer.writerow(c.name for c in columns)
+        writer.writerow(_not_a_formula(c.name) for c in columns)
         for row in rows:
-            writer.writerow("" if v is None else v for v in row)
+            writer.writerow("" if v is None else _not_a_formula(v) if isinstance(v, str) else v for v in row)
             count += 1
     return count
+
+
+def _not_a_formula(text: str) -> str:
+    """Return `text` so that a spreadsheet shows it: it may run a cell that begins with =, +, -, @ or a control character."""
+    return f"'{text}" if text[:1] in _FORMULA and text else text
 
 
 def _write_parquet(out: Path, columns: Sequence[Column], rows: Rows) -> int:
@@ -256,7 +266,7 @@ def _start_ns(header: RecordingHeader) -> int:
 
 def _is_capture(path: Path) -> bool:
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             return b'"t_ns"' in file.readline(4096)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e

@@ -28,6 +28,7 @@ from gateway.core.canframe import CanFrame
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import open_input
 from gateway.core.recording import RecordingHeader, encode_exchange, encode_header
 from gateway.protocols.modbus.framings import framing_of
 
@@ -57,7 +58,7 @@ def kind_of(path: Path) -> str:
     if name.endswith(CNV):
         return "cnv"
     try:
-        with path.open("rb") as file:
+        with open_input(path) as file:
             head = file.read(512)
     except OSError as e:
         if not name.endswith(_SUFFIXES):
@@ -100,7 +101,7 @@ def _write_log(frames: Iterable[tuple[int, str, CanFrame]], out: Path, summary: 
 def import_polls(path: Path, out: Path) -> TextSummary:
     """A session of modpoll or mbpoll as a recording of exchanges, with a draft profile. Raises `FileInvalid` with the line."""
     summary, drafts = TextSummary(out), Drafts()
-    with path.open("rb") as source, _New(out, encode_header(_header(path, out, ""))) as file:
+    with open_input(path) as source, _New(out, encode_header(_header(path, out, ""))) as file:
         for exchange in read_polls(_lines(source, path), str(path)):
             file.line(exchange.t_s, encode_exchange(exchange))
             drafts.note(exchange)
@@ -207,7 +208,7 @@ def _header(path: Path, out: Path, endpoint: str) -> RecordingHeader:
 def _of_prototype(capture: Path) -> bool:
     """Whether the run that a capture is of said so (SPEC ruling 15)."""
     try:
-        with capture.open("rb") as file:
+        with open_input(capture) as file:
             head = json.loads(file.readline(MAX_LINE))
     except (OSError, ValueError):
         return False

@@ -13,6 +13,7 @@ from fieldtwin.commissioning.reading import Target
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange as Transfer
 from fieldtwin.decoding.modbus_pdu import parse_request
+from fieldtwin.recording.aligning import Dialogue
 from fieldtwin.recording.asking import Asker, changes
 from fieldtwin.recording.comparing import Comparer, Comparison, Rules
 from fieldtwin.recording.comparing_can import TRANSFERS, Frames, compare_logs
@@ -52,21 +53,51 @@ async def compare_device(
 ) -> None:
     """Ask `most` (0: all) of the recorded requests again, of the recorded unit or of `unit`. What may change the device is
     left out and counted, unless `writes`; and what writes to a cell that is `wearing` (EEPROM) again, in any case. Raises
-    `ConnectionLost`."""
+    `ConnectionLost`.
+
+    The verdict does not depend on how often the device was read before: its dialogue may continue the recorded one anywhere, see
+    `aligning`."""
+    dialogue = Dialogue()
+    try:
+        await _ask_all(recorded, asker, comparer, dialogue, unit, writes, wearing, most, stop, progress)
+    finally:
+        for pair in dialogue.aligned(comparer.is_alike):
+            if pair.recorded is None:
+                comparer.not_compared()
+            else:
+                comparer.add(pair.recorded, pair.other)
+        comparer.shifted(dialogue.shifts)
+
+
+async def _ask_all(
+    recorded: Iterable[Exchange],
+    asker: Asker,
+    comparer: Comparer,
+    dialogue: Dialogue,
+    unit: int | None,
+    writes: bool,
+    wearing: Collection[Cell],
+    most: int,
+    stop: asyncio.Event | None,
+    progress: Progress,
+) -> None:
     done, worn = 0, set[Cell]()
     for exchange in recorded:
         if (most and done >= most) or (stop is not None and stop.is_set()):
-            return
+            if dialogue.is_full:
+                return
+            dialogue.rest(exchange)
+            continue
         written = cells_written(exchange.request).intersection(wearing) if wearing else set()
         if (changes(exchange.request) and not writes) or not worn.isdisjoint(written):
-            comparer.left_out()
+            comparer.left_out(exchange)
             continue
         worn |= written
         other = await asker.ask(exchange.unit if unit is None else unit, exchange.request)
         if other is None:
-            comparer.left_out()
+            comparer.left_out(exchange)
             continue
-        comparer.add(exchange, other)
+        dialogue.add(exchange, other)
         done += 1
         progress(done)
 

@@ -11,6 +11,7 @@ from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from fieldtwin.commissioning.address import tags_of
 from fieldtwin.commissioning.live import canopen_at, frames_at
 from fieldtwin.commissioning.point import CanopenPoint
 from fieldtwin.commissioning.reading import Target
@@ -169,11 +170,12 @@ async def record_node(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> None:
-    """As `record_polls`, for a CANopen node: each readable tag of its profile by SDO; `sink` sees the frames."""
-    clock, profile = clock or WallClock(), target.profile
-    if profile is None:
-        raise UsageError("a node is polled by its profile", hint="--profile")
-    tags = [t for t in profile.tags.values() if t.readable]
+    """As `record_polls`, for a CANopen node: read each readable tag of its profile, or each object of its EDS, by SDO.
+
+    `sink` sees the frames. Raises `UsageError` if the target has neither profile nor EDS.
+    """
+    clock = clock or WallClock()
+    tags = tags_of((), "canopen", None, target.profile, target.dictionary)
 
     async def on_the_grid() -> None:
         async with canopen_at(

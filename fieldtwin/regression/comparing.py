@@ -62,10 +62,17 @@ class Difference:
 
 @dataclass(frozen=True)
 class Verdict:
-    """`compared` fields and services, of which `differences`."""
+    """`compared` fields and services, of which `differences`; the runs' lengths in seconds."""
 
     compared: int
     differences: tuple[Difference, ...]
+    old_s: float = 0.0
+    new_s: float = 0.0
+
+    @property
+    def common_s(self) -> float:
+        """The time that both runs have. What one of them has after it was not compared."""
+        return min(self.old_s, self.new_s)
 
     @property
     def same(self) -> bool:
@@ -83,17 +90,19 @@ def compare(old: Story, new: Story, allowed: Allowed | None = None) -> Verdict:
         for name in sorted(before | after):
             if allowed.leaves_out(name):
                 continue
-            compared += 1
             one, other = _until(before.get(name, []), end_ns), _until(after.get(name, []), end_ns)
+            if not one and not other:
+                continue  # neither run has it in the time that both have
+            compared += 1
             if bool(one) != bool(other):
                 there, missing = "there", "not there"
                 found.append(Difference("field", name, there if one else missing, there if other else missing))
             else:
                 window_ns = max(round(allowed.window_s * NS_PER_S), old.pace_ns(name), new.pace_ns(name))
                 found += judge(name, one, other, end_ns, window_ns, allowed)
-    compared += len(old.latency_ns)
+    compared += sum(bool(times) and bool(new.latency_ns.get(key)) for key, times in old.latency_ns.items())
     found += _latencies(old, new, allowed) + _problems(old, new, allowed)
-    return Verdict(compared, tuple(found[:MOST_SHOWN]))
+    return Verdict(compared, tuple(found[:MOST_SHOWN]), old.end_ns / NS_PER_S, new.end_ns / NS_PER_S)
 
 
 def _until(changes: list[Change], end_ns: int) -> list[Change]:

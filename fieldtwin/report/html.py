@@ -15,7 +15,7 @@ from fieldtwin.report.coverage_tables import coverage_section
 from fieldtwin.report.diagram import timing_diagram
 from fieldtwin.report.file import put
 from fieldtwin.report.markup import Markup, el, join
-from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, Verdict
+from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, SystemKey, Verdict, key_of
 from fieldtwin.report.requirements import requirement_section
 from fieldtwin.report.style import style
 from fieldtwin.report.window import MOST_FRAMES, SECOND_NS, Study, Window
@@ -44,7 +44,7 @@ def write_html(report: Report, path: Path) -> None:
 
 def render_html(report: Report) -> str:
     """The whole page."""
-    counts, failures = _study(report)
+    parts, failures = _study(report)
     verdict = report.verdict
     body = [
         _header(report),
@@ -55,7 +55,7 @@ def render_html(report: Report) -> str:
     ]
     if failures:
         body += [el("h2", "Failures", id="failures"), *failures]
-    body += [el("h2", "Coverage", id="coverage"), coverage_section(report, counts), _checks(report)]
+    body += [el("h2", "Coverage", id="coverage"), _coverage(parts), _checks(report)]
     head = el(
         "head",
         el("meta", charset="utf-8"),
@@ -76,10 +76,9 @@ def pill(verdict: Verdict, *, big: bool = False) -> Markup:
 
 
 def _header(report: Report) -> Markup:
-    system = report.system
-    facts: list[tuple[str, object]] = []
-    if system is not None:
-        facts.append(("system", f"{system.name} ({system.path.name}, {system.hash})"))
+    facts: list[tuple[str, object]] = [
+        ("system", f"{system.name} ({system.path.name}, {system.hash})") for system in report.systems
+    ]
     facts += [("target", report.target), ("seed", report.seed), ("started", report.started)]
     facts += list(report.versions.items())
     hashes = [s.trace_hash for s in report.scenarios if s.trace_hash]
@@ -131,7 +130,7 @@ def _verdict_table(report: Report) -> Markup:
         rows.append(
             el(
                 "tr", el("td", pill(scenario.verdict)), el("td", name, cls="name"), about,
-                el("td", _why(scenario), cls="long check"),
+                el("td", _why(scenario), _attempts(scenario), cls="long check"),
                 el("td", checks, cls="num"), el("td", ", ".join(scenario.requirements)),
                 el("td", simulated, cls="num"), el("td", _time(scenario.took_s), cls="num"),
                 id=None if scenario.verdict.bad else f"s{number}",
@@ -149,6 +148,14 @@ def _verdict_table(report: Report) -> Markup:
             el("p", f"and {more} more scenarios", cls="small") if more > 0 else "",
         ]
     )
+
+
+def _attempts(scenario: ScenarioResult) -> list[Markup]:
+    """How often it ran, and why each attempt before the last one was inconclusive."""
+    return [
+        el("p", f"attempt {n} of {scenario.attempts} was inconclusive: {_cut(reason, MOST_SAID)}", cls="small")
+        for n, reason in enumerate(scenario.earlier, 1)
+    ]
 
 
 def _why(scenario: ScenarioResult) -> str:
@@ -169,10 +176,17 @@ def _cut(said: str, most: int) -> str:
 # -- failures ------------------------------------------------------------------------------------------------------------
 
 
-def _study(report: Report) -> tuple[Counts, list[Markup]]:
-    """Go through every trace once: the counts of all, and the sections of the failures."""
-    counts, sections, drawn, used, plain = Counts(), [], 0, 0, []
+def _study(report: Report) -> tuple[list[tuple[Report, Counts]], list[Markup]]:
+    """Go through every trace once: the counts of all, by system, each with the report for that system; and the sections of the
+    failures."""
+    parts: dict[SystemKey | None, tuple[Report, Counts]] = {}
+    sections, drawn, used, plain = [], 0, 0, []
+    if not report.scenarios or report.system is not None:
+        parts[key_of(report.system) if report.system is not None else None] = report, Counts()
     for number, scenario in enumerate(report.scenarios):
+        own_part = report.part_of(scenario)
+        key = None if own_part.system is None else key_of(own_part.system)
+        part, counts = parts.setdefault(key, (own_part, Counts()))
         failing = [c for c in scenario.checks if c.verdict.bad][:PER_SCENARIO] if scenario.verdict.bad else []
         room = drawn < MOST_DRAWN and used < BUDGET
         if scenario.verdict.bad and not room:
@@ -180,17 +194,28 @@ def _study(report: Report) -> tuple[Counts, list[Markup]]:
         wanted = failing if room else []
         windows: list[Window] = []
         if scenario.counts is None or wanted:
-            own, windows = Study(report, scenario).run(wanted)
+            own, windows = Study(part, scenario).run(wanted)
             counts.add(own)
         else:
             counts.add(scenario.counts)
         if scenario.verdict.bad and room:
-            section = _failure(report, number, scenario, windows, opened=drawn < 4)
+            section = _failure(part, number, scenario, windows, opened=drawn < 4)
             sections.append(section)
             drawn, used = drawn + 1, used + len(section)
     if plain:
         sections.append(_plain(plain))
-    return counts, sections
+    return list(parts.values()), sections
+
+
+def _coverage(parts: Sequence[tuple[Report, Counts]]) -> Markup:
+    """Coverage, system by system."""
+    if len(parts) == 1:
+        return coverage_section(*parts[0])
+    every: list[Markup] = []
+    for part, counts in parts:
+        name = part.system.name if part.system is not None else "what has no system file"
+        every += [el("h2", f"Coverage of {name}"), coverage_section(part, counts)]
+    return join(every)
 
 
 def _failure(report: Report, number: int, scenario: ScenarioResult, windows: list[Window], *, opened: bool) -> Markup:
@@ -200,6 +225,8 @@ def _failure(report: Report, number: int, scenario: ScenarioResult, windows: lis
     ]
     if scenario.reason:
         parts.append(el("p", scenario.reason))
+    parts += _attempts(scenario)
+    parts += _struck(scenario)
     failing = [c for c in scenario.checks if c.verdict.bad]
     if failing:
         parts.append(_check_table(failing[:20]))
@@ -307,13 +334,19 @@ def _checks(report: Report) -> Markup:
             continue
         shown = scenario.checks[:room]
         room -= len(shown)
-        parts.append(el("details", el("summary", f"{MARKS[scenario.verdict]} {scenario.title}"), _check_table(shown)))
+        title = f"{MARKS[scenario.verdict]} {scenario.title}"
+        parts.append(el("details", el("summary", title), _check_table(shown), _struck(scenario)))
     left = sum(len(s.checks) for s in report.scenarios) - (MOST_CHECKS - room)
     if left > 0:
         parts.append(el("p", f"{left} more checks are not listed here; the JUnit file has all of them.", cls="small"))
     if len(parts) == 1:
         parts.append(el("p", "There were none."))
     return join(parts)
+
+
+def _struck(scenario: ScenarioResult) -> list[Markup]:
+    """How often each fault struck."""
+    return [el("p", f"fault {fault.text}", cls="small") for fault in scenario.faults]
 
 
 def _check_table(checks: Iterable[CheckResult]) -> Markup:

@@ -3,10 +3,14 @@
 A scenario with a seed is a test case; its class is the system and the target. A failure's message is the first check that
 failed, its text all of them and the line that runs it again. INCONCLUSIVE is ``skipped`` with a type of its own: JUnit has
 no word for it, and it neither passed nor failed.
+
+`Flavour.JENKINS` writes only what junit-10.xsd allows, the schema by which Jenkins' xUnit plugin accepts or refuses a file. That
+schema has no properties of test cases: they become lines at the beginning of ``system-out``.
 """
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -18,13 +22,22 @@ MOST_TEXT = 20_000
 """Characters of the text of one test case."""
 
 
-def write_junit(report: Report, path: Path) -> None:
+class Flavour(Enum):
+    """The reader that a file is written for."""
+
+    COMMON = "common"
+    """pytest's dialect: test cases have properties."""
+    JENKINS = "jenkins"
+    """The file satisfies junit-10.xsd."""
+
+
+def write_junit(report: Report, path: Path, flavour: Flavour = Flavour.COMMON) -> None:
     """Write the file; raises `FileInvalid` where that is not possible."""
-    put(path, render_junit(report))
+    put(path, render_junit(report, flavour))
 
 
-def render_junit(report: Report) -> bytes:
-    """The file's content, UTF-8."""
+def render_junit(report: Report, flavour: Flavour = Flavour.COMMON) -> bytes:
+    """Return the file's content, UTF-8."""
     counts, total = report.counts, sum(s.took_s for s in report.scenarios)
     suites = ET.Element("testsuites", name=clean(report.title))
     suite = ET.SubElement(
@@ -36,15 +49,15 @@ def render_junit(report: Report) -> bytes:
         suite.set("timestamp", clean(report.started))
     _properties(suite, _facts(report))
     for scenario in report.scenarios:
-        _case(suite, report, scenario)
+        _case(suite, report, scenario, flavour)
     ET.indent(suites)
     return b"<?xml version='1.0' encoding='utf-8'?>\n" + ET.tostring(suites, encoding="unicode").encode() + b"\n"
 
 
 def _facts(report: Report) -> list[tuple[str, str]]:
     facts = [("target", report.target), ("seed", "" if report.seed is None else str(report.seed))]
-    if report.system is not None:
-        facts += [("system", report.system.name), ("system hash", report.system.hash)]
+    for system in report.systems:
+        facts += [("system", system.name), ("system hash", system.hash)]
     facts += [("reproduce", report.reproduce), *report.versions.items()]
     return [(name, value) for name, value in facts if value]
 
@@ -56,8 +69,9 @@ def _properties(parent: ET.Element, facts: list[tuple[str, str]]) -> None:
             ET.SubElement(properties, "property", name=clean(name), value=clean(value))
 
 
-def _case(suite: ET.Element, report: Report, scenario: ScenarioResult) -> None:
-    system = report.system.name if report.system is not None else "fieldtwin"
+def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: Flavour) -> None:
+    under_test = scenario.system or report.system
+    system = under_test.name if under_test is not None else "fieldtwin"
     target = scenario.target or report.target
     case = ET.SubElement(
         suite, "testcase", classname=clean(f"{system}.{target}" if target else system), name=clean(scenario.title),
@@ -66,9 +80,17 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult) -> None:
     facts = [(name, value) for name in ("case", "role", "danger") if (value := getattr(scenario, name))]
     if scenario.file:  # no attribute: Jenkins' xUnit plugin skips whole files for that
         facts.append(("file", f"{scenario.file}:{scenario.line}" if scenario.line else scenario.file))
+    if scenario.earlier:
+        facts.append(("attempts", str(scenario.attempts)))
+        facts += [("inconclusive attempt", reason) for reason in scenario.earlier]
     facts += [("requirement", id) for id in scenario.requirements]
+    facts += [("fault", fault.text) for fault in scenario.faults]
     facts += [("trace hash", scenario.trace_hash)] if scenario.trace_hash else []
-    _properties(case, facts)
+    lines = [_line(c) for c in scenario.checks]
+    if flavour is Flavour.JENKINS:
+        lines = [*(f"{name}: {value}" for name, value in facts), *lines]
+    else:
+        _properties(case, facts)
     verdict, message = scenario.verdict, clean(_message(scenario))
     if verdict is Verdict.FAILED:
         ET.SubElement(case, "failure", message=message, type="fieldtwin.failed").text = _text(scenario)
@@ -77,9 +99,8 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult) -> None:
     elif verdict in (Verdict.SKIPPED, Verdict.INCONCLUSIVE):
         said = message or verdict.value
         ET.SubElement(case, "skipped", message=said, type=f"fieldtwin.{verdict.value}").text = _text(scenario)
-    lines = "\n".join(_line(c) for c in scenario.checks)
     if lines:
-        ET.SubElement(case, "system-out").text = clean(_bounded(lines))
+        ET.SubElement(case, "system-out").text = clean(_bounded("\n".join(lines)))
 
 
 def _message(scenario: ScenarioResult) -> str:
@@ -94,6 +115,8 @@ def _text(scenario: ScenarioResult) -> str:
     lines = [_line(c) for c in scenario.checks if c.verdict is not Verdict.PASSED]
     if scenario.reason:
         lines.insert(0, scenario.reason)
+    if scenario.evidence:
+        lines += ["", "on the wire:", *scenario.evidence]
     if scenario.reproduce:
         lines += ["", f"reproduce: {scenario.reproduce}"]
     return clean(_bounded("\n".join(lines)))

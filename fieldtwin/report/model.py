@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fieldtwin.scenarios.trace import Event
@@ -48,6 +49,31 @@ class CheckResult:
     reason: str = ""
     where: str = ""
     names: tuple[str, ...] = ()
+    vacuous: bool = False
+    """Nothing came up that this check could have judged; another run of the scenario may judge it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Struck:
+    """A fault that was put in: on which device or bus, how often it struck, and whether it need not strike (`optional`)."""
+
+    id: str
+    name: str
+    on: str
+    struck: int
+    optional: bool = False
+
+    @property
+    def is_set(self) -> bool:
+        """Whether it is no fault, but a value that a step has set; it strikes when the device gives it away."""
+        return self.id == f"set {self.on}"
+
+    @property
+    def text(self) -> str:
+        times = (
+            "never struck" if not self.struck else f"struck {'once' if self.struck == 1 else f'{self.struck} times'}"
+        )
+        return f"{self.id} ({self.name} on {self.on}): {times}{', optional' if self.optional else ''}"
 
 
 @dataclass
@@ -78,6 +104,8 @@ class ScenarioResult:
     `case` is the id that it goes by, `role` whom it judges (controller, master, device), `danger` what it may do to what is there
     (observe, read, write, disrupt).
 
+    `faults` says how often each fault struck that the scenario put in.
+
     `reproduce` is the one line that runs it again. `simulated_s` is the run's own time, `took_s` the host's. `trace` are
     the events that are still in memory, `dropped` how many are not; `trace_hash` is over all. `counts` is what a `Collector` that
     listened to the run has counted; without them the report counts what is in `trace`.
@@ -99,9 +127,27 @@ class ScenarioResult:
     trace_hash: str = ""
     dropped: int = 0
     counts: Counts | None = None
+    earlier: tuple[str, ...] = ()
+    """The reasons of the attempts before this one, each of which was INCONCLUSIVE (`--retry-inconclusive`)."""
     case: str = ""
     role: str = ""
     danger: str = ""
+    faults: Sequence[Struck] = ()
+    evidence: Sequence[str] = ()
+    """Lines of what was on the wire: before the check that failed, or where that is not in `trace`."""
+    system: System | None = None
+    """What it ran against; None: the system of its report."""
+
+    @property
+    def why(self) -> str:
+        """The reason with what the deciding check saw."""
+        got = next((check.got for check in self.checks if check.verdict is self.verdict and check.got), "")
+        return f"{self.reason}: {got}" if got and got not in self.reason else self.reason
+
+    @property
+    def attempts(self) -> int:
+        """How often it ran."""
+        return len(self.earlier) + 1
 
     @property
     def title(self) -> str:
@@ -122,6 +168,14 @@ class Machine:
         if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < len(self.states):
             return self.states[value]
         return str(value)
+
+
+SystemKey = tuple[Path, str]
+
+
+def key_of(system: System) -> SystemKey:
+    """Return what tells one system file, as it was read, from another."""
+    return system.path, system.hash
 
 
 @dataclass(frozen=True)
@@ -145,6 +199,25 @@ class Report:
     """What is spoken on wires in the traces that are no bus of the system: rtu, ascii, mbap, udp or can."""
     served: Sequence[str] = ()
     """The wires on which the far end asks."""
+    machines_of: Mapping[SystemKey, Sequence[Machine]] = field(default_factory=dict)
+    """The state machines of the systems of scenarios, where these are not `system`."""
+
+    def part_of(self, scenario: ScenarioResult) -> Report:
+        """Return the report as it is for the system of one scenario: with its names, secrets and state machines."""
+        system = scenario.system
+        if system is None or (self.system is not None and key_of(system) == key_of(self.system)):
+            return self
+        return replace(self, system=system, machines=self.machines_of.get(key_of(system), ()))
+
+    @property
+    def systems(self) -> list[System]:
+        """The systems of all scenarios, each once; `system` first."""
+        every = [self.system, *(scenario.system for scenario in self.scenarios)]
+        found: dict[SystemKey, System] = {}
+        for one in every:
+            if one is not None:
+                found.setdefault(key_of(one), one)
+        return list(found.values())
 
     @property
     def counts(self) -> dict[Verdict, int]:

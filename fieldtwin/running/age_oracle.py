@@ -49,6 +49,7 @@ class AgeOracle:
         self.wrong: list[str] = []
         self._held: dict[str, _Held] = {}
         self._waiting: list[tuple[int, str, bytes, object, int]] = []
+        self._still_good: list[tuple[int, str, bytes, object, int]] = []
 
     def held(self, tag: str, raw: bytes, t_ns: int) -> None:
         """From `t_ns` on the device holds `raw` for DEVICE.TAG."""
@@ -57,6 +58,10 @@ class AgeOracle:
     def published(self, tag: str, raw: bytes, value: object, source_ns: int, now_ns: int) -> None:
         """DEVICE.TAG was published as good at `now_ns`; nothing older than `source_ns` may stand for it."""
         self._waiting.append((now_ns, tag, raw, value, source_ns))
+
+    def still_good(self, tag: str, raw: bytes, value: object, source_ns: int, now_ns: int) -> None:
+        """DEVICE.TAG is still good at `now_ns`; judged like `published`, but not counted as one more published value."""
+        self._still_good.append((now_ns, tag, raw, value, source_ns))
 
     def judge(self, emulated: frozenset[str]) -> None:
         """Compare what is waiting. Tags of devices that are not `emulated` are nobody's to judge."""
@@ -67,19 +72,32 @@ class AgeOracle:
             if not judged[tag]:
                 continue
             self.checked += 1
-            held = self._held.get(tag)
-            if held is None or not held.was(raw, source_ns, now_ns):
-                self.wrong_count += 1
-                if len(self.wrong) < EXAMPLES:
-                    age_s = (now_ns - source_ns) / NS_PER_S
-                    self.wrong.append(
-                        f"{tag} was published as {value!r} ({raw.hex()}), {age_s:.3f} s old: the device held no such thing"
-                    )
+            if not self._was_held(tag, raw, source_ns, now_ns):
+                age_s = (now_ns - source_ns) / NS_PER_S
+                self._refuse(
+                    f"{tag} was published as {value!r} ({raw.hex()}), {age_s:.3f} s old: the device held no such thing"
+                )
+        for now_ns, tag, raw, value, source_ns in self._still_good:
+            if tag.partition(".")[0] in emulated and not self._was_held(tag, raw, source_ns, now_ns):
+                limit_s = (now_ns - source_ns) / NS_PER_S
+                self._refuse(
+                    f"{tag} was still good as {value!r} ({raw.hex()}): the device held no such value in the last {limit_s:.3f} s"
+                )
+        self._still_good.clear()
         if self._waiting:
             oldest_ns = self._waiting[-1][0] - KEPT_NS
             for held in self._held.values():
                 held.forget(oldest_ns)
         self._waiting.clear()
+
+    def _was_held(self, tag: str, raw: bytes, from_ns: int, to_ns: int) -> bool:
+        held = self._held.get(tag)
+        return held is not None and held.was(raw, from_ns, to_ns)
+
+    def _refuse(self, text: str) -> None:
+        self.wrong_count += 1
+        if len(self.wrong) < EXAMPLES:
+            self.wrong.append(text)
 
     def describe(self) -> dict[str, Any]:
         return {"checked": self.checked, "wrong": self.wrong_count, "examples": list(self.wrong)}

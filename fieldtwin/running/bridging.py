@@ -36,7 +36,8 @@ WATCH_NS = NS_PER_S // 5
 @dataclass(frozen=True)
 class BridgeOptions:
     """What the command line said. `units` maps a client's unit id to the target's; empty: every unit keeps its own.
-    `pause_s` is kept behind each exchange with the target.
+    `pause_s` is kept behind each exchange with the target. `echo`: the
+    target's serial adapter returns what is sent.
     """
 
     listen: Endpoint
@@ -52,6 +53,7 @@ class BridgeOptions:
     broadcast: bool = False
     answer_broadcast: bool = False
     pause_s: float = 0.0
+    echo: bool = False
     idle_s: float = 0.0
     roles: frozenset[str] | None = None
     instance: str = ""
@@ -101,7 +103,9 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
     with Instance(instance_name(options)) as instance:
         audit = AuditLog(instance.path("audit.jsonl"), clock)
         try:
-            config = BusConfig(TARGET, options.target, options.timeout_s, options.retries, spacing_s=options.pause_s)
+            config = BusConfig(
+                TARGET, options.target, options.timeout_s, options.retries, spacing_s=options.pause_s, echo=options.echo
+            )
             bus = ModbusBus(config, [], connector, clock, TagTable(clock), lambda driver: None)
             bridge = Bridge(bridge_config(options), {TARGET: bus}, connector, clock, audit)
             if options.allow_writes:

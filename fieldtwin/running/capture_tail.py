@@ -35,7 +35,7 @@ class CaptureTail:
         *lines, self._rest = (self._rest + self._file.read(AT_ONCE)).split(b"\n")
         try:
             said = [json.loads(line) for line in lines if line]
-            captured = [captured_of(line) for line in said if "started" not in line]
+            captured = [captured_of(line) for line in said if "started" not in line and "refused" not in line]
         except (ValueError, KeyError, TypeError, FieldtwinError) as e:
             raise FileInvalid(f"not a line of a capture: {e}", path=str(self._path)) from e
         return frame_events(captured, self._system, start_ns)

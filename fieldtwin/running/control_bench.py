@@ -3,26 +3,36 @@
 A `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. What it can do is what can be reached: no field
 side, no faults; no capture, no wire. It starts nothing and ends nothing but its own connections. Where no gateway of ours runs, a
 scenario that is about probes only judges somebody else's controller, with the field side alone.
+
+What a scenario puts into the simulated devices is under a lease (`FieldLease`): it is taken out when the bench is left, and also
+when this process is killed.
 """
 
 from __future__ import annotations
 
 import asyncio
+import os
 from collections import deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fieldtwin.conformance.case import Danger
+from fieldtwin.report.model import Struck
 from fieldtwin.running.capture_tail import CaptureTail
-from fieldtwin.running.field_contact import connect_control, reachable
+from fieldtwin.running.field_contact import check_same, connect_control, reachable
+from fieldtwin.running.field_lease import FieldLease
+from fieldtwin.running.fresh_start import make_fresh, programs_scan
+from fieldtwin.running.host_lateness import HostLateness
 from fieldtwin.running.probes import Probes
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import state_words
-from fieldtwin.scenarios.bench import Can, Reading
+from fieldtwin.running.struck import struck_of
+from fieldtwin.running.with_field import environment_from
+from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
 from fieldtwin.scenarios.probe_form import Probe
-from fieldtwin.scenarios.trace import FAR_END, Event, Kind, Trace
+from fieldtwin.scenarios.trace import FAR_END, Event, Kind, Trace, refusal_data
 from gateway.core.clock import NS_PER_S
 from gateway.core.control import ControlClient, RemoteError
 from gateway.core.endpoint import Endpoint
@@ -32,15 +42,15 @@ from gateway.core.image_region import RegionReader
 from gateway.core.nursery import Nursery
 from gateway.core.started import Started
 from gateway.wallclock import WallClock
-from twin.physical import attached, image_layout
+from twin.physical import attached, gateway_lost_ms, image_layout
 from twin.system import System
 
 PLC_EVERY_S = 0.25
+STARTING_S = 5.0
+"""How long a PLC may take to start and to see the gateway's heartbeat for the first time."""
 HELD_KEPT = 20_000
-STALLS_KEPT = 10_000
 SERVED_WITHIN_S = 5.0
-TICK_SLACK_S = 0.005
-"""A wait that ends so much later than asked for is what waits do."""
+SERVED_LOOK_S = 0.005
 
 
 @dataclass(frozen=True)
@@ -51,16 +61,25 @@ class Where:
     run_dir: Path
     field_host: str = ""
     token: str = field(default="", repr=False)
+    field_socket: Path | None = None
+    """The Unix socket of a field side on this host, where that is not in the run directory."""
     far: str = ""
     capture: Path | None = None
     plant: bool = False
     """Nothing is emulated: no faults, nothing set, whatever else is there."""
+    own: bool = False
+    """The system was brought up for this scenario alone, so it is fresh."""
+    foreign: bool = False
+    """The controller is a program of the user: no gateway of ours is asked."""
+    env: Mapping[str, str] = field(default_factory=dict)
+    """What that program finds the devices by; endpoints of probes may name it."""
     allowed: Danger = Danger.DISRUPT
 
 
 class ControlBench(Started):
     """``async with ControlBench(system, where, trace, target="local", names=[...]) as bench``. `names` is what readings are asked
-    for. `gone` tells why the system is not there any more, or None."""
+    for. `fresh` is given what the bench can do, and tells whether the system is to be made anew before time begins. `gone` tells
+    why the system is not there any more, or None."""
 
     def __init__(
         self,
@@ -71,6 +90,7 @@ class ControlBench(Started):
         target: str,
         names: Collection[str],
         probes: Sequence[Probe] = (),
+        fresh: Callable[[frozenset[Can]], bool] = lambda can: False,
         gone: Callable[[], FieldtwinError | None] = lambda: None,
     ) -> None:
         super().__init__()
@@ -81,7 +101,11 @@ class ControlBench(Started):
         self.can: frozenset[Can] = frozenset()
         self._where = where
         self._names = list(names)
+        self._fresh = fresh
         self._gone = gone
+        self._env: dict[str, str] = {}
+        """Where the simulated devices are: endpoints of probes may name it."""
+        self.lease: FieldLease | None = None
         self._clock = WallClock()
         self._start_ns = self._clock.monotonic_ns()
         self._gateway: ControlClient | None = None
@@ -96,14 +120,21 @@ class ControlBench(Started):
         self._asked: list[str] = []
         self._seen_ns = 0
         self._since = 0
+        self._refused = 0
+        """The newest refusal that was seen, by its number in the gateway's journal."""
         self._updates: dict[str, int] = {}
         self._states: dict[str, Any] = {}
         self._words: dict[str, dict[int, str]] = {}
         self._plc_due_s = 0.0
+        self._stopped: Stopped | None = None
+        self._fault_numbers: set[int] = set()
+        """Of the faults that were put in here, as the field simulator counts them."""
+        self._not_started = ""
+        self._gateway_seen = False
         self._worst_us = -1.0
         self._overruns = -1
         self._late_ms = 0.0
-        self._stalls: deque[tuple[float, float]] = deque(maxlen=STALLS_KEPT)
+        self._lateness = HostLateness()
         self._held: dict[str, deque[tuple[float, bytes]]] = {}
         self._held_since: dict[str, int] = {}
 
@@ -111,34 +142,58 @@ class ControlBench(Started):
         where = self._where
         if not self._foreign():
             await self._open_controller()
-        can = set()
+        can = {Can.FRESH_START} if where.own else set()
         if not where.plant:
             await self._open_field()
-            can |= {Can.INJECT_FAULT, Can.SET_VALUE, Can.SEE_HELD} if self._field is not None else set()
-        nursery = await self._stack.enter_async_context(Nursery())
+        if self._field is not None:
+            can |= {Can.INJECT_FAULT, Can.SET_VALUE, Can.SEE_HELD} | (
+                {Can.FRESH_START} if self._plc is not None else set()
+            )
         far = Endpoint.parse(where.far) if where.far else await self._far_of_field()
         device = next((d.name for d in self.system.devices.values() if d.profile.inbox is not None), None)
         if far is not None and device is not None and where.allowed.rank >= Danger.WRITE.rank:
+            can.add(Can.SEND_COMMAND)
+        can |= {Can.SEE_WIRE} if where.capture is not None else set()
+        can |= {Can.PROBE} if self._probe else set()
+        self.can = frozenset(can)
+        nursery = await self._stack.enter_async_context(Nursery())
+        await self._open_lease(nursery)
+        if not where.own and self._fresh(self.can):
+            assert self._gateway is not None
+            assert self._plc is not None
+            assert self.lease is not None
+            await make_fresh(self.lease, self._gateway, self._plc)
+        if far is not None and device is not None and Can.SEND_COMMAND in self.can:
             self._shore = Shore(self.system, device, far, self._clock)
             self._shore.on_send = self._commanded
             nursery.start(self._shore.run([]), "far end")
-            can.add(Can.SEND_COMMAND)
         if where.capture is not None:
             self._tail = CaptureTail(where.capture, self.system)
             self._stack.callback(self._tail.close)
-            can.add(Can.SEE_WIRE)
         if self._probe:
             served = {probe.serve: await self._served(probe.serve) for probe in self._probe if probe.serve}
-            self._probes = Probes(self._probe, self._clock, served.__getitem__)
+            probes = [probe.at({**os.environ, **self._env}) for probe in self._probe]
+            self._probes = Probes(probes, self._clock, served.__getitem__)
             nursery.start(self._probes.run(), "probes")
-            can.add(Can.PROBE)
-        self.can = frozenset(can)
+        if where.own and self._plc is not None:  # a short scenario would end before the programs had their first inputs
+            await programs_scan(self._plc)
         self._start_ns = self._clock.monotonic_ns()
         await self._refresh()
         self._updates.clear()
 
+    async def _open_lease(self, nursery: Nursery) -> None:
+        """From here on, nothing that this judge puts into the simulated devices outlives it."""
+        if self._field is None:
+            return
+        self.lease = FieldLease(await self._connect_field())
+        await self.lease.open()
+        self._stack.push_async_callback(self.lease.release)
+        nursery.start(self.lease.run(), "lease")
+
     def _foreign(self) -> bool:
         """No gateway of ours is here, and nothing is asked of one."""
+        if self._where.foreign:
+            return True
         probed = {name for probe in self._probe for name in probe.names}
         asked = any(probe.serve for probe in self._probe) or not probed.issuperset(self._names)
         return (
@@ -155,17 +210,32 @@ class ControlBench(Started):
         self._outputs = image.reader(OUTPUTS)
         self._words = {f"{p}.state": w for p, w in state_words(layout, self.system.plc.programs).items()}
 
-    async def _connect(self, name: str) -> ControlClient:
-        client = await ControlClient.connect_unix(self._where.run_dir / f"{name}.sock")
+    async def _connect_field(self) -> ControlClient:
+        """Another connection to the field side."""
+        if not self._where.field_host:
+            return await self._connect_unix(self._field_socket)
+        client, _ = await connect_control(self._where.field_host, self._where.token)
         self._stack.push_async_callback(client.aclose)
         return client
 
+    async def _connect(self, name: str) -> ControlClient:
+        return await self._connect_unix(self._where.run_dir / f"{name}.sock")
+
+    async def _connect_unix(self, path: Path) -> ControlClient:
+        client = await ControlClient.connect_unix(path)
+        self._stack.push_async_callback(client.aclose)
+        return client
+
+    @property
+    def _field_socket(self) -> Path:
+        return self._where.field_socket or self._where.run_dir / "field.sock"
+
     async def _open_field(self) -> None:
-        if self._where.field_host:
-            self._field, _ = await connect_control(self._where.field_host, self._where.token)
-            self._stack.push_async_callback(self._field.aclose)
-        elif (self._where.run_dir / "field.sock").exists():
-            self._field = await self._connect("field")
+        if self._where.field_host or self._where.field_socket or self._field_socket.exists():
+            self._field = await self._connect_field()
+            status = await self._field.call("get")
+            check_same(self.system, status)
+            self._env = {**environment_from(status, self.system, self._field_at, self._field_socket), **self._where.env}
 
     async def _served(self, name: str) -> Endpoint:
         """Where the gateway serves what the system file calls `name`, once it does."""
@@ -174,15 +244,19 @@ class ControlBench(Started):
         while not (listening := (await self._gateway.call("get"))["serve"][name]["listening"]):
             if self.now_s() > until_s:
                 raise Unreachable(f"the gateway does not serve {name!r}")
-            await asyncio.sleep(TICK_SLACK_S)
+            await asyncio.sleep(SERVED_LOOK_S)
         return Endpoint.parse(listening)
 
     async def _far_of_field(self) -> Endpoint | None:
         if self._field is None:
             return None
         far = (await self._field.call("get"))["far"]
-        host = self._where.field_host.rpartition(":")[0] or self._where.field_host or "localhost"
-        return next((reachable(Endpoint.parse(url), host) for url in far.values()), None)
+        return next((reachable(Endpoint.parse(url), self._field_at) for url in far.values()), None)
+
+    @property
+    def _field_at(self) -> str:
+        """The host of the field side."""
+        return self._where.field_host.rpartition(":")[0] or self._where.field_host or "localhost"
 
     # -- Bench ----------------------------------------------------------------------------------------------------------
 
@@ -193,11 +267,11 @@ class ControlBench(Started):
         """Raises what the system is gone for."""
         before_s = self.now_s()
         await asyncio.sleep(max(0.0, t_s - before_s))
-        asked_s = max(t_s, before_s)
+        asked_s, slept_s = max(t_s, before_s), self.now_s()
+        self._lateness.slept(slept_s, slept_s - asked_s)
         await self._refresh()
-        late_s = self.now_s() - asked_s
-        if late_s > TICK_SLACK_S:
-            self._stalls.append((self.now_s(), late_s))
+        now_s = self.now_s()
+        self._lateness.waited(now_s, now_s - asked_s)
 
     def names(self) -> list[str]:
         return list(self._names)
@@ -214,7 +288,16 @@ class ControlBench(Started):
         if name not in self._names:
             raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
         value = self._states.get(name)
-        return None if value is None else Reading(value, "good", "", 0.0, 0)
+        return None if value is None else variable(value, runs=self._stopped is None)
+
+    def why_unknown(self, name: str) -> str:
+        return self._probes.why_unknown(name) if self._probes is not None else ""
+
+    def stopped(self) -> Stopped | None:
+        return self._stopped
+
+    def not_started(self) -> str:
+        return self._not_started
 
     def late_ms(self) -> float:
         if self._plc is None:
@@ -222,7 +305,10 @@ class ControlBench(Started):
         return self._late_ms
 
     def host_late_s(self, since_s: float) -> float:
-        return max((late_s for t_s, late_s in self._stalls if t_s >= since_s), default=0.0)
+        return self._lateness.longest_s(since_s)
+
+    def host_late_total_s(self, since_s: float) -> tuple[float, float]:
+        return self._lateness.own_s(since_s), self._lateness.any_s(since_s)
 
     async def send(self, period_s: int) -> None:
         if self._shore is None:
@@ -230,12 +316,21 @@ class ControlBench(Started):
         self._shore.send(period_s)
 
     async def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
-        await self._to_field("set", device=device, tag=tag, value=value)
+        answer = await self._put("set", device=device, tag=tag, value=value)
+        if value is not None:
+            self._fault_numbers.add(answer["number"])
 
     async def inject(self, fault: dict[str, Any]) -> None:
-        answer = await self._to_field("fault", fault=fault, start_ns=self._start_ns)
+        answer = await self._put("fault", fault=fault, start_ns=self._start_ns)
+        self._fault_numbers.add(answer["number"])
         target = fault.get("device") or fault.get("bus") or ""
         self._note(Kind.FAULT, answer["id"], {"name": fault["name"], "on": True, "target": target, "said": fault})
+
+    async def struck(self) -> list[Struck]:
+        if not self._fault_numbers:
+            return []
+        told = (await self._to_field("get"))["struck"]
+        return [struck_of(one) for one in told if one["number"] in self._fault_numbers]
 
     async def clear(self, id: str) -> None:
         await self._to_field("clear", id=id)
@@ -253,6 +348,12 @@ class ControlBench(Started):
                 self._held_since[device] = number
             if not entries:
                 return list(self._held.get(name, ()))
+
+    async def _put(self, verb: str, **args: Any) -> Any:
+        """Put something into the simulated devices, under the lease."""
+        if self.lease is None:
+            raise UsageError("there are no simulated field devices", expected="a prototype")
+        return await self.lease.call(verb, **args)
 
     async def _to_field(self, verb: str, **args: Any) -> Any:
         if self._field is None:
@@ -273,7 +374,7 @@ class ControlBench(Started):
         self._note(Kind.NOTE, FAR_END, {"text": f"commands {period_s} s", "period_s": period_s})
 
     async def _refresh(self) -> None:
-        gone = self._gone()
+        gone = self._gone() or (self.lease.lost if self.lease is not None else None)
         if gone is not None:
             raise gone
         events = await self._changed_tags() + self._changed_states()
@@ -290,9 +391,14 @@ class ControlBench(Started):
     async def _changed_tags(self) -> list[Event]:
         if self._gateway is None:
             return []
-        answer = await self._gateway.call("watch", since=self._since, names=self._asked)
+        answer = await self._gateway.call("watch", since=self._since, names=self._asked, refused=self._refused)
         self._tags, self._seen_ns = answer["tags"], answer["now_ns"]
         events = []
+        for entry in answer["refusals"]:
+            self._refused = entry["number"]
+            t_ns = entry["t_ns"] - self._start_ns
+            if t_ns >= 0 or self.target == "local" or entry["standing"]:  # before: of this run, or refused now as well
+                events.append(Event(max(0, t_ns), Kind.REFUSED, entry["tag"], refusal_data(entry)))
         for number, t_ns, tag, value, quality, reason in answer["changes"]:
             self._since = number
             self._updates[tag] = self._updates.get(tag, 0) + 1
@@ -305,6 +411,8 @@ class ControlBench(Started):
         if self._outputs is None:
             return []
         snapshot = self._outputs.snapshot()
+        if snapshot.stopped and self._stopped is None:
+            self._plc_due_s = 0.0  # why it stopped is asked at once
         if not snapshot.counter:
             return []
         events = []
@@ -319,13 +427,37 @@ class ControlBench(Started):
     async def _ask_plc(self) -> None:
         """How late scans were since the last question: a new maximum, or the limit that some overran."""
         assert self._plc is not None
-        tasks = (await self._plc.call("get", brief=True))["tasks"].values()
+        told = await self._plc.call("get", brief=True)
+        self._stopped = self._what_stopped(told)
+        waiting = told.get("waiting", {})  # a PLC of an older version has none
+        self._not_started = "; ".join(f"program {name} waits for {start['reason']}" for name, start in waiting.items())
+        tasks = told["tasks"].values()
         worst_us = max(task["lateness_us"]["max"] for task in tasks)
         overruns = sum(task["overruns"] for task in tasks)
         if self._overruns >= 0:
             limit_ms = float(self.system.plc.watchdog.late_ms) if overruns > self._overruns else 0.0
             self._late_ms = max(worst_us / 1000 if worst_us > self._worst_us else 0.0, limit_ms)
             if overruns > self._overruns:
-                self._stalls.append((self.now_s(), max(self._late_ms, limit_ms) / 1000))
+                self._lateness.waited(self.now_s(), max(self._late_ms, limit_ms) / 1000)
         self._worst_us, self._overruns = worst_us, overruns
         self._plc_due_s = self.now_s() + PLC_EVERY_S
+        if self._field is not None:
+            await self._field.call("ready")  # raises if the field simulator is gone
+
+    def _what_stopped(self, told: dict[str, Any]) -> Stopped | None:
+        """Return what the PLC's status says that does not run: the PLC itself, or the gateway, whose heartbeat it watches."""
+        starting = self.now_s() < STARTING_S
+        state, late_s = told["state"], float(self.system.plc.watchdog.late_ms) / 1000
+        if state == "stopped":
+            watchdog = told["stop_reason"] == "watchdog"
+            what = f"the PLC stopped ({told['stop_reason']}): {told['error'] or 'on request'}"
+            return Stopped("plc", what, told.get("error_at", ""), late_s if watchdog else 0.0)
+        if state == "paused" or (state == "ready" and not starting):
+            return Stopped("plc", "the PLC is paused" if state == "paused" else "the PLC was not started")
+        if state == "waiting" and told["error"]:  # its time is over
+            return Stopped("plc", told["error"])
+        self._gateway_seen |= told["gateway_alive"]
+        if told["gateway_alive"] or (starting and not self._gateway_seen):
+            return None
+        what = "the PLC does not see the gateway's heartbeat"
+        return Stopped("gateway", what, bound_s=gateway_lost_ms(self.system) / 1000)

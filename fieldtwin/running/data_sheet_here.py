@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from emulators.canopen.dictionary import Dictionary, load_eds
 from emulators.canopen.lss import UNCONFIGURED
 from emulators.canopen.node import CanopenNode, NodeContext
+from emulators.canopen.remarks import Remark
 from emulators.canopen.serve import serve_node
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.models.by_profile import model_for
+from emulators.models.emulated_node import NodeOptions, node_remarks
 from emulators.replay.can_log import CanLog
 from emulators.replay.objects import recorded_objects
 from fieldtwin.cli.talk import talk
@@ -30,7 +32,12 @@ DEFAULT_NODE_ID = 1
 
 
 async def run_data_sheet(
-    path: Path, endpoints: tuple[str, ...], node_id: int | None, bitrate: int | None = None, log: Path | None = None
+    path: Path,
+    endpoints: tuple[str, ...],
+    node_id: int | None,
+    bitrate: int | None = None,
+    log: Path | None = None,
+    options: NodeOptions | None = None,
 ) -> int:
     """Serve until SIGINT or SIGTERM; raises what ends the serving before. What was mended in the file is said first.
 
@@ -38,12 +45,15 @@ async def run_data_sheet(
     of the DCF, else 125 kbit/s. `log` is what candump -L wrote of such a node, to be held again. Raises `FileInvalid` for a
     file that cannot be used, `UsageError` for endpoints that are not one bus and for a log that holds nothing of the node.
     """
-    dictionary = load_eds(path)
+    options = options or NodeOptions()
+    dictionary = load_eds(path, parameter_values=options.parameter_values)
     for note in dictionary.notes:
         talk.print(f"{path.name}, {note}", soft_wrap=True)
     wires = [Endpoint.parse(url) for url in endpoints]
     wire = only_bus(wires)
-    node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log)
+    node = _node(dictionary, node_id or dictionary.node_id or DEFAULT_NODE_ID, log, options)
+    if log is None or options.model is not None:  # a node of a log is known by what it did
+        print_remarks(path.name, node_remarks(dictionary, node.node_id, node.context.model, options))
     closing: list[SoftBusServer | CanConnection] = []
     try:
         async with Nursery() as nursery:  # inside: who serves is stopped before what it serves on is closed
@@ -77,15 +87,25 @@ async def run_log(path: Path, endpoints: tuple[str, ...], node_id: int | None, b
         return await run_data_sheet(sheet, endpoints, node_id, bitrate, path)
 
 
-def _node(dictionary: Dictionary, node_id: int, log: Path | None) -> CanopenNode:
-    """With what was recorded of it, and the model of the device profile that 1000h names, where there are such."""
+def print_remarks(name: str, found: Iterable[Remark]) -> None:
+    """Print what does not fit a node's data sheet, and which option of `emulate` overrides it."""
+    for remark in found:
+        advice = ""
+        if remark.by_parameter_value:
+            advice = " (--defaults starts with the DefaultValues)"
+        elif remark.model:
+            advice = " (--model 402 chooses a model, --model none means it)"
+        talk.print(f"{name}: {remark.text}{advice}", soft_wrap=True, markup=False)
+
+
+def _node(dictionary: Dictionary, node_id: int, log: Path | None, options: NodeOptions) -> CanopenNode:
+    """With what was recorded of it, and the model that `options` or 1000h name, where there are such."""
+    model = model_for(dictionary, options.model)
     if log is not None:
         played = recorded_objects(CanLog(log), dictionary, node_id)
-        context = NodeContext(
-            source=played, factory=played.initial, refusals=played.refusals, model=model_for(dictionary)
-        )
+        context = NodeContext(source=played, factory=played.initial, refusals=played.refusals, model=model)
         return CanopenNode(dictionary, node_id, context)
-    return CanopenNode(dictionary, node_id, NodeContext(model=model_for(dictionary)))
+    return CanopenNode(dictionary, node_id, NodeContext(model=model))
 
 
 def _named(node: CanopenNode) -> str:

@@ -5,22 +5,32 @@ The same device may listen on several wires at once; its registers are one and t
 
 from __future__ import annotations
 
-from dataclasses import replace
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from emulators.canopen.serve import serve_node
 from emulators.context import WhenUsedUp
+from emulators.distorted_registers import DistortedRegisters
 from emulators.endpoints.bus_server import SoftBusServer
+from emulators.endpoints.faulty import FaultyEnd
+from emulators.endpoints.faulty_udp import FaultyDatagrams
 from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import OnClient, SocketListener
+from emulators.endpoints.socket_end import OnClient, SocketEnd, SocketListener
 from emulators.endpoints.udp_end import UdpEnd
+from emulators.faults.engine import WireFaults
+from emulators.faults.fault import Active
+from emulators.faults.frames import Framing
+from emulators.faults.of_device import DeviceFaults
 from emulators.modbus.ascii import AsciiSlave
 from emulators.modbus.line import LineSlave
 from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
 from emulators.modbus.unit import ModbusUnit
-from emulators.models.emulated_node import emulated_node
+from emulators.models.emulated_node import NodeOptions, emulated_node
 from emulators.models.mailbox_modem import ModemPair
 from emulators.models.register_device import StatedRegisters, add_own_functions
 from emulators.models.sampled_sensor import SampledSensor
@@ -31,11 +41,14 @@ from emulators.replay.replay import ExchangeReplay, NeverRecorded
 from emulators.replay.unit import ReplayUnit
 from emulators.signals import SignalPlayer, SignalTrack
 from emulators.stated import parts_of
+from fieldtwin.cli.struck import struck
 from fieldtwin.cli.talk import talk
 from fieldtwin.recording.rotating import exchanges_of, header_of, oldest_part
 from fieldtwin.running.can_here import only_bus, stand_on_bus
+from fieldtwin.running.data_sheet_here import print_remarks
 from fieldtwin.running.until_stopped import until_stopped
 from gateway.connections.os_connector import OsConnector
+from gateway.core.clock import NS_PER_S
 from gateway.core.connection import ByteConnection, CanConnection
 from gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from gateway.core.errors import UsageError
@@ -64,25 +77,30 @@ async def run_device(
     *,
     unknown: NeverRecorded = NeverRecorded.EXCEPTION,
     at_end: WhenUsedUp = WhenUsedUp.HOLD,
+    options: NodeOptions | None = None,
+    extras: Extras | None = None,
 ) -> int:
     """Serve until SIGINT or SIGTERM; raises what ends the serving before. `bitrate` is for a CAN bus, None for the usual one.
 
     `unknown` and `at_end` are for a recording without a profile: what is answered to a request that was never recorded, and
-    when what was recorded is used up.
+    when what was recorded is used up. `options` are for a CANopen node, `extras` for a Modbus device.
     """
-    host = DeviceHost(speed)
+    host = DeviceHost(speed, extras or Extras())
     try:
         async with Nursery() as nursery:  # inside: who serves is stopped before what it serves on is closed
             wires = [Endpoint.parse(url) for url in endpoints]
             if kind == "recording":
+                host.fault(None)
                 units = host.replayed(path, unit_id, unknown, at_end)
                 wires = [as_it_was_recorded(wire, header_of(path).endpoint) for wire in wires]
             else:
                 profile = load_profile(path)
                 wires = [_as_from_the_factory(wire, profile) for wire in wires]
                 if profile.protocol == "canopen":
-                    await host.serve_can(nursery, profile, wires, unit_id, recording, bitrate)
+                    await host.serve_can(nursery, profile, wires, unit_id, recording, bitrate, options)
                     units = {}
+                elif options is not None:
+                    raise UsageError("--model and --defaults are for a CANopen node", got=profile.name)
                 else:
                     units = {unit_id or profile.form.factory.unit: host.modbus(profile, recording)}
             if units:
@@ -91,19 +109,39 @@ async def run_device(
             await until_stopped(nursery)
     finally:
         await host.aclose()
+        for active in host.put_in:
+            talk.print(struck(active), soft_wrap=True, markup=False)
     return 0
+
+
+@dataclass(frozen=True)
+class Extras:
+    """What a Modbus device may be given: `values` of its tags at first (None: its recording, or zeros), `faults` as a file says
+    them with the `seed` of what is left to chance, and with `any_unit` the answer to every unit id on TCP."""
+
+    values: Mapping[str, float | str] | None = None
+    faults: tuple[dict[str, Any], ...] = ()
+    seed: int = 1
+    any_unit: bool = False
 
 
 class DeviceHost:
     """Builds a device and puts it on wires."""
 
-    def __init__(self, speed: float) -> None:
+    def __init__(self, speed: float, extras: Extras = Extras()) -> None:
+        self._extras = extras
+        self._faults: DeviceFaults | None = None
         self._clock = WallClock()
         self._speed = speed
-        self._closing: list[SocketListener | UdpEnd | SoftBusServer | ByteConnection | CanConnection] = []
+        self._closing: list[
+            SocketListener | UdpEnd | FaultyDatagrams | SoftBusServer | ByteConnection | CanConnection
+        ] = []
 
     def modbus(self, profile: DeviceProfile, recording: Path | None) -> ModbusUnit:
         """The unit that a Modbus profile describes."""
+        self.fault(profile)
+        if self._extras.values is not None:
+            return self._stated(profile, self._extras.values)
         if profile.inbox is not None:
             pair = ModemPair(profile, bytes_per_s=400, latency_s=0.2, loss=0.0, seed=1)
             return ModbusUnit(pair.near, unit_limits(profile), name=profile.name)
@@ -117,15 +155,33 @@ class DeviceHost:
         """A device that is known by its exchanges: a recording that is given, or the shipped one under the profile's name.
         Without either, its profile is all there is of it."""
         if recording is None and self._recording_of(profile) is None:
-            bank = StatedRegisters(profile, {}, self._clock.monotonic_ns())
-            unit = ModbusUnit(bank, unit_limits(profile), name=profile.name, **parts_of(profile))
-            add_own_functions(unit, bank, profile)
             talk.print(f"{profile.name}: nothing recorded; every register of its profile begins with 0", soft_wrap=True)
-            return unit
+            return self._stated(profile, {})
         path = find_recording(str(recording or f"{Path(profile.path).stem}.jsonl"))
         replay, recorded = load_replay(profile, path)
         talk.print(f"{profile.name} plays {shown(path)}", soft_wrap=True)
         return ProfiledReplay(profile, replay, recorded)
+
+    def _stated(self, profile: DeviceProfile, values: Mapping[str, float | str]) -> ModbusUnit:
+        """A device of which nothing but its profile is known, and what its tags hold at first."""
+        bank = StatedRegisters(profile, values, self._clock.monotonic_ns())
+        seen = DistortedRegisters(bank, bank.peek, profile, bank.journal)
+        unit = ModbusUnit(seen, unit_limits(profile), name=profile.name, **parts_of(profile))
+        add_own_functions(unit, bank, profile)
+        if self._faults is not None:
+            self._faults.on_values(seen.distortions)
+        return unit
+
+    def fault(self, profile: DeviceProfile | None) -> None:
+        """Prepare the faults of the device; their times count from now."""
+        if self._extras.faults:
+            start_ns = round(asyncio.get_running_loop().time() * NS_PER_S)
+            self._faults = DeviceFaults(self._extras.faults, profile, self._extras.seed, start_ns)
+
+    @property
+    def put_in(self) -> list[Active]:
+        """The faults that were put in, once for each wire."""
+        return self._faults.put_in if self._faults is not None else []
 
     def replayed(
         self, path: Path, unit_id: int | None, unknown: NeverRecorded, at_end: WhenUsedUp
@@ -181,12 +237,14 @@ class DeviceHost:
             await self._listen(wire, units, lambda c: serve_rtu(c, line, self._clock, as_recorded(), echo=echo), 1)
         elif wire.scheme in ("tcp", "tls"):
             await self._listen(
-                wire, units, lambda c: serve_mbap(c, MbapSlave(units), self._clock, as_recorded()), MAX_CLIENTS
+                wire, units, lambda c: serve_mbap(c, self._mbap(units), self._clock, as_recorded()), MAX_CLIENTS
             )
         elif wire.scheme == "udp":
             end = await UdpEnd.open(wire)
-            self._closing.append(end)
-            nursery.start(serve_udp(end, MbapSlave(units), self._clock, as_recorded()), f"units on {wire}")
+            faults = self._faults.on_wire(Framing.MBAP) if self._faults is not None else None
+            datagrams = end if faults is None else FaultyDatagrams(end, faults)
+            self._closing.append(datagrams)
+            nursery.start(serve_udp(datagrams, self._mbap(units), self._clock, as_recorded()), f"units on {wire}")
             talk.print(f"units {_list(units)} on {end.bound}", soft_wrap=True)
         else:
             raise UsageError(
@@ -197,7 +255,7 @@ class DeviceHost:
     async def _serve_port(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
         """A port that is there: this is a device on a real line."""
         line: LineSlave = AsciiSlave(units) if wire.scheme == "ascii" else RtuSlave(units)
-        end = await OsConnector().open_bytes(wire)
+        end = self._behind_faults(await OsConnector().open_bytes(wire), line)
         self._closing.append(end)
         nursery.start(serve_rtu(end, line, self._clock, as_recorded(wire.serial)), f"units on {wire}")
         talk.print(
@@ -209,7 +267,7 @@ class DeviceHost:
         scheme = "ascii" if isinstance(line, AsciiSlave) else "rtu"
         settings = tuple((name, value) for name, value in wire.params if name not in LINE_PARAMS)
         plant = Endpoint(scheme, path=wire.path, params=settings)
-        end = await PtyEnd.open(Path(wire.path), plant, plant.serial)
+        end = self._behind_faults(await PtyEnd.open(Path(wire.path), plant, plant.serial), line)
         self._closing.append(end)
         serving = serve_rtu(end, line, self._clock, as_recorded(plant.serial), echo=echo)
         nursery.start(serving, f"units on {wire}")
@@ -219,9 +277,20 @@ class DeviceHost:
     async def _listen(
         self, wire: Endpoint, units: dict[int, ModbusUnit], on_client: OnClient, max_clients: int
     ) -> None:
+        if self._faults is not None:
+            framing = Framing.MBAP if wire.scheme in ("tcp", "tls") else _framing(_is_ascii(wire))
+            on_client = _behind(self._faults.on_wire(framing), on_client)
         listener = await SocketListener.open(wire, on_client, max_clients)
         self._closing.append(listener)
         talk.print(f"units {_list(units)} on {listener.bound}", soft_wrap=True)
+
+    def _mbap(self, units: dict[int, ModbusUnit]) -> MbapSlave:
+        return MbapSlave(units, any_unit=self._extras.any_unit)
+
+    def _behind_faults(self, end: ByteConnection, line: LineSlave) -> ByteConnection:
+        if self._faults is None:
+            return end
+        return FaultyEnd(end, self._faults.on_wire(_framing(isinstance(line, AsciiSlave))))
 
     async def serve_can(
         self,
@@ -231,6 +300,7 @@ class DeviceHost:
         node_id: int | None,
         recording: Path | None,
         bitrate: int | None,
+        options: NodeOptions | None = None,
     ) -> None:
         """A CANopen node on one bus: see `can_here.stand_on_bus`."""
         wire = only_bus(wires)
@@ -240,7 +310,10 @@ class DeviceHost:
             talk.print(f"{profile.name} plays {played.path.name} (a log of a CAN bus)", soft_wrap=True)
         elif recording or self._recording_of(profile):
             played = self._player(profile, recording)
-        node = emulated_node(profile, node_id or profile.form.factory.node, played, self._clock.monotonic_ns()).node
+        number, now_ns = node_id or profile.form.factory.node, self._clock.monotonic_ns()
+        made = emulated_node(profile, number, played, now_ns, options=options)
+        print_remarks(profile.name, made.remarks)
+        node = made.node
         opened: list[SoftBusServer | CanConnection] = []
         try:
             connection, where = await stand_on_bus(wire, bitrate, profile.name, opened)
@@ -282,6 +355,25 @@ def _is_ascii(wire: Endpoint) -> bool:
 
 def _line(wire: Endpoint, units: dict[int, ModbusUnit]) -> LineSlave:
     return AsciiSlave(units) if _is_ascii(wire) else RtuSlave(units)
+
+
+def _framing(ascii_: bool) -> Framing:
+    return Framing.ASCII if ascii_ else Framing.RTU
+
+
+def _behind(faults: WireFaults, serve: OnClient) -> OnClient:
+    """Serve clients through the faults of their wire."""
+
+    async def client(connection: SocketEnd) -> None:
+        if faults.refuses(round(asyncio.get_running_loop().time() * NS_PER_S)):
+            return
+        end = FaultyEnd(connection, faults)
+        try:
+            await serve(end)  # type: ignore[arg-type]  # a connection like the one that it stands for
+        finally:
+            await end.aclose()
+
+    return client
 
 
 def _list(units: dict[int, ModbusUnit]) -> str:

@@ -34,6 +34,10 @@ class FieldContact:
         self.listening: dict[str, str] = {}
         self.far_said: dict[str, str] = {}
         """Where buses and far modems are, as the field side says it."""
+        self.remarks: list[str] = []
+        """What does not fit a node's data sheet, each with the device's name."""
+        self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
+        """By bus and client, what a field side counted before we came."""
         self.counted_before: dict[str, dict[str, int]] = {}
         """By device, what its counters said when we came: a field side may have served others before us."""
 
@@ -73,6 +77,8 @@ async def _contact(client: ControlClient, system: System, host: str, run_dir: Pa
     check_same(system, status)
     contact = FieldContact(client, {}, {})
     contact.life, contact.listening, contact.far_said = status["life"], status["listening"], status["far"]
+    contact.clients_before = status.get("clients", {})
+    contact.remarks = [f"{name}: {text}" for name, device in status["devices"].items() for text in device["remarks"]]
     contact.counted_before = {name: dict(device["counters"]) for name, device in status["devices"].items()}
     try:
         for bus_name, url in status["listening"].items():

@@ -55,6 +55,8 @@ def _say(side: FieldSide, process: FieldProcess, options: FieldOptions) -> None:
         talk.print(f"  {bus}: {endpoint}  ({devices})", soft_wrap=True)
     for name, emulated in side.devices.items():
         talk.print(f"  {name}: from {emulated.plays}", soft_wrap=True)
+        for remark in emulated.remarks:
+            talk.print(f"  {name}: {remark}", soft_wrap=True, markup=False)
     for device, endpoint in side.far.items():
         talk.print(f"  far end of {device}: {endpoint}", soft_wrap=True)
     host = options.control.rpartition(":")[0]

@@ -13,6 +13,7 @@ import msgspec
 from fieldtwin.__about__ import __version__
 from fieldtwin.running.many_seeds import SeedResult
 from gateway.core.errors import FileInvalid, Unreachable
+from gateway.core.input_file import read_input
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -29,13 +30,16 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     errors: tuple[str, ...] = ()
 
 
+MAX_BYTES = 256 * 1024 * 1024
+
+
 class Ledger:
     """A file of entries, appended to. A last line that a kill cut off is taken away. Raises `FileInvalid`, `Unreachable`."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.entries: list[Entry] = []
-        data = path.read_bytes() if path.exists() else b""
+        data = read_input(path, MAX_BYTES) if path.exists() else b""
         *lines, rest = data.split(b"\n")
         for number, line in enumerate(lines, 1):
             try:
@@ -70,6 +74,10 @@ class Ledger:
         except OSError as e:
             raise Unreachable(f"cannot write the ledger: {e.strerror}", where=str(self.path)) from e
         self.entries.append(entry)
+
+    def failed_of(self, what: str, seeds: range) -> set[int]:
+        """Return which of these seeds failed when they were run of this, by this version."""
+        return {e.seed for e in self.failed if e.what == what and e.version == __version__ and e.seed in seeds}
 
     @property
     def hours(self) -> float:

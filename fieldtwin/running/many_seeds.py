@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fieldtwin.running.shrink import smallest
+from fieldtwin.running.shrink import same_failure, smallest
 from fieldtwin.running.virtual_network_run import VirtualNetworkOptions
 from fieldtwin.running.virtual_run import VirtualOptions
-from fieldtwin.running.workers import Workers
+from fieldtwin.running.workers import each
 
 MAX_SEEDS = 100_000
 _ERRORS_SHOWN = 5
@@ -30,6 +29,8 @@ class SeedResult:
     wrong: int
     events: int
     sha256: str
+    faults: tuple[tuple[str, int, int], ...] = ()
+    """By fault name: how many were put in, and how often they struck in all."""
 
 
 def fingerprint(*parts: str) -> str:
@@ -64,49 +65,51 @@ def run_seed(options: Options) -> SeedResult:
         sum(one["wrong"] for one in published),
         summary["trace"]["events"],
         summary["trace"]["sha256"],
+        _by_name([one for part in [summary, *systems.values()] for one in part.get("faults", ())]),
     )
 
 
-def shrunk(options: Options, seed: int, most_runs: int = 60) -> tuple[list[dict[str, Any]], SeedResult]:
-    """The fewest faults with which the run of `seed` still fails, and how it fails with them. It must fail with all."""
-    options = replace(options, seed=seed)
-    faults = options.make().faults
-    base = replace(options, random_faults=False, faults=())
+def _by_name(faults: Sequence[dict[str, Any]]) -> tuple[tuple[str, int, int], ...]:
+    names = sorted({fault["name"] for fault in faults})
+    of = {name: [fault["struck"] for fault in faults if fault["name"] == name] for name in names}
+    return tuple((name, len(struck), sum(struck)) for name, struck in of.items())
+
+
+@dataclass(frozen=True, slots=True)
+class Shrunk:
+    """The fewest faults with which a run still fails as it did: `faults`. `minimal`: none of them can be left out. `result`: how
+    the run ends with them. `without`: how it ends without any fault; the same as `result` if it takes none. `scripted`: when (s)
+    the remote client commands which period."""
+
+    faults: list[dict[str, Any]]
+    minimal: bool
+    result: SeedResult
+    without: SeedResult
+    scripted: list[tuple[float, int]]
+
+
+def shrunk(options: Options, found: SeedResult, most_runs: int = 60) -> Shrunk:
+    """Return the fewest faults with which the run of `found`'s seed still fails as it did with all of them."""
+    options = replace(options, seed=found.seed)
+    run = options.make()
+    base = replace(options, random_faults=None, faults=())
+    seen: dict[str, SeedResult] = {}
+
+    def ended(part: Sequence[dict[str, Any]]) -> SeedResult:
+        key = repr(part)
+        if key not in seen:
+            seen[key] = run_seed(replace(base, faults=tuple(part)))
+        return seen[key]
 
     def fails(part: Sequence[dict[str, Any]]) -> bool:
-        return not run_seed(replace(base, faults=tuple(part))).ok
+        return same_failure(found.errors, ended(list(part)).errors)
 
-    left = smallest(faults, fails, most_runs)
-    return left, run_seed(replace(base, faults=tuple(left)))
+    left, minimal = smallest(run.faults, fails, most_runs)
+    return Shrunk(left, minimal, ended(left), ended([]), run.scripted)
 
 
 def run_seeds(
     options: Options, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
 ) -> list[SeedResult]:
     """A run a seed, `jobs` at a time, in the order of the seeds. `on_result` is told of each as it ends."""
-    if jobs <= 1:
-        results = []
-        for seed in seeds:
-            results.append(run_seed(replace(options, seed=seed)))
-            if on_result is not None:
-                on_result(results[-1])
-        return results
-    found: dict[int, SeedResult] = {}
-    with Workers(jobs) as pool:
-        for result in _as_they_end(pool, options, seeds, 2 * jobs):
-            found[result.seed] = result
-            if on_result is not None:
-                on_result(result)
-    return [found[seed] for seed in seeds]
-
-
-def _as_they_end(pool: Workers, options: Options, seeds: Sequence[int], at_once: int) -> Iterator[SeedResult]:
-    waiting: set[Future[SeedResult]] = set()
-    for seed in seeds:
-        waiting.add(pool.submit(run_seed, replace(options, seed=seed)))
-        if len(waiting) >= at_once:
-            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-            yield from (future.result() for future in done)
-    while waiting:
-        done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
-        yield from (future.result() for future in done)
+    return each(jobs, run_seed, [replace(options, seed=seed) for seed in seeds], on_result)

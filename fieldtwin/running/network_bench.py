@@ -7,12 +7,14 @@ starts and ends nothing: that is for who makes it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.conformance.case import Danger
+from fieldtwin.report.model import Struck
 from fieldtwin.running.shore import Shore
-from fieldtwin.scenarios.bench import Bench, Can, Reading
+from fieldtwin.running.struck import struck_of
+from fieldtwin.scenarios.bench import Bench, Can, Reading, Stopped
 from fieldtwin.scenarios.trace import Kind, Trace
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import UsageError
@@ -97,11 +99,30 @@ class NetworkBench:
         part, local = self._part(name)
         return part.bench.reading(local)
 
+    def why_unknown(self, name: str) -> str:
+        part, local = self._part(name)
+        return part.bench.why_unknown(local)
+
+    def stopped(self) -> Stopped | None:
+        for member, part in self.parts.items():
+            if (stopped := part.bench.stopped()) is not None:
+                return replace(stopped, what=f"{member}: {stopped.what}")
+        return None
+
+    def not_started(self) -> str:
+        told = {member: part.bench.not_started() for member, part in self.parts.items()}
+        return "; ".join(f"{member}: {text}" for member, text in told.items() if text)
+
     def late_ms(self) -> float:
         return max(part.bench.late_ms() for part in self.parts.values())
 
     def host_late_s(self, since_s: float) -> float:
         return max(part.bench.host_late_s(since_s - part.trace.offset_ns / NS_PER_S) for part in self.parts.values())
+
+    def host_late_total_s(self, since_s: float) -> tuple[float, float]:
+        """One judge sleeps for all systems, in the first one's bench."""
+        told = [p.bench.host_late_total_s(since_s - p.trace.offset_ns / NS_PER_S) for p in self.parts.values()]
+        return told[0][0], max(any_s for _, any_s in told)
 
     async def send(self, period_s: int) -> None:
         if self.shore is None:
@@ -124,6 +145,12 @@ class NetworkBench:
             return
         await self.parts[where].bench.inject(local)
         self._where[str(fault["id"])] = where
+
+    async def struck(self) -> list[Struck]:
+        found = [struck_of(one) for one in self.faults.history.describe()]
+        for member, part in self.parts.items():
+            found += [replace(one, on=f"{member}.{one.on}") for one in await part.bench.struck()]
+        return found
 
     async def clear(self, id: str) -> None:
         where = self._where.pop(id, None)

@@ -33,10 +33,11 @@ async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> Sce
         bench = NetworkBench(scenario.network, trace, "local", session.faults)
         for name, one in session.sessions.items():
             notes = MemberTrace(trace, name, _later(bench, name))
-            used = [local for member, local in map(scenario.network.split, sorted(scenario.used)) if member == name]
+            names = sorted(scenario.used | scenario.invariants.names)
+            used = [local for member, local in map(scenario.network.split, names) if member == name]
             part = ControlBench(
                 one.system,
-                Where(one.instance.dir, capture=one.options.capture),
+                Where(one.instance.dir, capture=one.options.capture, own=True),
                 notes,
                 target="local",
                 names=used,

@@ -14,6 +14,7 @@ def summarise_network(
     water: dict[str, dict[str, int]],
     ship: dict[str, Any] | None,
     errors: list[str],
+    water_faults: list[dict[str, Any]],
 ) -> dict[str, Any]:
     """Plain data for `--json` and for people. `systems`: each one's own summary. `ok` when all are, and nothing else failed."""
     return {
@@ -22,6 +23,7 @@ def summarise_network(
         "prototype": True,
         "systems": systems,
         "water": water,
+        "faults": water_faults,
         "ship": ship,
         "errors": errors,
         "ok": not errors and all(one["ok"] for one in systems.values()),

@@ -19,6 +19,8 @@ from twin.instance import runtime_root
 from twin.system import System
 
 T = TypeVar("T")
+LOOK_S = 0.02
+"""Between two looks at whether all steps are done."""
 
 
 def running_instances() -> list[str]:
@@ -53,6 +55,16 @@ def talk_to(instance: str, ask: Callable[[ControlClient], Awaitable[T]]) -> T:
             await client.aclose()
 
     return asyncio.run(main())
+
+
+async def step_and_wait(call: Callable[..., Awaitable[Any]], count: int, by: str) -> dict[str, int]:
+    """Let a paused PLC execute `count` steps, and return the scans of each task once all are done, or it is paused no more."""
+    scans: dict[str, int] = (await call("step", count=count, by=by))["scans"]
+    while True:
+        now = await call("get", brief=True)
+        if not now["stepping"] or now["state"] != "paused":
+            return scans
+        await asyncio.sleep(LOOK_S)
 
 
 def parse_value(text: str, words: Sequence[str] = ()) -> bool | int | float:

@@ -80,6 +80,14 @@ class Probes:
             self._updates.get(name, 0),
         )
 
+    def why_unknown(self, name: str) -> str:
+        """Return which endpoint did not answer for a probe's register, and with what error; empty for all other names."""
+        bus = next((one for one in self._buses if one.config.name == name.partition(".")[0]), None)
+        if bus is None or name not in self.names:
+            return ""
+        error = bus.error or next((device.error for device in bus.devices if device.error), "")
+        return f"the probe {bus.config.name} at {bus.config.endpoint}: {error or 'no answer yet'}"
+
     def changes(self, start_ns: int) -> list[Event]:
         """TAG events since the last call, in ns since `start_ns`."""
         events = [Event(t_ns - start_ns, Kind.TAG, name, data) for t_ns, name, data in self._events]

@@ -20,12 +20,15 @@ PATIENCE_S = 120.0
 class Reloaded:
     """`applied`: something changed, and all of it counts. Else nothing does; `restart` says what cannot change while it runs.
 
+    `warnings` are those of the new file.
+
     Changes are ``{"where": "plant.yaml:12:5", "what": "devices.ctd...: 1000 -> 500", "live": true}``.
     """
 
     applied: bool
     changes: list[dict[str, Any]]
     hash: str
+    warnings: tuple[str, ...] = ()
 
     @property
     def restart(self) -> list[dict[str, Any]]:
@@ -37,10 +40,18 @@ async def reload(gateway: ControlClient, plc: ControlClient | None, by: str, *, 
 
     Raises `RemoteError` where a file is invalid, with its line, and what reaching them may raise; nothing has changed then.
     """
-    answer = await gateway.call("reload", timeout_s=PATIENCE_S, by=by, check=check)
+    programs = (await plc.call("sources"))["changed"] if plc is not None else []
+    answer = await gateway.call("reload", timeout_s=PATIENCE_S, by=by, check=check or bool(programs))
+    changes = [*answer["changes"], *map(_of_program, programs)]
     if answer["applied"] and answer["limits"] and plc is not None:
         await plc.call("limits", tags=answer["limits"])
-    return Reloaded(answer["applied"], answer["changes"], answer["hash"])
+    return Reloaded(answer["applied"], changes, answer["hash"], tuple(answer.get("warnings", ())))
+
+
+def _of_program(source: dict[str, str]) -> dict[str, Any]:
+    """A program's file that is not the one that runs, as a change that a reload cannot take over."""
+    what = f"plc.programs.{source['program']}: its file changed since the PLC read it ({source['cure']})"
+    return {"where": source["path"], "what": what, "live": False}
 
 
 async def reload_instance(instance: str, by: str, *, check: bool = False) -> Reloaded:

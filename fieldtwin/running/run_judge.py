@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.running.driven import PIECE_S
@@ -25,15 +26,19 @@ TITLE = "what a run in virtual time is judged by"
 class _Judged(VirtualRun):
     disturbed = True
     """What a program should do, the scenario says."""
+    may_refuse: tuple[str, ...] = ()
+    """The outputs whose refusal it expects."""
 
 
 class RunJudge:
     """`attach`, then `watch` in a task of its own, and `finish` when the scenario is over."""
 
-    def __init__(self, scenario: Scenario, prototype: Prototype | None) -> None:
-        faults = tuple(
-            {"id": f"step {n}", **step.fault} for n, step in enumerate(scenario.form.steps, 1) if step.fault is not None
-        )
+    def __init__(
+        self, scenario: Scenario, prototype: Prototype | None, by_chance: tuple[dict[str, Any], ...] = ()
+    ) -> None:
+        """`by_chance`: random faults, which are put in besides those of the steps."""
+        steps = enumerate(scenario.form.steps, 1)
+        faults = by_chance + tuple({"id": f"step {n}", **step.fault} for n, step in steps if step.fault is not None)
         if scenario.network is None:
             assert prototype is not None
             files = {"": (scenario.system.path, prototype.path)}
@@ -49,6 +54,9 @@ class RunJudge:
             )
             for name, (system, file) in files.items()
         }
+        for name, run in self._runs.items():
+            prefix = f"{name}." if name else ""
+            run.may_refuse = tuple(t.removeprefix(prefix) for t in scenario.form.refused if t.startswith(prefix))
         self._benches: Mapping[str, VirtualBench] = {}
         self._where = scenario.line("judge")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shlex
 import shutil
 import signal
 from collections.abc import Callable
@@ -18,17 +19,20 @@ from fieldtwin.report.coverage import Collector
 from fieldtwin.report.machines import machines_of
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.control_bench import ControlBench, Where
+from fieldtwin.running.field_found import find_field
 from fieldtwin.running.network_local import run_network
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.virtual_scenario import prototype_of, reproduce, run_virtual
+from fieldtwin.running.with_controller import WithController
 from fieldtwin.scenarios.about import result_of
-from fieldtwin.scenarios.bench import Can
+from fieldtwin.scenarios.bench import Can, NothingKnown
 from fieldtwin.scenarios.form import Scenario
-from fieldtwin.scenarios.runner import Runner, refusal
+from fieldtwin.scenarios.runner import Runner, gone, refusal
 from fieldtwin.scenarios.trace import Trace, open_sink
 from gateway.core.errors import FieldtwinError
 from gateway.wallclock import WallClock
+from twin.field_process import FieldConfig
 from twin.instance import Instance, runtime_root
 
 TARGETS = ("virtual", "local", "compose", "real")
@@ -39,21 +43,36 @@ class Target:
     """Where scenarios run. `instance` of `compose` and `real`: one that runs on this host already; empty: `compose` takes the
     system's name, `real` starts the plant. `field_host`, `token`: the field side of `compose`. `far`: the far end of a plant.
     `capture`: the file that a running instance's wires are captured to. `allow`: what may be done to a plant. `can`: on `local`
-    the interface that emulated CAN buses are on (`socketcan/vcan0`); empty: as the prototype file says."""
+    the interface that emulated CAN buses are on (`socketcan/vcan0`); empty: as the prototype file says. `controller`: on `local`
+    the user's program and its arguments, which control instead of our gateway and PLC."""
 
     name: str = "virtual"
     seed: int | None = None
     instance: str = ""
-    field_host: str = "field"
+    field_host: str = ""
     token: str = field(default="", repr=False)
     far: str = ""
     capture: Path | None = None
     allow: Danger = Danger.READ
     can: str = ""
+    controller: tuple[str, ...] = ()
 
 
-def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = None) -> ScenarioResult:
-    """Run it. What the target does not allow or cannot do is SKIPPED; a system that is gone is an ERROR with its reason."""
+def run_scenario(
+    scenario: Scenario, target: Target, trace_file: Path | None = None, retries: int = 0
+) -> ScenarioResult:
+    """Run it, and again, at most `retries` times, while it is INCONCLUSIVE; the first other verdict counts. In virtual time an
+    attempt is like the one before, so there is one only."""
+    earlier: list[str] = []
+    while True:
+        result = _attempt(scenario, target, trace_file)
+        if result.verdict is not Verdict.INCONCLUSIVE or len(earlier) >= retries or target.name == "virtual":
+            return replace(result, earlier=tuple(earlier))
+        earlier.append(result.why)
+
+
+def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> ScenarioResult:
+    """Run it once. What the target does not allow or cannot do is SKIPPED; a system that is gone is an ERROR with its reason."""
     if target.name == "virtual":
         return run_virtual(scenario, target.seed, trace_file)
     collector = Collector(scenario.system, machines_of(scenario.system))
@@ -63,6 +82,10 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
         refused = f"a network is a prototype, and the target {target.name} is none: each of its systems is a plant"
     elif scenario.network is not None and target.can:
         refused = "--can is of one system, and this is a network"
+    elif scenario.network is not None and target.controller:
+        refused = "a network has a controller in each of its systems, and --with starts one program"
+    elif target.controller:
+        refused = _of_a_foreign_controller(scenario)
     sink = open_sink(trace_file) if trace_file is not None else None
     trace = Trace(sink=sink)
     trace.listen(collector.feed)
@@ -73,14 +96,18 @@ def run_scenario(scenario: Scenario, target: Target, trace_file: Path | None = N
             result = asyncio.run(_run(scenario, target, trace))
     except asyncio.CancelledError:  # SIGTERM: everything went down in order
         raise KeyboardInterrupt from None
+    except NothingKnown as e:  # the host was late, or another judge interfered: nothing is known
+        result = result_of(scenario, target.name, Verdict.INCONCLUSIVE, reason=str(e), trace=tuple(trace.events))
     except FieldtwinError as e:
-        result = result_of(scenario, target.name, Verdict.ERROR, reason=str(e), trace=tuple(trace.events))
+        events = tuple(trace.events)
+        checks = (gone(e, events[-1].t_ns if events else 0),)
+        result = result_of(scenario, target.name, Verdict.ERROR, checks=checks, reason=str(e), trace=events)
     finally:
         trace.close()
     return replace(
         result,
         seed=target.seed if target.seed is not None else scenario.form.seed,
-        reproduce=reproduce(scenario, *_words(target)),
+        reproduce=reproduce(scenario, *_words(target)) + _with_words(target),
         took_s=(WallClock().monotonic_ns() - began_ns) / 1e9,
         counts=collector.finish(),
         trace_hash="",  # no two runs on a clock have the same
@@ -103,13 +130,33 @@ def _words(target: Target) -> list[str]:
     said = {
         "--seed": "" if target.seed is None else str(target.seed),
         "--instance": target.instance,
-        "--field": target.field_host if target.field_host != Target.field_host else "",
+        "--field": target.field_host,
         "--far": target.far,
         "--capture": str(target.capture or ""),
         "--can": target.can,
         "--allow": target.allow.value if target.name == "real" and target.allow is not Target.allow else "",
     }
     return words + [word for option, value in said.items() if value for word in (option, value)]
+
+
+def _with_words(target: Target) -> str:
+    """How the command line ends where the user's program controls."""
+    return f" --with -- {shlex.join(target.controller)}" if target.controller else ""
+
+
+def _of_a_foreign_controller(scenario: Scenario) -> str:
+    """Why a program of the user cannot be judged by it; empty when it can."""
+    probed = {name for probe in scenario.probes for name in probe.names}
+    ours = sorted(scenario.used - probed) + [
+        f"the probe {probe.name} (serve)" for probe in scenario.probes if probe.serve
+    ]
+    if not ours:
+        return ""
+    told = f"{', '.join(ours[:5])}{', ...' if len(ours) > 5 else ''}"
+    return (
+        f"the scenario looks at {told}: fieldtwin's own gateway and PLC publish that, and here a program of yours "
+        "controls. Let the scenario look at registers through `probes`"
+    )
 
 
 async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResult:
@@ -121,7 +168,16 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
     async with AsyncExitStack() as stack:
         gone: Callable[[], FieldtwinError | None] = lambda: None  # noqa: E731
         if target.name == "compose" or target.instance:
-            where = _running(scenario, target)
+            where = await _running(scenario, target)
+            if where.foreign and (refused := _of_a_foreign_controller(scenario)):
+                return result_of(scenario, target.name, Verdict.SKIPPED, reason=refused)
+        elif target.controller:
+            name = f"test-{os.getpid()}"
+            both = await stack.enter_async_context(
+                WithController(scenario.system, _field_config(scenario, target), target.controller, name)
+            )
+            where = Where(both.instance.dir, own=True, foreign=True, env=both.env)
+            gone = both.failure
         else:
             session = _session(scenario, target)
             own = session.instance.dir
@@ -136,24 +192,43 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
                 own,
                 far=target.far,
                 capture=session.options.capture,
+                own=target.name == "local",
                 plant=target.name == "real",
                 allowed=target.allow if target.name == "real" else Danger.DISRUPT,
             )
 
-            def gone() -> FieldtwinError | None:
+            def ended() -> FieldtwinError | None:
                 return next((failed for child in session.children.values() if (failed := child.failure())), None)
+
+            gone = ended
 
         bench = ControlBench(
             scenario.system,
             where,
             trace,
             target=target.name,
-            names=sorted(scenario.used),
+            names=sorted(scenario.used | _invariant_names(scenario, where)),
             probes=scenario.probes,
+            fresh=lambda can: scenario.form.start == "fresh" and not refusal(scenario, target.name, can, where.allowed),
             gone=gone,
         )
         async with bench:
-            return await Runner(scenario, bench).run()
+            result = await Runner(scenario, bench).run()
+            return _with_what_was_in(result, bench)
+
+
+def _invariant_names(scenario: Scenario, where: Where) -> set[str]:
+    """The tags and variables of the system file's invariants, where a gateway of ours publishes them."""
+    ours = not where.foreign and (where.run_dir / "gateway.sock").exists()
+    return scenario.invariants.names if ours else set()
+
+
+def _with_what_was_in(result: ScenarioResult, bench: ControlBench) -> ScenarioResult:
+    """A scenario that did not pass says what somebody else had put into the simulated devices before it began."""
+    before = bench.lease.before if bench.lease is not None else ""
+    if not before or result.verdict in (Verdict.PASSED, Verdict.SKIPPED):
+        return result
+    return replace(result, reason=f"{result.reason}; before this scenario began, these were in already: {before}")
 
 
 def _session(scenario: Scenario, target: Target) -> RunSession:
@@ -176,12 +251,34 @@ def _session(scenario: Scenario, target: Target) -> RunSession:
     return RunSession(options)
 
 
-def _running(scenario: Scenario, target: Target) -> Where:
+def _field_config(scenario: Scenario, target: Target) -> FieldConfig:
+    """The simulated field devices, for the user's program."""
+    system, file = scenario.system, prototype_of(scenario)
+    cans = [name for name, bus in system.buses.items() if bus.endpoint.is_can and target.can]
+    return FieldConfig(
+        system=str(system.path.resolve()),
+        run_dir="",
+        prototype=str(file.resolve()) if file is not None else "",
+        profiles=tuple(str(path.resolve()) for path in scenario.profiles),
+        listen=dict.fromkeys(cans, f"can:{target.can}"),
+        seed=target.seed if target.seed is not None else scenario.form.seed,
+    )
+
+
+async def _running(scenario: Scenario, target: Target) -> Where:
     """One that runs already, under its name on this host (in its container, for `compose`)."""
     plant = target.name == "real"
+    run_dir = runtime_root() / (target.instance or scenario.system.name)
+    host, socket, foreign = target.field_host, None, False
+    if not plant and not host:
+        under_with = {} if target.instance else os.environ
+        host, socket = await find_field(scenario.system, run_dir, under_with)
+        foreign = "FIELDTWIN_CONTROL" in under_with
     return Where(
-        runtime_root() / (target.instance or scenario.system.name),
-        field_host="" if plant else target.field_host,
+        run_dir,
+        field_host="" if plant else host,
+        field_socket=socket,
+        foreign=foreign,
         token=target.token,
         far=target.far,
         capture=target.capture,

@@ -14,18 +14,24 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from fieldtwin.cli.talk import talk
+from fieldtwin.conformance.case import Danger
 from fieldtwin.running.children import Child
+from fieldtwin.running.control_bench import ControlBench, Where
 from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
 from fieldtwin.running.field_return import FieldReturn, is_loss
+from fieldtwin.running.invariant_watch import InvariantWatch
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.oracle import Oracle
 from fieldtwin.running.reloading import Reloaded, reload
 from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.thread_return import ThreadReturn
+from fieldtwin.scenarios.trace import Trace
+from gateway.core.clock import NS_PER_S
 from gateway.core.control import ControlClient
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.started import Started
 from gateway.wallclock import WallClock
@@ -44,7 +50,13 @@ if TYPE_CHECKING:
 MODEM_EVERY_S = 1.0
 """So often, at most, a tag goes over a modem: it takes some thirty events a second."""
 WATCH_S = 0.02
+ANSWERS_WITHIN_S = 5.0
+"""A process that does not say how it is by then is stopped, or gets no processor."""
+STILL_S = 3.0
+"""Looks of this process that are so far apart mean the same of itself."""
 ORACLE_S = 1.0
+INVARIANTS_S = 0.1
+"""How often the invariants of the system file are looked at."""
 MAX_ERRORS = 100
 SETTLE_S = 4.0
 FIELD_LINGER_S = 1.5
@@ -73,9 +85,13 @@ class RunSession(Started):
         self.far: dict[str, Endpoint] = {}
         self.cables: dict[str, BridgeCable] = {}
         self.counted_before: dict[str, dict[str, int]] = {}
+        self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
         self.children: dict[str, Child] = {}
         self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
         self.oracle = Oracle()
+        self.invariants = InvariantWatch(self.system)
+        self.watches_invariants = bool(self.invariants)
+        self._judging: asyncio.Task[None] | None = None
         self.states = StateWatch(self.system)
         self.shore: Shore | None = None
         self.gateway_status: dict[str, Any] | None = None
@@ -87,10 +103,16 @@ class RunSession(Started):
         self.thread_return: ThreadReturn | None = None
         self.started_ns = 0
         self.answered_ns: dict[str, int] = {}  # when gateway and PLC last did
+        self._looked_ns = 0
+        """When this process last looked after the others."""
+        self._still_ns = -(1 << 62)
+        """When it last noticed that it had stood still."""
         self.stopped = asyncio.Event()
         self._nursery = Nursery()
         self._clients: dict[str, ControlClient] = {}
         self._field: FieldContact | None = None
+        self.made_anew = 0
+        """How often a scenario made the simulated devices anew."""
         self.field_return: FieldReturn | None = None
         """Of a field side elsewhere: that it was lost, and came back."""
 
@@ -112,12 +134,13 @@ class RunSession(Started):
     @property
     def disturbed(self) -> bool:
         """Whether faults were put in, or the field side was away: then both sides need not count alike."""
-        return bool(self.options.faults) or (self.field_return is not None and self.field_return.losses > 0)
+        lost = self.field_return is not None and self.field_return.losses > 0
+        return bool(self.options.faults) or lost or self.made_anew > 0
 
     @property
     def calm(self) -> bool:
         """Whether there were no faults: how long recovery takes is a scenario's to say."""
-        return not self.options.faults
+        return not self.options.faults and not self.made_anew
 
     # -- starting -------------------------------------------------------------------------------------------------------
 
@@ -237,7 +260,9 @@ class RunSession(Started):
             self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far
-        self.counted_before = self._field.counted_before
+        self.counted_before, self.clients_before = self._field.counted_before, self._field.clients_before
+        for remark in self._field.remarks:
+            talk.print(remark, soft_wrap=True, markup=False)
 
     async def _lay_cables(self, run_dir: Path) -> None:
         """A line for each bridge that masters ask over a line: what the plant has there is not touched."""
@@ -254,7 +279,7 @@ class RunSession(Started):
     async def _field_returned(self, another: bool) -> None:
         if another:
             self.oracle.begin_again()
-            self.counted_before = {}
+            self.counted_before, self.clients_before = {}, {}
             await self._put_faults_in()
 
     @property
@@ -268,6 +293,8 @@ class RunSession(Started):
         if self.field_return is not None:
             self._nursery.start(self.field_return.run(), "field side's return")
         self._nursery.start(self._watch(), "states")
+        if self.invariants:
+            self._judging = self._nursery.start(self._judge_invariants(), "invariants")
         self._nursery.start(self._ask(), "status")
         device = next(iter(self.far), None)
         if device is not None and self.options.prototype and self.options.commands:
@@ -292,6 +319,16 @@ class RunSession(Started):
         finally:
             done.cancel()
 
+    async def _judge_invariants(self) -> None:
+        """Look at the invariants of the system file until the gateway or the PLC is gone, or the run is stopped."""
+        where = Where(self.instance.dir, plant=True, allowed=Danger.OBSERVE)
+        try:
+            async with ControlBench(self.system, where, Trace(1), target="real", names=self.invariants.names) as bench:
+                await self.invariants.run(bench, INVARIANTS_S)
+        except FieldtwinError as e:  # the processes' own watch tells of one that is gone
+            self.invariants.end(str(e))
+            self.note_error(f"the invariants were not judged to the end: {e}")
+
     async def _settle(self) -> None:
         """The time is over; a command that is still under way may arrive, for `SETTLE_S` seconds at most."""
         deadline_s = self.elapsed_s + SETTLE_S
@@ -307,7 +344,9 @@ class RunSession(Started):
 
     async def _watch(self) -> None:
         while True:
-            self.states.look(self.clock.monotonic_ns())
+            self._stood_still()
+            self._looked_ns = self.clock.monotonic_ns()
+            self.states.look(self._looked_ns)
             self._notice_deaths()
             await asyncio.sleep(WATCH_S)
 
@@ -335,32 +374,54 @@ class RunSession(Started):
 
     async def refresh(self) -> None:
         """Ask every process for its status."""
-        self.gateway_status = await self._get(self._clients.get("gateway"))
-        self.plc_status = await self._get(self._clients.get("plc"), brief=True)
-        self.field_status = await self._get(self._field_client)
+        self.gateway_status = await self._get(self._clients.get("gateway"), "gateway")
+        self.plc_status = await self._get(self._clients.get("plc"), "plc", brief=True)
+        await self._refresh_field()
         for name, status in (("gateway", self.gateway_status), ("plc", self.plc_status)):
             if status is not None:
                 self.answered_ns[name] = self.clock.monotonic_ns()
-        if (thread := await self._get(self._clients.get("thread"))) is not None:
+        if (thread := await self._get(self._clients.get("thread"), "thread")) is not None:
             self.thread_status = thread
             if thread["dropped"]:
                 self.note_error(f"the thread's log lost events: {thread['store_trouble'] or 'they came too fast'}")
 
-    async def _get(self, client: ControlClient | None, **args: Any) -> dict[str, Any] | None:
+    async def _refresh_field(self) -> None:
+        """Its status; where a scenario made its devices anew (`start: fresh`), their journals and counters begin again."""
+        self.field_status = await self._get(self._field_client, "" if self.field_return is not None else "field")
+        if self._field is None or self.field_status is None or self.field_status["life"] == self._field.life:
+            return
+        self._field.life = self.field_status["life"]
+        self.made_anew += 1
+        self.oracle.begin_again()
+        self.counted_before, self.clients_before = {}, {}
+
+    async def _get(self, client: ControlClient | None, name: str, **args: Any) -> dict[str, Any] | None:
+        """The status of a process. One that does not answer is an error of the run; `name` is empty for one watched elsewhere."""
         if client is None:
             return None
         try:
-            answer: dict[str, Any] = await client.call("get", **args)
+            answer: dict[str, Any] = await client.call("get", timeout_s=ANSWERS_WITHIN_S, **args)
         except FieldtwinError as e:
             self._maybe_lost(client, e)
+            if isinstance(e, ReplyTimeout) and name and not self._stood_still():
+                self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
             return None  # it is dying or gone: _notice_deaths says so with its reason
         return answer
+
+    def _stood_still(self) -> bool:
+        """Whether this very process was stopped, or got no processor: then it cannot tell whether others answered."""
+        gap_s = (self.clock.monotonic_ns() - self._looked_ns) / NS_PER_S
+        if self._looked_ns and gap_s > STILL_S:
+            self._still_ns = self.clock.monotonic_ns()
+            self.note_error(f"run: the run's own process stood still for {gap_s:.1f} s")
+        return self.clock.monotonic_ns() - self._still_ns < (STILL_S + ANSWERS_WITHIN_S) * NS_PER_S
 
     def _maybe_lost(self, client: ControlClient, error: FieldtwinError) -> None:
         if self.field_return is not None and client is self.field_return.client and is_loss(error):
             self.field_return.lost()
 
     async def _judge(self) -> None:
+        await self._refresh_field()
         gateway = self._clients.get("gateway")
         field = self._field_client
         if gateway is None or field is None:
@@ -388,8 +449,15 @@ class RunSession(Started):
         finally:
             await self._nursery.__aexit__(None, None, None)
 
+    async def _end_judging(self) -> None:
+        """Look at invariants no more: what stopping does to the outputs is no violation."""
+        if self._judging is not None:
+            self._judging.cancel()
+            await asyncio.wait([self._judging])
+
     async def _stop_in_order(self) -> None:
         self._notice_deaths()
+        await self._end_judging()
         if self.shore is not None:
             await self.shore.halt()
         await self.refresh()
@@ -400,7 +468,7 @@ class RunSession(Started):
                 self.outputs_confirmed_safe, self.gateway_status = answer["safe"], answer["status"]
             except FieldtwinError as e:
                 self.note_error(f"the gateway did not stop in order: {e}")
-        self.field_status = await self._get(self._field_client) or self.field_status
+        self.field_status = await self._get(self._field_client, "") or self.field_status
         await self._judge()
         if self.field_return is not None and (trouble := self.field_return.trouble):
             self.note_error(trouble)

@@ -2,24 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 T = TypeVar("T")
 MOST_RUNS = 200
+BROKEN_AT = ": broken at "
+"""What stands in an error between the text of a rule and what was known when it was broken."""
+_PLAIN = re.compile(r"[A-Za-z_]\w*")
+_NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
-def smallest(items: Sequence[T], fails: Callable[[Sequence[T]], bool], most_runs: int = MOST_RUNS) -> list[T]:
-    """A part of `items` that still `fails` and of which no single item can be left out; what was found by then after
-    `most_runs` questions. `items` as a whole must fail."""
+def smallest(
+    items: Sequence[T], fails: Callable[[Sequence[T]], bool], most_runs: int = MOST_RUNS
+) -> tuple[list[T], bool]:
+    """Return a part of `items` that still `fails`, and whether no single item can be left out of it.
+
+    The first question is about no items at all: a failure that needs none of them must not be blamed on one. After `most_runs`
+    questions the smallest part that was found by then is returned. `items` as a whole must fail.
+    """
     left, parts, runs = list(items), 2, 0
-    while len(left) > 1 and runs < most_runs:
+    if left and most_runs > 0:
+        runs += 1
+        if fails(()):
+            return [], True
+    while len(left) > 1:
         size = -(-len(left) // parts)
         pieces = [left[i : i + size] for i in range(0, len(left), size)]
         for n in range(len(pieces)):
             without = [item for m, piece in enumerate(pieces) if m != n for item in piece]
-            if not without or runs >= most_runs:
+            if not without:
                 continue
+            if runs >= most_runs:
+                return left, False
             runs += 1
             if fails(without):
                 left, parts = without, max(parts - 1, 2)
@@ -28,7 +45,20 @@ def smallest(items: Sequence[T], fails: Callable[[Sequence[T]], bool], most_runs
             if size == 1:
                 break
             parts = min(2 * parts, len(left))
-    return left
+    return left, not left or runs > 0
+
+
+def kind_of(error: str) -> str:
+    """Return an error without its numbers: the same failure at another time, or with another value, has the same kind.
+
+    A rule that was broken is the same whatever was known of its tags then.
+    """
+    return _NUMBER.sub("#", error.partition(BROKEN_AT)[0])
+
+
+def same_failure(found: Iterable[str], again: Iterable[str]) -> bool:
+    """Return whether an error of `again` is of the kind of one of `found`."""
+    return not {kind_of(error) for error in found}.isdisjoint(kind_of(error) for error in again)
 
 
 def as_scenario(
@@ -36,36 +66,51 @@ def as_scenario(
     system: str,
     seed: int,
     duration_s: float,
-    faults: Sequence[dict[str, Any]],
+    faults: Sequence[Mapping[str, Any]],
     why: Sequence[str],
-    commands: Sequence[tuple[float, int]] = (),
+    acts: Sequence[tuple[float, Mapping[str, Any]]] = (),
+    keys: Mapping[str, Any] | None = None,
 ) -> str:
-    """The faults as a scenario file: put in, lived through, and judged as the run was. `commands`: when (s) the far end commanded
-    which period."""
+    """Return a scenario file: it puts the faults in, lets `duration_s` pass, and is judged by `keys`, as a run is by default.
+
+    `acts`: further steps, each with its time (s since the start).
+    """
     lines = [
         "# Shrunk from a run that failed:",
-        *(f"#   {line}" for line in why),
-        f"scenario: {_quoted(title)}",
-        f"system: {_quoted(system)}",
+        *(f"#   {line}" for text in why for line in text.splitlines()),
+        f"scenario: {flow(title)}",
+        f"system: {flow(system)}",
         f"seed: {seed}",
-        "judge: run",
+        *(f"{key}: {flow(value)}" for key, value in ({"judge": "run"} if keys is None else keys).items()),
         "steps:",
+        *(f"  - fault: {flow(dict(fault))}" for fault in faults),
     ]
-    for fault in faults:
-        inside = ", ".join(f"{key}: {_quoted(value)}" for key, value in fault.items())
-        lines.append(f"  - fault: {{{inside}}}")
     now_s = 0.0
-    for at_s, period_s in sorted(commands):
-        lines += [f"  - pause: {at_s - now_s:g}s", f"  - send: {{period_s: {period_s}}}"]
-        now_s = at_s
-    lines.append(f"  - pause: {duration_s - now_s:g}s")
+    for at_s, step in sorted(acts, key=lambda act: act[0]):
+        if at_s > now_s:
+            lines.append(f"  - pause: {_seconds(at_s - now_s)}")
+        lines += [f"  - {key}: {flow(value)}" for key, value in step.items()]
+        now_s = max(now_s, at_s)
+    if duration_s > now_s:
+        lines.append(f"  - pause: {_seconds(duration_s - now_s)}")
     return "\n".join(lines) + "\n"
 
 
-def _quoted(value: object) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int | float):
-        return repr(value)
-    text = str(value)
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+def _seconds(time_s: float) -> str:
+    return f"{round(time_s, 6):.12g}s"
+
+
+def flow(value: Any) -> str:
+    """Return plain data as YAML in one line. Texts are always quoted; a float has a point, which our YAML asks for."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_key(key)}: {flow(one)}" for key, one in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(flow, value)) + "]"
+    if isinstance(value, float):
+        said = repr(value)
+        return said.replace("e", ".0e") if "e" in said and "." not in said else said
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _key(key: Any) -> str:
+    return key if isinstance(key, str) and _PLAIN.fullmatch(key) else json.dumps(key, ensure_ascii=False)

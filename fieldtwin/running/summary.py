@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any, Protocol
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import StateWatch, expected_states
+from fieldtwin.scenarios.trace import refusal_text
 from gateway.core.endpoint import Endpoint
+from plc.task import StopReason
 from twin.system import System
+
+MOST_REFUSED = 10
+"""Refused outputs that a summary names one by one."""
 
 
 class Options(Protocol):
@@ -32,8 +37,24 @@ class Oracle(Protocol):
     def describe(self) -> dict[str, Any]: ...
 
 
+class Invariants(Protocol):
+    """What judged the invariants of the system file."""
+
+    def results(self) -> list[dict[str, Any]]: ...
+
+    def errors(self) -> list[str]: ...
+
+
 class Run(Protocol):
     """A run that is over: of processes on this host, or in virtual time."""
+
+    @property
+    def invariants(self) -> Invariants: ...
+
+    @property
+    def watches_invariants(self) -> bool:
+        """Whether the run judged the invariants of its system file."""
+        ...
 
     @property
     def options(self) -> Options: ...
@@ -72,6 +93,9 @@ class Run(Protocol):
     def counted_before(self) -> dict[str, dict[str, int]]: ...
 
     @property
+    def clients_before(self) -> dict[str, dict[str, dict[str, int]]]: ...
+
+    @property
     def outputs_confirmed_safe(self) -> bool | None: ...
 
     @property
@@ -95,10 +119,15 @@ def summarise(run: Run) -> dict[str, Any]:
     exchanges = _exchanges(run)
     checks = [*_plc_checks(plc), *_loss_checks(gateway)]
     if run.calm:
-        checks = [*_device_checks(gateway), *_output_checks(gateway), *checks]
+        checks = [*_device_checks(gateway, run.options.prototype and run.disturbed), *_output_checks(gateway), *checks]
     if run.options.prototype:
-        checks += _oracle_checks(run) + ([] if run.disturbed else _exchange_checks(exchanges) + _state_checks(run))
-    errors = [*run.errors, *checks]
+        checks += _oracle_checks(run) + ([] if run.disturbed else exchange_checks(exchanges) + _state_checks(run))
+    refusals = gateway.get("refusals", {})
+    checks += _refusal_checks(
+        refusals, getattr(run, "may_refuse", ()), disturbed=run.options.prototype and run.disturbed
+    )
+    invariants = run.invariants if run.watches_invariants else None
+    errors = [*run.errors, *(invariants.errors() if invariants is not None else ()), *checks]
     return {
         "fieldtwin": __version__,
         "system": run.system.name,
@@ -106,11 +135,13 @@ def summarise(run: Run) -> dict[str, Any]:
         "prototype": run.options.prototype,
         "instance": run.instance.name,
         "duration_s": round(run.elapsed_s, 3),
+        "warnings": list(run.system.warnings),
         "mapping": {str(plant): str(target) for plant, target in run.mapping.items()},
         "devices": _devices(gateway, run.field_status or {}),
         "states": {program: run.states.sequence(program) for program in run.states.programs},
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
+        "faults": (run.field_status or {}).get("struck", []),
         "published": {"values": gateway.get("published", 0), **run.oracle.describe()},
         "mailboxes": gateway.get("mailboxes", {}),
         "far_end": run.shore.describe() if run.shore else None,
@@ -119,6 +150,8 @@ def summarise(run: Run) -> dict[str, Any]:
         "learnt": gateway.get("learnt", {}),
         "logged": gateway.get("logged", 0),
         "writes": gateway.get("writes", {}),
+        "refused": refusals.get("entries", []),
+        "invariants": invariants.results() if invariants is not None else [],
         "outputs_safe": run.outputs_confirmed_safe,
         "plc": {
             k: plc[k]
@@ -134,6 +167,8 @@ def summarise(run: Run) -> dict[str, Any]:
                 "error",
                 "acts",
                 "forces",
+                "waiting",
+                "started_without",
             )
             if k in plc
         },
@@ -175,6 +210,7 @@ def _exchanges(run: Run) -> dict[str, Any]:
             row["gateway"]["heartbeats"] = counters.get("heartbeats", 0)
         devices = [d for d in run.system.devices_on(name) if d.name in field.get("devices", {})]
         if devices:
+            row["unanswered_at_stop"] = unanswered_at_stop(row, len(devices))
             row["emulators"] = {
                 what: sum(
                     field["devices"][d.name]["counters"][what] - run.counted_before.get(d.name, {}).get(what, 0)
@@ -182,23 +218,64 @@ def _exchanges(run: Run) -> dict[str, Any]:
                 )
                 for what in ("requests", "replies")
             }
+            others = _others(bus, field.get("clients", {}).get(name, {}), run.clients_before.get(name, {}))
+            if any(others.values()):
+                row["others"] = others
+                # The bus counts a request when it is sent and the node when it takes it: a third party, which nobody stops
+                # before the counts are read, may have one under way at each node.
+                row["under_way"] = len(devices) if can else 0
+                row["emulators"] = {what: number - others[what] for what, number in row["emulators"].items()}
         if any(d.name == getattr(run, "lent", "") for d in devices):
             row["shared"] = "the digital thread"
         out[name] = row
     return out
 
 
-def _exchange_checks(exchanges: dict[str, Any]) -> list[str]:
-    """Both sides count the same; but a reply that came too late, or damaged, was one for its sender only. Where somebody else
-    asks the same device, nobody can say."""
+def unanswered_at_stop(row: dict[str, Any], devices: int) -> int:
+    """Return how many requests the gateway had under way when it stopped: at most one for each of its `devices`.
+
+    Such a request has neither a reply nor a timeout on the gateway's side, but the emulator may have answered it.
+    """
+    answered = row["gateway"]["replies"] + row["timeouts"] + row["crc_errors"]
+    return min(devices, max(0, int(row["gateway"]["requests"]) - int(answered)))
+
+
+def _others(
+    bus: dict[str, Any], clients: dict[str, dict[str, int]], before: dict[str, dict[str, int]]
+) -> dict[str, int]:
+    """What third parties asked the emulators of a bus: the traffic of clients whose address is none of the gateway's.
+
+    On a bus of the kernel, where frames have no sender, it is the SDO requests that the gateway did not send itself. Where no
+    client has an address of the gateway's, something between the two translates addresses, and nothing can be told apart.
+    """
+    ours = set(bus.get("local", ()))
+    if not clients:
+        number = bus["counters"].get("foreign_sdo_requests", 0)
+        return {"requests": number, "replies": number}
+    if not ours & clients.keys():
+        return {"requests": 0, "replies": 0}
+    return {
+        what: sum(c[what] - before.get(name, {}).get(what, 0) for name, c in clients.items() if name not in ours)
+        for what in ("requests", "replies")
+    }
+
+
+def exchange_checks(exchanges: dict[str, Any]) -> list[str]:
+    """Compare the counts of both sides of each bus; return one sentence for each difference.
+
+    A reply that came too late, was damaged, or was under way when the gateway stopped counts on the emulators' side only.
+    A device that the digital thread also uses is not compared.
+    """
     failed = []
     for bus, row in exchanges.items():
-        excused = {"requests": 0, "replies": row["timeouts"] + row["crc_errors"]}
+        under_way = row.get("under_way", 0)
+        unanswered = row.get("unanswered_at_stop", 0)
+        excused = {"requests": under_way, "replies": row["timeouts"] + row["crc_errors"] + under_way + unanswered}
         for what in ("requests", "replies"):
             if (
                 "shared" not in row
                 and "emulators" in row
-                and not 0 <= row["emulators"][what] - row["gateway"][what] <= excused[what]
+                and not -under_way <= row["emulators"][what] - row["gateway"][what] <= excused[what]
             ):
                 failed.append(
                     f"{bus}: the gateway counted {row['gateway'][what]} {what}, the emulators {row['emulators'][what]}"
@@ -208,8 +285,16 @@ def _exchange_checks(exchanges: dict[str, Any]) -> list[str]:
     return failed
 
 
-def _device_checks(gateway: dict[str, Any]) -> list[str]:
-    return [f"{name}: {d['error']}" for name, d in gateway.get("devices", {}).items() if not d["online"] or d["error"]]
+def _device_checks(gateway: dict[str, Any], disturbed: bool) -> list[str]:
+    """Return the errors of devices.
+
+    A fault that doubles frames looks like two nodes with one ID, so this is no error when the run is `disturbed`.
+    """
+    return [
+        f"{name}: {d['error']}"
+        for name, d in gateway.get("devices", {}).items()
+        if not d["online"] or (d["error"] and not (disturbed and d["error"] == d.get("conflict")))
+    ]
 
 
 def _output_checks(gateway: dict[str, Any]) -> list[str]:
@@ -225,11 +310,33 @@ def _output_checks(gateway: dict[str, Any]) -> list[str]:
     ]
 
 
+def _refusal_checks(refusals: dict[str, Any], expected: Collection[str], *, disturbed: bool) -> list[str]:
+    """Outputs of programs that were refused: always where the program or the configuration is wrong; where the device refused,
+    unless faults were put in. What is refused by design, tried again or asked by a client fails no run."""
+    found: dict[tuple[str, str, str], str] = {}
+    faults = ("program",) if disturbed else ("program", "device")
+    for entry in refusals.get("entries", []):
+        if entry["fault"] in faults and entry["tag"] not in expected:
+            found[entry["tag"], entry["cause"], entry["place"]] = refusal_text(entry["tag"], entry)
+    told = list(found.values())
+    if len(told) > MOST_REFUSED:
+        told[MOST_REFUSED:] = [f"{len(told) - MOST_REFUSED} more outputs were refused"]
+    if not found and not expected and any(refusals.get("faults", {}).get(fault) for fault in faults):
+        told = ["outputs of programs were refused, so many that the first are no longer kept: see the audit log"]
+    return told
+
+
 def _plc_checks(plc: dict[str, Any]) -> list[str]:
     if not plc:
         return []  # its death is in the run's errors already
+    # A PLC that was stopped still lists the programs that never ran.
+    failed = [
+        f"PLC: program {program} has not started: it waits for {start['reason']}"
+        for program, start in plc.get("waiting", {}).items()
+    ]
     error = plc.get("error")
-    return [f"PLC: {error}"] if error else []
+    told = failed and (plc.get("state") == "waiting" or plc.get("stop_reason") == StopReason.NOT_STARTED.value)
+    return [f"PLC: {error}", *failed] if error and not told else failed
 
 
 def _loss_checks(gateway: dict[str, Any]) -> list[str]:
@@ -240,14 +347,17 @@ def _loss_checks(gateway: dict[str, Any]) -> list[str]:
         failed.append(f"{gateway['log_dropped']} entries of the exchange log were dropped")
     if gateway.get("store_error"):
         failed.append(gateway["store_error"])
-    return failed
+    buses = gateway.get("buses", {}).items()
+    return failed + [f"{name}: {bus['sync_producers']}" for name, bus in buses if bus.get("sync_producers")]
 
 
 def _oracle_checks(run: Run) -> list[str]:
     oracle = run.oracle
+    judged = getattr(run, "messages", None)  # a run of processes cannot see each message
+    messages: list[str] = judged.wrong if judged is not None else []
     if oracle.wrong_count:
-        return [f"{oracle.wrong_count} published values were never held by their device", *oracle.wrong]
-    return [] if oracle.checked else ["no value was published as good"]
+        return [f"{oracle.wrong_count} published values were never held by their device", *oracle.wrong, *messages]
+    return messages if oracle.checked else ["no value was published as good", *messages]
 
 
 def _state_checks(run: Run) -> list[str]:

@@ -13,12 +13,14 @@ from typing import Any
 from emulators.models.packet_link import ModemEnd
 from emulators.virtual.loop import VirtualLoop
 from fieldtwin.conformance.case import Danger
+from fieldtwin.report.model import Struck
 from fieldtwin.running.probes import Probes
 from fieldtwin.running.shore import Scripted, Shore
 from fieldtwin.running.states import state_words
-from fieldtwin.scenarios.bench import Can, Reading
+from fieldtwin.running.struck import struck_of
+from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
 from fieldtwin.scenarios.probe_form import Probe
-from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
+from fieldtwin.scenarios.trace import FAR_END, Kind, Trace, refusal_data
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.connection import Direction
@@ -27,7 +29,9 @@ from gateway.core.errors import Unreachable, UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.started import Started
 from gateway.core.values import Quality, Reason, TagValue
+from gateway.runtime.refusals import Refusal
 from plc.publishing import Change
+from plc.task import StopReason
 from twin.prototype_file import Prototype
 from twin.system import System
 from twin.virtual import VirtualPrototype
@@ -71,13 +75,14 @@ class VirtualBench(Started):
             seed=seed,
             taps=[_FrameTap(self, system)],
             on_change=self._changed,
+            on_refusal=self._refused,
             water=water,
         )
         self.shore: Shore | None = None
         self._commands = commands or []
         self._far_end = far_end
         self._probe = probes
-        if probes and all(probe.endpoint is None for probe in probes):  # nothing else is in memory
+        if probes and all(probe.serve for probe in probes):  # nothing else is in memory
             self.can = self.can | {Can.PROBE}
         self._probes: Probes | None = None
         self.asked_ns: dict[str, deque[int]] = {bus: deque(maxlen=ASKED_KEPT) for bus in system.buses}
@@ -97,6 +102,7 @@ class VirtualBench(Started):
             Can.SEE_WIRE,
             Can.SEE_HELD,
             Can.EXACT_TIME,
+            Can.FRESH_START,
             Can.JUDGE_RUN,
         }
     )
@@ -155,6 +161,9 @@ class VirtualBench(Started):
     def _changed(self, change: Change) -> None:
         self.note(Kind.STATE, change.tag, {"value": self._named(change.tag, change.after)})
 
+    def _refused(self, entry: Refusal) -> None:
+        self.note(Kind.REFUSED, entry.tag, refusal_data(entry.describe()))
+
     def _named(self, tag: str, value: Any) -> Any:
         """A state by its name."""
         return self._words[tag].get(value, value) if tag in self._words else value
@@ -186,7 +195,8 @@ class VirtualBench(Started):
         outputs = self.run.plc.outputs.last()
         if name in outputs and name not in self.run.gateway.tags:
             value = self._named(name, outputs[name])
-            return None if value is None else Reading(value, "good", "", 0.0, 0)
+            runs = self.run.plc.stop_reason is StopReason.NONE  # else nothing may be made of its variables any more
+            return None if value is None else variable(value, runs=runs)
         if name not in self.run.gateway.tags:
             raise UsageError(f"no tag or variable {name!r}", expected="DEVICE.TAG or PROGRAM.VARIABLE")
         now_ns = self.run.clock.monotonic_ns()
@@ -201,11 +211,30 @@ class VirtualBench(Started):
             self._updates.get(name, 0),
         )
 
+    def why_unknown(self, name: str) -> str:
+        return self._probes.why_unknown(name) if self._probes is not None else ""
+
+    def stopped(self) -> Stopped | None:
+        plc = self.run.plc
+        if plc.stop_reason is StopReason.NONE:
+            overdue = plc.starts.error
+            return Stopped("plc", str(overdue)) if overdue is not None else None
+        place = getattr(plc.error, "place", "")
+        return Stopped("plc", f"the PLC stopped ({plc.stop_reason.value}): {plc.error or 'on request'}", place)
+
+    def not_started(self) -> str:
+        return "; ".join(
+            f"program {start.name} waits for {start.reason()}" for start in self.run.plc.starts.missing_something
+        )
+
     def late_ms(self) -> float:
         return 0.0
 
     def host_late_s(self, since_s: float) -> float:
         return 0.0
+
+    def host_late_total_s(self, since_s: float) -> tuple[float, float]:
+        return 0.0, 0.0
 
     async def send(self, period_s: int) -> None:
         if self.shore is None:
@@ -219,6 +248,9 @@ class VirtualBench(Started):
         id = self.run.field.faults.inject(fault)
         target = fault.get("device") or fault.get("bus") or ""
         self.note(Kind.FAULT, id, {"name": fault["name"], "on": True, "target": target, "said": fault})
+
+    async def struck(self) -> list[Struck]:
+        return [struck_of(one) for one in self.run.field.faults.history.describe()]
 
     async def clear(self, id: str) -> None:
         self.run.field.faults.clear(id)

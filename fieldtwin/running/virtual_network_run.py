@@ -11,11 +11,12 @@ from typing import Any
 
 from emulators.virtual.loop import VirtualLoop
 from fieldtwin.running.driven import DrivenRun
-from fieldtwin.running.fault_schedule import random_network_schedule
+from fieldtwin.running.fault_schedule import RandomFaults, random_network_schedule
 from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.shore import Scripted
 from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
+from gateway.core.nursery import Nursery
 from twin.network import load_network
 from twin.network_faults import placed_all
 
@@ -31,18 +32,13 @@ class VirtualNetworkOptions:
     profiles: tuple[Path, ...] = ()
     commands: tuple[Scripted, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
-    random_faults: bool = False
-    """Faults that the seed chooses, besides."""
+    random_faults: RandomFaults | None = None
+    """What the seed chooses faults from, besides `faults`."""
     trace: Path | None = None
 
     def make(self) -> VirtualNetworkRun:
         """The run of these options."""
         return VirtualNetworkRun(self)
-
-    @property
-    def scripted(self) -> list[tuple[float, int]]:
-        """When (s) the far end commands which period."""
-        return [(one.at_s, one.period_s) for one in self.commands]
 
 
 class VirtualNetworkRun(DrivenRun):
@@ -52,9 +48,11 @@ class VirtualNetworkRun(DrivenRun):
         self.network = network = load_network(Path(options.system), options.profiles)
         self.options = options
         super().__init__(network.seed if options.seed is None else options.seed, options.duration_s, options.trace)
+        self.water_faults: list[dict[str, Any]] = []
         self.faults = options.faults
-        if options.random_faults:
-            self.faults += random_network_schedule(network, self.seed, options.duration_s)
+        if options.random_faults is not None:
+            options.random_faults.check(network.whole, network)
+            self.faults += random_network_schedule(network, self.seed, options.duration_s, options.random_faults)
         faults = placed_all(network, self.faults)
         self.runs = {
             name: VirtualRun(
@@ -72,6 +70,11 @@ class VirtualNetworkRun(DrivenRun):
         self.ship: dict[str, Any] | None = None
 
     @property
+    def scripted(self) -> list[tuple[float, int]]:
+        """When (s) the ship commands which period; empty in a network without a ship."""
+        return [(one.at_s, one.period_s) for one in self.options.commands] if self.network.ship is not None else []
+
+    @property
     def files(self) -> tuple[str, ...]:
         return self.network.path.read_text(encoding="utf-8"), *(
             text for run in self.runs.values() for text in run.files
@@ -86,13 +89,17 @@ class VirtualNetworkRun(DrivenRun):
             self._judged = True
             for fault in self.faults:  # each knows its time
                 await whole.bench.inject(fault)
-            await self._through(whole.bench, loop, lambda: self._judge(whole))
+            async with Nursery() as nursery:
+                for name, run in self.runs.items():
+                    run.watch_invariants(whole.systems[name], nursery)
+                await self._through(whole.bench, loop, lambda: self._judge(whole))
             if whole.bench.shore is not None:
                 await whole.bench.shore.halt()
                 self.ship = whole.bench.shore.describe()
             for name, run in self.runs.items():
                 await run.finish(whole.systems[name])
             self.water = {name: counters.as_dict() for name, counters in whole.medium.counters.items()}
+            self.water_faults = whole.faults.history.describe()
 
     def _judge(self, whole: VirtualNetwork) -> None:
         for name, run in self.runs.items():
@@ -104,7 +111,7 @@ class VirtualNetworkRun(DrivenRun):
             for key in ("seed", "trace", "virtual"):
                 del one[key]
         return {
-            **summarise_network(self.network, systems, self.water, self.ship, self.errors),
+            **summarise_network(self.network, systems, self.water, self.ship, self.errors, self.water_faults),
             "duration_s": round(self.elapsed_s, 3),
             "virtual": True,
             "seed": self.seed,

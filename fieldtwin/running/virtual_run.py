@@ -16,15 +16,21 @@ from emulators.faults.schema import seconds
 from emulators.virtual.loop import VirtualLoop
 from fieldtwin.running.age_oracle import AgeOracle
 from fieldtwin.running.driven import DrivenRun
-from fieldtwin.running.fault_schedule import random_schedule
+from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
+from fieldtwin.running.invariant_watch import InvariantWatch
+from fieldtwin.running.message_oracle import MessageOracle
 from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.scenarios.runner import TICK_S
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.clock import NS_PER_MS
+from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.endpoint import Endpoint
+from gateway.core.nursery import Nursery
+from gateway.core.statemachine import encode_period
 from gateway.core.values import Quality, TagValue
+from gateway.runtime.gateway import stale_limits
 from gateway.runtime.learnt import describe_learnt
 from gateway.runtime.status import describe
 from twin.field import FieldSide
@@ -37,6 +43,8 @@ CALM_S = 60.0
 """How long after the last fault all must be well again."""
 CAN_WIRE_NS = 10 * NS_PER_MS
 """What a frame may need on a CAN bus: several attempts, behind others."""
+STALE_CHECK_NS = 100 * NS_PER_MS
+"""How often, at most, the oracle looks for values that are still good although they are older than they may be."""
 _GOOD = Quality.GOOD  # an Enum's members are slow to look up
 
 
@@ -53,17 +61,12 @@ class VirtualOptions:
     speed: float = 0.0
     commands: tuple[int, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
-    random_faults: bool = False
-    """Faults that the seed chooses, besides."""
+    random_faults: RandomFaults | None = None
+    """What the seed chooses faults from, besides `faults`."""
     trace: Path | None = None
 
     prototype: bool = True
     field_host: str = ""
-
-    @property
-    def scripted(self) -> list[tuple[float, int]]:
-        """When (s) the far end commands which period."""
-        return [(one.at_s, one.period_s) for one in (script(self.commands, self.duration_s) if self.commands else ())]
 
     def make(self) -> VirtualRun:
         """The run of these options."""
@@ -94,21 +97,36 @@ class VirtualRun(DrivenRun):
             self.prototype.seed if options.seed is None else options.seed, options.duration_s, options.trace
         )
         self.faults = options.faults
-        if options.random_faults:
-            self.faults += random_schedule(self.system, self.seed, options.duration_s)
+        if options.random_faults is not None:
+            options.random_faults.check(self.system)
+            self.faults += random_schedule(self.system, self.seed, options.duration_s, options.random_faults)
         self.instance = _Instance()
         self.states = StateWatch(self.system)
         self.oracle = AgeOracle()
+        self.messages = MessageOracle()
+        """Compares the commands that reached the gateway through a mailbox with those that the far end sent."""
+        self.invariants = InvariantWatch(self.system)
+        self.watches_invariants = False
+        """Whether this run judges the invariants; a scenario judges them itself."""
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: dict[str, Any] | None = None
         self.field_status: dict[str, Any] | None = None
         self.counted_before: dict[str, dict[str, int]] = {}
+        self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
         self.outputs_confirmed_safe: bool | None = None
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
         self.shore: Shore | None = None
         self._numbers: dict[str, int] = {}
         self._emulated: frozenset[str] = frozenset()
+
+    @property
+    def scripted(self) -> list[tuple[float, int]]:
+        """When (s) the remote client commands which period; empty where the prototype has no link for that."""
+        o = self.options
+        if not o.commands or all(device.form.far is None for device in self.prototype.devices.values()):
+            return []
+        return [(one.at_s, one.period_s) for one in script(o.commands, o.duration_s)]
 
     @property
     def disturbed(self) -> bool:
@@ -140,11 +158,19 @@ class VirtualRun(DrivenRun):
             self.attach(bench)
             for fault in self.faults:  # each knows its time
                 await bench.inject(fault)
-            await self._through(bench, loop, lambda: self.judge(bench))
-            await self._settle(bench)
+            async with Nursery() as nursery:
+                self.watch_invariants(bench, nursery)
+                await self._through(bench, loop, lambda: self.judge(bench))
+                await self._settle(bench)
             if self.shore is not None:
                 await self.shore.halt()
             await self.finish(bench)
+
+    def watch_invariants(self, bench: VirtualBench, nursery: Nursery) -> None:
+        """Judge the invariants of the system file from now on, as long as `nursery` is open."""
+        self.watches_invariants = True
+        if self.invariants:
+            nursery.start(self.invariants.run(bench, TICK_S), "invariants")
 
     def attach(self, bench: VirtualBench) -> None:
         """From now on what happens on `bench` is judged."""
@@ -152,6 +178,10 @@ class VirtualRun(DrivenRun):
         self.mapping, self.far, self.shore = bench.run.mapping, bench.run.field.far, bench.shore
         self._emulated = frozenset(bench.run.field.devices)
         bench.run.gateway.tags.on_put = self._watched(bench)
+        if self.shore is not None:
+            for pump in bench.run.gateway.pumps:
+                if pump.driver.config.name in self.far:
+                    self.messages.watch(pump.driver.emitter)
         bench.trace.listen(self._on_state, Kind.STATE)
         self.states.knows(bench.run.twin.ecs.layout)
         for program, state in bench.states().items():
@@ -170,6 +200,8 @@ class VirtualRun(DrivenRun):
         ]  # a node that was stopped holds nothing for sure
         await bench.sleep_until_s(bench.now_s() + LAST_REPLIES_S)
         self._judge(bench.run.field)
+        if self.shore is not None:
+            self.messages.judge([encode_period(period).data for period in self.shore.commands_sent])
         self._take_status(bench, outputs)
 
     async def _settle(self, bench: VirtualBench) -> None:
@@ -190,12 +222,14 @@ class VirtualRun(DrivenRun):
             for name, device in self.system.devices.items()
             if not self.system.buses[device.bus].endpoint.is_can
         }
+        check_ages = self._age_check(bench)
         asked_of: dict[str, deque[int] | None] = {}
         """By tag: when its bus was asked; None for what a node sends unasked."""
 
         def put(name: str, value: TagValue) -> None:
             if told is not None:
                 told(name, value)
+            check_ages()
             if value.quality is _GOOD:
                 # A value is of the moment in which its reply was complete; the device answered after it was asked. What a node
                 # sends unasked was on the wire for a while, longer where it had to be sent again.
@@ -214,6 +248,38 @@ class VirtualRun(DrivenRun):
                 self.oracle.published(name, value.raw, value.value, since_ns, loop.now_ns)
 
         return put
+
+    def _age_check(self, bench: VirtualBench) -> Callable[[], None]:
+        """Return a function that tells the oracle which values the gateway still calls good, whether they are new or not.
+
+        The device must have held such a value within the value's maximum age, plus the time of one exchange. The function does so
+        at most every `STALE_CHECK_NS`.
+        """
+        tags, loop = bench.run.gateway.tags, bench.loop
+        limits_ns = {
+            tag: limit_ms * NS_PER_MS + self._exchange_ns(driver.config.bus)
+            for driver in bench.run.gateway.drivers.values()
+            for tag, limit_ms in stale_limits(driver).items()
+            if limit_ms is not None
+        }
+        next_ns = 0
+
+        def check() -> None:
+            nonlocal next_ns
+            if loop.now_ns < next_ns:
+                return
+            next_ns = loop.now_ns + STALE_CHECK_NS
+            for tag, limit_ns in limits_ns.items():
+                value = tags.current(tag, loop.now_ns)
+                if value.quality is _GOOD:
+                    self.oracle.still_good(tag, value.raw, value.value, loop.now_ns - limit_ns, loop.now_ns)
+
+        return check
+
+    def _exchange_ns(self, bus: str) -> int:
+        """Return how much older than its last refresh a value may be: the device held it before its reply came, in ns."""
+        config = self.system.buses[bus]
+        return CAN_WIRE_NS if config.endpoint.is_can else round(config.timeout_s * NS_PER_S)
 
     def _on_state(self, event: Event) -> None:
         if event.where.endswith(".state") and isinstance(event.data["value"], str):

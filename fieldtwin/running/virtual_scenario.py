@@ -19,7 +19,7 @@ from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.form import Scenario
-from fieldtwin.scenarios.runner import Runner
+from fieldtwin.scenarios.runner import ByChance, Runner, gone
 from fieldtwin.scenarios.trace import Trace, open_sink
 from gateway.core.errors import FieldtwinError
 from gateway.core.nursery import Nursery
@@ -27,16 +27,22 @@ from gateway.wallclock import WallClock
 from twin.prototype_file import load_prototype
 
 
-def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | None = None) -> ScenarioResult:
-    """Run it. `seed` before the scenario's own and the prototype file's."""
+def run_virtual(
+    scenario: Scenario, seed: int | None = None, trace_file: Path | None = None, by_chance: ByChance | None = None
+) -> ScenarioResult:
+    """Run it. `seed` before the scenario's own and the prototype file's. `by_chance`: random faults of a campaign."""
     prototype = load_prototype(scenario.system, prototype_of(scenario)) if scenario.network is None else None
     own = prototype.seed if prototype is not None else scenario.network.seed if scenario.network is not None else 0
     chosen = seed if seed is not None else scenario.form.seed if scenario.form.seed is not None else own
-    judge = RunJudge(scenario, prototype) if scenario.form.judge is not None else None
+    judge = (
+        RunJudge(scenario, prototype, by_chance.faults if by_chance is not None else ())
+        if scenario.form.judge is not None
+        else None
+    )
     collector = Collector(scenario.system, machines_of(scenario.system))
     began_ns = WallClock().monotonic_ns()
     loop = VirtualLoop()
-    error = ""
+    error: FieldtwinError | None = None
     result: ScenarioResult | None = None
     with tempfile.TemporaryDirectory(prefix="ft-scenario-") as folder:
         sink = open_sink(trace_file) if trace_file is not None else None
@@ -46,23 +52,26 @@ def run_virtual(scenario: Scenario, seed: int | None = None, trace_file: Path | 
         async def main() -> ScenarioResult:
             if scenario.network is not None:
                 async with VirtualNetwork(scenario.network, loop, Path(folder), trace, seed=chosen) as whole:
-                    return await _judged(scenario, Runner(scenario, whole.bench), judge, whole.systems)
+                    return await _judged(scenario, Runner(scenario, whole.bench, by_chance), judge, whole.systems)
             assert prototype is not None
             async with VirtualBench(
                 scenario.system, prototype, loop, Path(folder), trace, seed=chosen, probes=scenario.probes
             ) as bench:
-                return await _judged(scenario, Runner(scenario, bench), judge, {"": bench})
+                return await _judged(scenario, Runner(scenario, bench, by_chance), judge, {"": bench})
 
         try:
             with seeded(chosen), sealed():
                 result = loop.run_until_complete(main())
         except FieldtwinError as e:
-            error = str(e)
+            error = e
         finally:
             loop.close()
             trace.close()
     if result is None:
-        result = result_of(scenario, "virtual", Verdict.ERROR, reason=error, trace=tuple(trace.events))
+        assert error is not None
+        events = tuple(trace.events)
+        checks = (gone(error, events[-1].t_ns if events else 0),)
+        result = result_of(scenario, "virtual", Verdict.ERROR, checks=checks, reason=str(error), trace=events)
     return replace(
         result,
         seed=chosen,

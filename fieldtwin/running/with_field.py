@@ -20,12 +20,13 @@ import msgspec
 from msgspec import structs
 
 from fieldtwin.running.children import Child
-from fieldtwin.running.field_contact import FieldContact, contact_here
+from fieldtwin.running.field_contact import FieldContact, contact_here, reachable
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 from gateway.wallclock import WallClock
 from twin.field_process import FieldConfig, resolve
 from twin.instance import Instance
+from twin.mapping import mapped_endpoint
 from twin.system import System, load_system
 
 FIELD_LINGER_S = 0.5
@@ -39,16 +40,31 @@ Tell = Callable[[dict[str, str]], None]
 
 def environment(contact: FieldContact, system: System, control: Path) -> dict[str, str]:
     """What the program finds the field by (docs/scenarios.md has the table)."""
-    env = {"FIELDTWIN_SYSTEM": str(system.path.resolve()), "FIELDTWIN_CONTROL": str(control)}
+    env = _of_system(system, control)
     for name, bus in system.buses.items():
         endpoint = contact.mapping.get(bus.endpoint)
         if endpoint is not None:
             env |= _of_endpoint(_word(name), endpoint)
+    for device_name, endpoint in contact.far.items():
+        env |= _of_endpoint(f"{_word(device_name)}_FAR", endpoint)
+    return env
+
+
+def environment_from(status: Mapping[str, Any], system: System, host: str, control: Path) -> dict[str, str]:
+    """The same, from what a field side on `host` answers to `get`. What cannot be reached from here is left out."""
+    env: dict[str, str] = {}
+    for bus, url in status["listening"].items():
+        with suppress(UsageError):  # a virtual serial port on another host
+            endpoint = mapped_endpoint(system.buses[bus].endpoint, reachable(Endpoint.parse(url), host))
+            env |= _of_endpoint(_word(bus), endpoint)
+    return env | _of_system(system, control)
+
+
+def _of_system(system: System, control: Path) -> dict[str, str]:
+    env = {"FIELDTWIN_SYSTEM": str(system.path.resolve()), "FIELDTWIN_CONTROL": str(control)}
     for name, device in system.devices.items():
         kind = "NODE" if system.buses[device.bus].endpoint.is_can else "UNIT"
         env[f"FIELDTWIN_{_word(name)}_{kind}"] = str(device.address)
-    for device_name, endpoint in contact.far.items():
-        env |= _of_endpoint(f"{_word(device_name)}_FAR", endpoint)
     return env
 
 
@@ -77,10 +93,17 @@ def _of_endpoint(word: str, endpoint: Endpoint) -> dict[str, str]:
 
 
 async def run_with(
-    config: FieldConfig, argv: Sequence[str], *, instance: str = "", faults: Sequence[dict[str, Any]] = (), tell: Tell
+    config: FieldConfig,
+    argv: Sequence[str],
+    *,
+    instance: str = "",
+    faults: Sequence[dict[str, Any]] = (),
+    tell: Tell,
+    tell_struck: Callable[[list[dict[str, Any]]], None] = lambda struck: None,
 ) -> int:
     """Bring the field side of `config` up (its `run_dir` is chosen here), run `argv`, take all down; the exit status of `argv`,
-    128 and the signal's number where a signal ended it. `tell` is given the environment before `argv` starts.
+    128 and the signal's number where a signal ended it. `tell` is given the environment before `argv` starts, `tell_struck` how
+    often each fault struck after it ended.
 
     Raises `UsageError` for a program that there is not, before anything starts; `ChildFailed` when the field side ended
     meanwhile and the program had nothing to object.
@@ -94,7 +117,13 @@ async def run_with(
     with Instance(name) as home:
         try:
             return await _inside(
-                home, structs.replace(config, run_dir=str(home.dir)), system, [program, *argv[1:]], faults, tell
+                home,
+                structs.replace(config, run_dir=str(home.dir)),
+                system,
+                [program, *argv[1:]],
+                faults,
+                tell,
+                tell_struck,
             )
         finally:
             if not instance:  # nobody else knows its name
@@ -108,6 +137,7 @@ async def _inside(
     argv: list[str],
     faults: Sequence[dict[str, Any]],
     tell: Tell,
+    tell_struck: Callable[[list[dict[str, Any]]], None],
 ) -> int:
     path = home.path("field.json")
     path.write_bytes(msgspec.json.encode(config))
@@ -122,6 +152,8 @@ async def _inside(
                 await contact.client.call("fault", fault=fault, start_ns=start_ns)
             tell(env)
             status = await _run_program(argv, env)
+            if faults and child.failure() is None:
+                tell_struck((await contact.client.call("get"))["struck"])
         finally:
             await contact.aclose()
         failed = child.failure()

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from fieldtwin.conformance.case import Danger
+from fieldtwin.report.model import Struck
 from fieldtwin.scenarios.trace import Trace
+from gateway.core.errors import FieldtwinError
 
 
 class Can(Enum):
@@ -26,8 +28,14 @@ class Can(Enum):
     EXACT_TIME = "exact_time"
     """Lateness of the host never shows."""
     PROBE = "probe"
+    FRESH_START = "fresh_start"
+    """PLC, simulations and devices begin anew before the scenario (`start: fresh`)."""
     JUDGE_RUN = "judge_run"
     """What a run is judged by (`judge: run`): every value that was published as good is compared with what its device held."""
+
+
+Part = Literal["plc", "gateway", "field"]
+"""The parts of a system that a scenario needs running."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +48,29 @@ class Reading:
     reason: str
     age_s: float
     updates: int
+
+
+def variable(value: Any, *, runs: bool) -> Reading:
+    """Return the reading of a program's variable. That of a PLC that does not run is bad: nobody may act on it."""
+    return Reading(value, "good" if runs else "bad", "" if runs else "not_operational", 0.0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Stopped:
+    """A part of the system under test that does not run: the PLC, the gateway or the simulated field devices.
+
+    `what` is the error, `where` the file and line of the logic that failed, if logic did. `bound_s`: a host that was late by a
+    part of this time may have caused it; 0 if the host's lateness cannot be the cause.
+    """
+
+    part: Part
+    what: str
+    where: str = ""
+    bound_s: float = 0.0
+
+
+class NothingKnown(FieldtwinError):
+    """The judge itself was interrupted: what it saw says nothing about the system, and the scenario is INCONCLUSIVE."""
 
 
 class Bench(Protocol):
@@ -78,12 +109,29 @@ class Bench(Protocol):
         """As it was when the last `sleep_until_s` returned. None: never published. Raises `UsageError` for an unknown name."""
         ...
 
+    def why_unknown(self, name: str) -> str:
+        """Return why `reading` is None, as far as that is known: which endpoint did not answer, and with what error."""
+        ...
+
+    def stopped(self) -> Stopped | None:
+        """Return the part of the system that does not run, or None. A plant has no simulated field devices."""
+        ...
+
+    def not_started(self) -> str:
+        """Return which programs wait for their inputs and have not started, with what is missing; empty where all run."""
+        ...
+
     def late_ms(self) -> float:
         """How late the last scan was by the host's own making; 0 in virtual time."""
         ...
 
     def host_late_s(self, since_s: float) -> float:
         """The longest that the host, by its own load, kept us or a scan waiting since `since_s`; 0 in virtual time."""
+        ...
+
+    def host_late_total_s(self, since_s: float) -> tuple[float, float]:
+        """All lateness since `since_s`, together, in seconds: that of the judge's own sleeps, which is the host's alone, and all
+        that was seen, which may also be the system's. Both 0 in virtual time."""
         ...
 
     async def send(self, period_s: int) -> None:
@@ -100,6 +148,10 @@ class Bench(Protocol):
 
     async def clear(self, id: str) -> None:
         """Take the fault away."""
+        ...
+
+    async def struck(self) -> list[Struck]:
+        """Return how often each fault struck that was put in through this bench, in the order in which they were put in."""
         ...
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:

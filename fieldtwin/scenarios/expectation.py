@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from emulators.faults.schema import seconds
 from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.scenarios.bench import Bench, Reading
-from fieldtwin.scenarios.words import Bounds, Expect
+from fieldtwin.scenarios.words import Bounds, Expect, WireForm
 from gateway.devices.codec import decode, decode_little
 from twin.system import System
 
@@ -62,6 +63,8 @@ def is_secret(system: System, name: str) -> bool:
 
 async def _judge_value(expect: Expect, watched: Watched, reading: Reading) -> Said:
     assert expect.tag is not None
+    if expect.quality is not None and reading.value is None:  # it has not gone bad: it never was anything else
+        return f"{expect.tag} {expect.quality}", f"no value yet, {reading.quality} ({reading.reason.replace('_', ' ')})"
     if expect.quality is not None and reading.quality != expect.quality:
         return f"{expect.tag} {expect.quality}", f"{reading.quality} ({reading.reason})"
     if expect.value is not None and not _near(reading.value, expect.value, expect.tolerance):
@@ -80,13 +83,20 @@ async def _like_held(expect: Expect, watched: Watched, value: object, reading_ag
     held = await watched.bench.held(expect.tag)
     can = watched.system.buses[watched.system.devices[device].bus].endpoint.is_can
     since_s = watched.bench.now_s() - reading_age_s - LIKE_S
-    newest = [raw for t_s, raw in held if t_s >= since_s]
-    recent = newest or [raw for _, raw in held[-1:]]
-    truths = [(decode_little if can else decode)(tag, raw, 0).value for raw in recent]
+    truths = [(decode_little if can else decode)(tag, raw, 0).value for raw in held_since(held, since_s)]
     if any(_near(value, truth, expect.tolerance) for truth in truths if truth is not None):
         return None
     last = truths[-1] if truths else "nothing"
     return f"{expect.tag} as the device holds it, ± {expect.tolerance:g}", f"{value!r}; the device holds {last!r}"
+
+
+def held_since(held: Sequence[tuple[float, bytes]], since_s: float) -> list[bytes]:
+    """Return what a device held at any time from `since_s` on. What it began to hold before that, it still held then.
+
+    `held` gives each value with the time from which it was held, in order.
+    """
+    first = sum(t_s <= since_s for t_s, _ in held)
+    return [raw for _, raw in held[max(0, first - 1) :]]
 
 
 def _near(value: object, truth: object, tolerance: float) -> bool:
@@ -99,7 +109,9 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
     """How often something was asked on a device's wire since the last stimulus; or how often a second, since the step began."""
     assert expect.wire is not None
     since_s = watched.since_s if expect.requests_per_s is not None else watched.stimulus_s
-    seen = [x for x in watched.exchanges if x.device == expect.wire and x.t_ns >= since_s * _NS and _matches(expect, x)]
+    seen = [
+        x for x in watched.exchanges if x.device == expect.wire and x.t_ns >= since_s * _NS and wire_matches(expect, x)
+    ]
     if expect.requests_per_s is not None:
         took_s = max(watched.bench.now_s() - since_s, 0.001)
         rate = len(seen) / took_s
@@ -116,14 +128,18 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
     return None
 
 
-def _matches(expect: Expect, exchange: Exchange) -> bool:
-    if expect.function is not None and exchange.function != expect.function:
+def wire_matches(form: Expect | WireForm, exchange: Exchange) -> bool:
+    """Return whether an exchange has the form's function, access, register and value, as far as the form names them. A
+    stray frame is not a request, so it never has them."""
+    if exchange.is_stray:
         return False
-    if expect.access is not None and expect.access not in exchange.access:
+    if form.function is not None and exchange.function != form.function:
         return False
-    if expect.register_ is not None and expect.register_ not in exchange.tags:
+    if form.access is not None and form.access not in exchange.access:
         return False
-    return expect.value is None or exchange.tags.get(expect.register_ or "") == expect.value
+    if form.register_ is not None and form.register_ not in exchange.tags:
+        return False
+    return form.value is None or exchange.tags.get(form.register_ or "") == form.value
 
 
 def inside(number: float, bounds: Bounds) -> bool:
@@ -137,3 +153,12 @@ def bounds_text(bounds: Bounds) -> str:
         return f"{bounds.min:g}" if bounds.min is not None else "any"
     parts = [f"at least {bounds.min:g}"] if bounds.min is not None else []
     return " and ".join(parts + ([f"at most {bounds.max:g}"] if bounds.max is not None else []))
+
+
+def said(part: Any) -> str:
+    """Return a part of a scenario file in its own words."""
+    if hasattr(part, "model_dump"):
+        part = part.model_dump(exclude_none=True, exclude_defaults=True, by_alias=True)
+    if isinstance(part, dict):
+        return ", ".join(f"{key} {said(value)}" for key, value in part.items())
+    return str(part)

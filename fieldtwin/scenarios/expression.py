@@ -10,8 +10,9 @@ import ast
 import difflib
 import operator
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from itertools import pairwise
+from math import isnan
 from typing import Any
 
 from gateway.core.errors import UsageError
@@ -24,6 +25,7 @@ WORDS = {"quality": QUALITIES, "reason": tuple(str(reason).replace(" ", "_") for
 """What these functions can say."""
 NO_WORDS: Mapping[str, Collection[str]] = {}
 OWN = ("plc.late", "command pending")
+_OWN = ("plc.late", "command_pending")
 """``plc.late``: by how many seconds the last scan was late; ``command pending``: the far end commanded within 5 s."""
 LONGEST = 1000
 DEEPEST = 50
@@ -56,16 +58,23 @@ class NotUnderstood(UsageError):
 
 
 Look = Callable[[str, str], Any]
-"""``look(function, name)``: what is known of a tag or variable now; None where nothing is."""
+"""``look(function, name)`` returns what is known of a tag or variable now, or None if that is unknown."""
 
 
 class Expression:
     """`text`, read once. `names`: the tags and variables that it is about. Raises `UsageError` for what it is not.
 
-    `words`: what a name can only be, where that is known; to compare it with another text is a mistake.
+    `words`: what a name can only be, where that is known; to compare it with another text is a mistake. `prefix` is put before
+    each name when it is looked at: in a network the name of the system, with a dot.
     """
 
-    def __init__(self, text: str, known: Collection[str], words: Mapping[str, Collection[str]] = NO_WORDS) -> None:
+    def __init__(
+        self,
+        text: str,
+        known: Collection[str],
+        words: Mapping[str, Collection[str]] = NO_WORDS,
+        prefix: str = "",
+    ) -> None:
         self.text = text
         self.names: list[str] = []
         self.times_s = [float(m[2]) * _UNIT_S[m[3]] for m in _TOKEN.finditer(text) if m[2] is not None]
@@ -74,6 +83,7 @@ class Expression:
         """Whether it is about ``plc.late``."""
         self._known = known
         self._words = words
+        self._prefix = prefix
         if len(text) > LONGEST:
             raise UsageError("too long an expression", expected=f"at most {LONGEST} characters")
         self._lead = len(text) - len(text.lstrip())
@@ -87,8 +97,19 @@ class Expression:
         self._check(self._tree, 0)
 
     def evaluate(self, look: Look) -> Any:
-        """Its value now. What compares with something unknown is False, but `!=`, which is True."""
-        return _value(self._tree, look)
+        """Return its value now, or None if the value is unknown.
+
+        An operation on an unknown operand is unknown, and so is one without a result, such as a division by zero. `and` and `or`
+        follow Kleene's three-valued logic: ``false and unknown`` is false, ``true or unknown`` is true.
+        """
+        prefix = self._prefix
+        if not prefix:
+            return _value(self._tree, look)
+        return _value(self._tree, lambda function, name: look(function, name if name in _OWN else prefix + name))
+
+    def truth(self, look: Look) -> bool | None:
+        """Return whether the expression is true now; None if that is unknown. Never treat None as true, nor as false."""
+        return _truth(self.evaluate(look))
 
     @property
     def is_constant(self) -> bool:
@@ -188,7 +209,7 @@ class Expression:
             hint = f"did you mean {near[0]!r}?" if near else ""
             expected = "DEVICE.TAG or PROGRAM.VARIABLE"
             raise NotUnderstood(f"no tag or variable {name!r}", self._at(node), expected=expected, hint=hint)
-        self.names.append(name)
+        self.names.append(self._prefix + name)
 
 
 def _plain(match: re.Match[str]) -> str:
@@ -211,35 +232,51 @@ def _value(node: ast.expr, look: Look) -> Any:
         return node.value
     if isinstance(node, ast.Name | ast.Attribute):
         name = _dotted(node)
-        return name == "true" if name in ("true", "false") else look("value", name)
+        return name == "true" if name in ("true", "false") else _known(look("value", name))
     if isinstance(node, ast.Call):
-        return look(_dotted(node.func), _dotted(node.args[0]))
+        return _known(look(_dotted(node.func), _dotted(node.args[0])))
     if isinstance(node, ast.BoolOp):
-        values = (bool(_value(part, look)) for part in node.values)
-        return all(values) if isinstance(node.op, ast.And) else any(values)
+        return _joined((_truth(_value(part, look)) for part in node.values), isinstance(node.op, ast.Or))
     if isinstance(node, ast.UnaryOp):
         inner = _value(node.operand, look)
-        return not inner if isinstance(node.op, ast.Not) else None if inner is None else -inner
+        if isinstance(node.op, ast.Not):
+            true = _truth(inner)
+            return None if true is None else not true
+        return None if inner is None or isinstance(inner, str) else -inner
     if isinstance(node, ast.BinOp):
-        a, b = _value(node.left, look), _value(node.right, look)
-        try:
-            return None if a is None or b is None else _ARITHMETIC[type(node.op)](a, b)
-        except (TypeError, ZeroDivisionError):
-            return None
+        left, right = _value(node.left, look), _value(node.right, look)
+        texts = isinstance(left, str) or isinstance(right, str)  # Python would repeat and join them
+        return None if texts else _applied(_ARITHMETIC[type(node.op)], left, right)
     assert isinstance(node, ast.Compare)
-    left = _value(node.left, look)
-    for op, comparator in zip(node.ops, node.comparators, strict=True):
-        right = _value(comparator, look)
-        if not _holds(type(op), left, right):
-            return False
-        left = right
-    return True
+    values = [_value(part, look) for part in (node.left, *node.comparators)]
+    pairs = zip(node.ops, pairwise(values), strict=True)
+    return _joined((_applied(_COMPARE[type(op)], *pair) for op, pair in pairs), stop_at=False)
 
 
-def _holds(op: type[ast.cmpop], left: Any, right: Any) -> bool:
-    if left is None or right is None:
-        return (op is ast.NotEq) != (left is right and op is ast.Eq)
+def _known(value: Any) -> Any:
+    """Return the value, or None for NaN, which stands for "no number"."""
+    return None if isinstance(value, float) and isnan(value) else value
+
+
+def _truth(value: Any) -> bool | None:
+    return None if value is None else bool(value)
+
+
+def _joined(parts: Iterable[bool | None], stop_at: bool) -> bool | None:
+    """Return Kleene's `or` (`stop_at` True) or `and` (False) of `parts`."""
+    unknown = False
+    for part in parts:
+        if part is stop_at:
+            return stop_at
+        unknown |= part is None
+    return None if unknown else not stop_at
+
+
+def _applied(operation: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
+    """Return the operation's result; None if an operand is unknown or the operation has no result."""
+    if a is None or b is None:
+        return None
     try:
-        return bool(_COMPARE[op](left, right))
-    except TypeError:
-        return op is ast.NotEq
+        return _known(operation(a, b))
+    except (TypeError, ArithmeticError):
+        return None

@@ -10,6 +10,7 @@ from pathlib import Path
 from emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.expression import QUALITIES, Expression, NotUnderstood
+from fieldtwin.scenarios.invariants import Invariants, load_invariants
 from fieldtwin.scenarios.probe_form import Probe, read_probe
 from fieldtwin.scenarios.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
 from gateway.core.errors import FileInvalid, UsageError
@@ -19,7 +20,9 @@ from twin.fault_aims import target
 from twin.network import Network, load_network
 from twin.network_faults import check_network_fault
 from twin.system import System, load_system
+from twin.system_schema import InvariantsForm
 
+NONE_STATED = InvariantsForm()
 _TOGETHER = {
     "tag": ("tag", "value", "tolerance", "quality", "like", "within", "during"),
     "updates": ("tag", "quality", "updates_per_s", "during"),
@@ -53,6 +56,8 @@ class Scenario:
     """Of which `system` is the whole, if it is a network's scenario."""
     used: set[str] = field(default_factory=set, compare=False)
     """The tags and variables that it is about."""
+    invariants: Invariants = field(default_factory=Invariants)
+    """What the system file, or each system file of the network, says that holds in every scenario."""
 
     def line(self, *loc: Key) -> str:
         """FILE:LINE of a part of it."""
@@ -102,6 +107,14 @@ def names_of(system: System, network: Network | None = None) -> dict[str, tuple[
     return names
 
 
+def invariants_of(system: System, network: Network | None = None) -> Invariants:
+    """Return the invariants of a system, or of all systems of a network. Raises `FileInvalid`."""
+    if network is None:
+        return load_invariants(system, names_of(system)) if system.invariants != NONE_STATED else Invariants()
+    every = [load_invariants(m.system, names_of(m.system), f"{m.name}.") for m in network.members.values()]
+    return sum(every, Invariants())
+
+
 def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
     """Read and check. Raises `FileInvalid`, `UsageError`."""
     file = load(path)
@@ -129,6 +142,7 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
         probes,
         profiles,
         network,
+        invariants=invariants_of(system, network),
     )
     always = tuple(_looks(scenario, text, ("always", n)) for n, text in enumerate(form.always))
     never: list[Expression | WireForm] = []
@@ -143,6 +157,9 @@ def load_scenario(path: Path, profiles: tuple[Path, ...] = ()) -> Scenario:
             never.append(one)
     scenario = replace(scenario, always=always, never=tuple(never))
     _check_whole_run(scenario)
+    for n, tag in enumerate(form.refused):
+        _known(file, ("refused", n), "tag", tag, scenario.own)
+        scenario.used.add(tag)
     faults: list[str] = []
     for n, step in enumerate(form.steps):
         _check_step(scenario, step, n)
@@ -191,6 +208,8 @@ def _needs(file: YamlFile, form: ScenarioForm) -> tuple[Can, ...]:
     asked = [Can(need) for need in form.needs]
     if form.probes:
         asked.append(Can.PROBE)
+    if form.start is not None:
+        asked.append(Can.FRESH_START)
     if form.judge is not None:
         asked.append(Can.JUDGE_RUN)
     if any(isinstance(one, WireForm) for one in form.never) or any(one.wire is not None for one in form.rate):

@@ -9,7 +9,8 @@ Registers are written as the tags of a device profile (docs/files.md); they are 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -21,10 +22,12 @@ from gateway.core.profile import DeviceProfile, resolve
 from gateway.core.yaml_file import Key, Position, YamlFile
 
 MIN_EVERY_S = 0.01
+_VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 
 class ProbeForm(BaseModel):
-    """A probe. `endpoint`, or `serve`: what the system's own gateway serves under that name."""
+    """A probe. `endpoint`, in which ``${NAME}`` stands for a variable of the environment, or `serve`: what the system's own
+    gateway serves under that name."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -50,6 +53,22 @@ class Probe:
     unit: int
     every_s: float
     timeout_s: float
+    written: str = ""
+    """The endpoint as it is written, where it names variables of the environment: `at` says where it is then."""
+
+    def at(self, environ: Mapping[str, str]) -> Probe:
+        """The probe, its endpoint resolved. Raises `UsageError` for a variable that is not set, and for what is no endpoint."""
+        if not self.written:
+            return self
+        where = f"the probe {self.name!r}"
+        missing = [name for name in _VARIABLE.findall(self.written) if name not in environ]
+        if missing:
+            raise UsageError(
+                f"{where} names variables of the environment that are not set: {', '.join(missing)}",
+                hint="`fieldtwin test --with -- CMD` and `fieldtwin with` set those of the system's buses",
+            )
+        text = _VARIABLE.sub(lambda found: environ[found[1]], self.written)
+        return replace(self, endpoint=_modbus(Endpoint.parse(text), where), written="")
 
     @property
     def names(self) -> list[str]:
@@ -67,19 +86,29 @@ def read_probe(file: YamlFile, name: str, form: ProbeForm, served: list[str]) ->
         raise file.error(
             (*loc, "serve"), f"the system serves no {form.serve!r}", expected=", ".join(served) or "nothing"
         )
+    written = form.endpoint if form.endpoint is not None and _VARIABLE.search(form.endpoint) else ""
     try:
-        endpoint = Endpoint.parse(form.endpoint) if form.endpoint is not None else None
+        endpoint = None
+        if form.endpoint is not None and not written:
+            endpoint = _modbus(Endpoint.parse(form.endpoint), "")
     except UsageError as e:
         raise file.error((*loc, "endpoint"), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
     try:
         every_s, timeout_s = seconds(form.every), seconds(form.timeout)
     except UsageError as e:
         raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
-    if endpoint is not None and (endpoint.is_can or endpoint.scheme in ("pty", "udp")):
-        raise file.error((*loc, "endpoint"), "a probe asks over Modbus", expected="tcp://, rtu+tcp://, rtu: or ascii:")
     if every_s < MIN_EVERY_S or timeout_s <= 0:
         raise file.error(loc, "too often", expected=f"every {MIN_EVERY_S:g} s at most, and a timeout above 0")
-    return Probe(name, _profile(file, loc, name, form), endpoint, form.serve or "", form.unit, every_s, timeout_s)
+    profile = _profile(file, loc, name, form)
+    return Probe(name, profile, endpoint, form.serve or "", form.unit, every_s, timeout_s, written)
+
+
+def _modbus(endpoint: Endpoint, where: str) -> Endpoint:
+    if endpoint.is_can or endpoint.scheme in ("pty", "udp"):
+        raise UsageError(
+            "a probe asks over Modbus", where=where, expected="tcp://, rtu+tcp://, rtu: or ascii:", got=str(endpoint)
+        )
+    return endpoint
 
 
 def _profile(file: YamlFile, loc: tuple[Key, ...], name: str, form: ProbeForm) -> DeviceProfile:

@@ -6,34 +6,45 @@ its host's lateness makes worthless INCONCLUSIVE, and neither ever passes.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from emulators.faults.schema import seconds
 from fieldtwin.conformance.case import Danger
 from fieldtwin.decoding.decoder import Decoder
-from fieldtwin.decoding.exchange import SECRET, Exchange
-from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
+from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.report.model import CheckResult, ScenarioResult, Struck, Verdict
 from fieldtwin.scenarios.about import dangers, result_of
-from fieldtwin.scenarios.bench import Bench, Can
-from fieldtwin.scenarios.expectation import Watched, is_secret, judge_tag, judge_wire
+from fieldtwin.scenarios.bench import Bench, Can, NothingKnown
+from fieldtwin.scenarios.expectation import Watched, judge_tag, judge_wire, said
 from fieldtwin.scenarios.expression import Expression
 from fieldtwin.scenarios.form import Scenario, needs_of
+from fieldtwin.scenarios.invariants import Invariants
+from fieldtwin.scenarios.knowledge import Knowledge
+from fieldtwin.scenarios.last_exchanges import deciding, last_exchanges
+from fieldtwin.scenarios.lateness import Allowance, allowance
+from fieldtwin.scenarios.refused import RefusedOutputs
+from fieldtwin.scenarios.standing import Standing
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.whole_run import WholeRun
-from fieldtwin.scenarios.words import Expect, Step, WireForm, word_of
-from gateway.core.errors import UsageError
+from fieldtwin.scenarios.words import Expect, Step, word_of
+from gateway.core.errors import FieldtwinError, UsageError
 
 TICK_S = 0.02
 """How often is looked while something is waited for."""
-PENDING_S = 5.0
 RECENT_S = 2.0
 """How long ago the host's lateness may have been and still show in what is looked at now."""
+KNOWN_WITHIN_S = 5.0
+"""How long an expression may take to become known when a step begins to look at it: programs have not run yet at the start."""
 KEPT = 20_000
 LATE_SHARE = 0.1
 """A host that was late by more than this part of the time that a check is about has proved nothing."""
+NO_FRESH_START = (
+    "`start: fresh` begins PLC, simulation and devices anew, which is possible only where the devices are simulated "
+    "and the PLC is fieldtwin's"
+)
 _NS = 1_000_000_000
 
 
@@ -49,6 +60,30 @@ class _Broken(Exception):
     since_s: float | None = None
 
 
+class _RuleBroken(Exception):
+    """A rule of the whole run says no, during a step or after the last."""
+
+    def __init__(self, rule: CheckResult) -> None:
+        self.rule = rule
+
+
+def _wanted(what: str, within_s: float) -> str:
+    """Return what a step waits for, in words: ``ctd.pressure > 3 within 2 s``, or ``... now`` where it may take no time."""
+    return f"{what} within {within_s:g} s" if within_s else f"{what} now"
+
+
+def _too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> _Broken:
+    """A deadline that is over. Where the lateness of the host was waited for as well, the system is what failed."""
+    if allowed.exhausted:
+        return _Broken(
+            Verdict.INCONCLUSIVE, expected, f"{got}; this host was late by itself for more than {allowed.any_s:.3f} s"
+        )
+    if allowed.applies:
+        waited = f"; also not in {allowed.any_s:.3f} s more, by which this host was late" if allowed.any_s else ""
+        return _Broken(Verdict.FAILED, expected, got + waited)
+    return _Broken(Verdict.FAILED, expected, got, bound_s)
+
+
 def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Danger) -> str:
     """Why a target cannot do what the scenario is made of, or may not have it done to it; empty when all is well."""
     lacking = [need.value for need in scenario.needs if need not in can]
@@ -59,7 +94,8 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Dang
             if any(need.value in lacking for need in needs_of(step))
         ]
         said = f" (step{'s' if len(steps) > 1 else ''} {', '.join(steps[:5])})" if steps else ""
-        return f"the target {target} cannot {', '.join(lacking)}{said}"
+        why = f": {NO_FRESH_START}" if Can.FRESH_START.value in lacking else ""
+        return f"the target {target} cannot {', '.join(lacking)}{said}{why}"
     for danger, what in dangers(scenario):
         if danger.rank > allowed.rank:
             said = f"{what} is of the class {danger.value}, and the target {target} allows {allowed.value}"
@@ -67,45 +103,63 @@ def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Dang
     return ""
 
 
+def gone(error: FieldtwinError, t_ns: int) -> CheckResult:
+    """Return the check that a part of the system broke by failing with `error`, `t_ns` after the run's start."""
+    text, where = "every part of the system runs", getattr(error, "place", "")
+    return CheckResult("running", text, Verdict.ERROR, t_ns, t_ns, text, str(error), where=where)
+
+
+def fault_id(n: int, step: Step) -> str:
+    """Return the id of the fault that step `n` (from 0) puts in."""
+    assert step.fault is not None
+    return str(step.fault.get("id") or f"step {n + 1}")
+
+
+@dataclass(frozen=True)
+class ByChance:
+    """Random faults of a campaign, put in before the first step. The steps then only drive the system: what they expect is not
+    judged, and neither are rates and cycles. All other rules are judged until `until_s` at least, in seconds of the run."""
+
+    faults: tuple[dict[str, Any], ...]
+    until_s: float
+
+
 class Runner:
     """One scenario on one bench. ``await run()`` once."""
 
-    def __init__(self, scenario: Scenario, bench: Bench) -> None:
+    def __init__(self, scenario: Scenario, bench: Bench, by_chance: ByChance | None = None) -> None:
         self.scenario = scenario
         self.bench = bench
         self.results: list[CheckResult] = []
+        self.faults: list[Struck] = []
         self.exchanges: deque[Exchange] = deque(maxlen=KEPT)
         self._decoder = Decoder(scenario.system)
-        self._always = [
-            (f"always {n}", text, e, True) for n, (text, e) in _numbered(scenario.form.always, scenario.always)
-        ]
-        self._never = list(enumerate(scenario.never, 1))
         self._dropped = 0
-        self._judged: set[str] = set()
-        """What must always or never hold and of which everything was known at least once."""
+        self._remark = ""
+        """What the verdict of the current step is to be read with."""
         self._stimulus_s = 0.0
-        self._sent_s = -PENDING_S
-        self._watched: deque[Exchange] = deque()
-        self._excused: list[bool] = []
-        self._whole = WholeRun(scenario, bench, self._look)
+        self._by_chance = by_chance
+        self._knowledge = Knowledge(scenario.system, scenario.known, bench)
+        self._invariants = scenario.invariants if scenario.invariants.names <= set(bench.names()) else Invariants()
+        self._standing = Standing(scenario, bench, self._knowledge, self._invariants)
+        self._whole = WholeRun(scenario, bench, self._knowledge, self._invariants, by_chance=by_chance is not None)
+        self._refused = RefusedOutputs(scenario)
         bench.trace.listen(self._on_event)
+        for event in bench.trace.events:  # of the look when the bench opened, before the first step
+            if event.kind is Kind.REFUSED:
+                self._refused.hear(event)
 
     async def run(self) -> ScenarioResult:
-        """All steps. Never raises for what the system does; raises what a bench raises that is gone."""
-        scenario, form = self.scenario, self.scenario.form
+        """Run all steps and return the verdict. A part of the system that is gone makes it an ERROR with that reason."""
+        scenario = self.scenario
         refused = refusal(scenario, self.bench.target, self.bench.can, self.bench.allowed)
         verdict, reason = Verdict.PASSED, ""
         if refused:
             verdict, reason = Verdict.SKIPPED, refused
         else:
-            for n, step in enumerate(form.steps):
-                result = await self._step(n, step)
-                self.results.append(result)
-                if result.verdict is not Verdict.PASSED:
-                    verdict, reason = result.verdict, f"step {result.number}: {result.text}"
-                    break
-            if verdict is Verdict.PASSED:
-                verdict, reason = await self._hold_to_the_end()
+            verdict, reason = await self._judged()
+            if verdict is not Verdict.ERROR:  # else there may be nobody left to ask
+                verdict, reason = await self._count_faults(verdict, reason)
         return result_of(
             scenario,
             self.bench.target,
@@ -116,22 +170,98 @@ class Runner:
             trace=tuple(self.bench.trace.events),
             trace_hash=self.bench.trace.hexdigest(),
             dropped=self.bench.trace.dropped,
+            faults=tuple(self.faults),
+            evidence=self._evidence(verdict),
         )
+
+    def _evidence(self, verdict: Verdict) -> tuple[str, ...]:
+        """Return what was on the wire before the check that gave the scenario a `verdict` that is no pass."""
+        check = deciding(self.results, verdict)
+        if verdict in (Verdict.PASSED, Verdict.SKIPPED) or check is None:
+            return ()
+        if self.scenario.network is not None or Can.SEE_WIRE not in self.bench.can:  # no exchange was decoded
+            return ()
+        seen = [*self.exchanges, *self._decoder.pending()]
+        return tuple(last_exchanges(seen, check, self.scenario.system.devices))
+
+    async def _judged(self) -> tuple[Verdict, str]:
+        """Run the steps, then the whole-run rules to their end; return the verdict and its reason."""
+        try:
+            for fault in self._by_chance.faults if self._by_chance is not None else ():  # each knows its time
+                await self.bench.inject({**fault, "optional": True})
+            for n, step in enumerate(self.scenario.form.steps):
+                result = await self._step(n, step)
+                self.results.append(result)
+                if result.verdict is not Verdict.PASSED and not (self._by_chance and result.verdict is Verdict.SKIPPED):
+                    return result.verdict, f"step {result.number}: {result.text}"
+            if self._by_chance is not None:
+                await self._until(self._by_chance.until_s)
+            return await self._hold_to_the_end()
+        except _RuleBroken as broken:
+            self.results.append(broken.rule)
+            return broken.rule.verdict, f"{broken.rule.number}: {broken.rule.text}: {broken.rule.got}"
+        except NothingKnown as e:
+            self.results.append(replace(gone(e, self._now_ns()), verdict=Verdict.INCONCLUSIVE))
+            return Verdict.INCONCLUSIVE, str(e)
+        except FieldtwinError as e:  # the bench: a part of the system is gone
+            self.results.append(gone(e, self._now_ns()))
+            return Verdict.ERROR, str(e)
+
+    async def _count_faults(self, verdict: Verdict, reason: str) -> tuple[Verdict, str]:
+        """Ask how often each fault struck. A scenario that passed with a fault that never struck is INCONCLUSIVE."""
+        try:
+            struck = await self.bench.struck()
+            self.faults = [one for one in struck if not one.is_set]
+        except FieldtwinError as e:
+            self.results.append(gone(e, self._now_ns()))
+            return (Verdict.ERROR, str(e)) if verdict is Verdict.PASSED else (verdict, reason)
+        steps = {fault_id(n, step): n for n, step in enumerate(self.scenario.form.steps) if step.fault is not None}
+        for one in self.faults:
+            if one.struck or one.optional:
+                continue
+            where = self.scenario.line("steps", steps[one.id]) if one.id in steps else ""
+            text, now_ns = f"{one.name} strikes {one.on}", self._now_ns()
+            got = "never struck: nothing was tested with it; if it need not strike, say optional: true"
+            self.results.append(
+                CheckResult(
+                    f"fault {one.id}", text, Verdict.INCONCLUSIVE, now_ns, 0, text, got, where=where, vacuous=True
+                )
+            )
+            if verdict is Verdict.PASSED and self._by_chance is None:
+                verdict, reason = Verdict.INCONCLUSIVE, f"fault {one.id}: {text}: {got}"
+        effect = Counter[str]()
+        for one in struck:
+            if one.is_set:
+                effect[one.on] += one.struck
+        for tag in (tag for tag, times in effect.items() if not times):
+            text, now_ns = f"set: {tag} takes effect", self._now_ns()
+            got = "no effect: the device has not given the value away since it was set"
+            self.results.append(
+                CheckResult(f"set {tag}", text, Verdict.INCONCLUSIVE, now_ns, 0, text, got, vacuous=True)
+            )
+            if verdict is Verdict.PASSED and self._by_chance is None:
+                verdict, reason = Verdict.INCONCLUSIVE, f"{text}: {got}"
+        return verdict, reason
 
     # -- steps ----------------------------------------------------------------------------------------------------------
 
     async def _step(self, n: int, step: Step) -> CheckResult:
         word, since_s = word_of(step), self.bench.now_s()
-        text = f"{word}: {_said(getattr(step, word))}"
+        text = f"{word}: {said(getattr(step, word))}"
         self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text})
-        expected = got = ""
-        verdict = Verdict.PASSED
+        expected = got = self._remark = ""
+        verdict, rule = Verdict.PASSED, None
         try:
             self._look_at_all()
             await self._do(n, word, step)
             self._look_at_all()
         except _Broken as broken:
             verdict, expected, got = self._judged_on_time(broken, since_s)
+            if self._by_chance is not None:
+                verdict, got = Verdict.SKIPPED, f"not judged under random faults: {got}"
+        except _RuleBroken as broken_rule:
+            rule = broken_rule
+            verdict, got = Verdict.INCONCLUSIVE, f"not finished: {rule.rule.number} was broken first"
         except UsageError as e:
             verdict, got = Verdict.ERROR, str(e)
         result = CheckResult(
@@ -143,9 +273,13 @@ class Runner:
             expected,
             got,
             where=self.scenario.line("steps", n),
+            reason=self._remark,
             names=self._about(n, step),
         )
         self.bench.trace.note(self._now_ns(), Kind.STEP, str(n + 1), {"text": text, "verdict": verdict.value})
+        if rule is not None:
+            self.results.append(result)
+            raise rule
         return result
 
     def _about(self, n: int, step: Step) -> tuple[str, ...]:
@@ -171,13 +305,13 @@ class Runner:
         if word in ("send", "set", "fault", "clear"):
             self._stimulus_s = bench.now_s()
         if step.send is not None:
-            self._sent_s = bench.now_s()
+            self._knowledge.commanded()
             await bench.send(step.send.period_s)
         elif step.set is not None:
             device, _, tag = step.set.tag.rpartition(".")
             await bench.set_value(device, tag, step.set.value)
         elif step.fault is not None:
-            await bench.inject({"id": f"step {n + 1}", **step.fault})
+            await bench.inject({"id": fault_id(n, step), **step.fault})
         elif step.clear is not None:
             await bench.clear(step.clear)
         elif step.pause is not None:
@@ -189,14 +323,34 @@ class Runner:
             await self._expect(n, step.expect)
 
     async def _wait(self, expression: Expression, within_s: float) -> None:
-        deadline_s = self.bench.now_s() + within_s
-        while not expression.evaluate(self._look):
+        since_s = self.bench.now_s()
+        unknown_until_s = since_s
+        while (truth := expression.truth(self._knowledge.look)) is not True:
+            if truth is None:
+                unknown_until_s = self.bench.now_s()
+            allowed = allowance(self.bench, since_s, within_s, [expression])
+            deadline_s = since_s + (max(within_s, KNOWN_WITHIN_S) if truth is None else within_s) + allowed.any_s
             if self.bench.now_s() >= deadline_s:
-                got = self._seen_of(expression)
-                raise _Broken(
-                    Verdict.FAILED, f"{expression.text} within {within_s:g} s", got, self._bound(expression, within_s)
-                )
+                waited_s = self.bench.now_s() - since_s
+                unknown = f"unknown after {waited_s:g} s: " if truth is None else ""
+                got = unknown + self._knowledge.of_expression(expression)
+                raise _too_late(_wanted(expression.text, within_s), got, self._bound(expression, within_s), allowed)
             await self._tick(deadline_s)
+        if self.bench.now_s() - unknown_until_s > TICK_S:  # else it was in time as soon as it was known
+            self._met(_wanted(expression.text, within_s), since_s, within_s, [expression])
+
+    def _met(self, expected: str, since_s: float, within_s: float, expressions: Iterable[Expression] = ()) -> None:
+        """A check was met. After its own time that needs the lateness of this host as the reason."""
+        took_s = self.bench.now_s() - since_s
+        if not within_s or took_s <= within_s:
+            return
+        allowed = allowance(self.bench, since_s, within_s, expressions)
+        late = f"met after {took_s:.3f} s; this host was late by itself for {allowed.own_s:.3f} s"
+        if not allowed.in_time(took_s):
+            got = f"{late}, and {allowed.any_s:.3f} s of lateness were seen in all: host or system, nobody knows"
+            raise _Broken(Verdict.INCONCLUSIVE, expected, got)
+        if allowed.own_s:
+            self._remark = f"{late}, which was subtracted"
 
     async def _expect(self, n: int, expect: Expect) -> None:
         within_s = seconds(expect.within) if expect.within is not None else 0.0
@@ -217,15 +371,23 @@ class Runner:
             said = judge_wire(expect, watched)
             if said is not None:
                 raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
+            if not self._whole.requests[expect.wire]:  # too few is no evidence on a wire that nobody has seen working
+                got = f"no exchange with {expect.wire} was seen since the start"
+                raise _Broken(Verdict.INCONCLUSIVE, f"exchanges with {expect.wire}", got)
             return
         assert expect.tag is not None
         if expect.updates_per_s is not None:
             await self._until(self.bench.now_s() + max(during_s, 1.0))
-        deadline_s = self.bench.now_s() + within_s
+        since_s = self.bench.now_s()
         while (said := await judge_tag(expect, watched)) is not None:
-            if self.bench.now_s() >= deadline_s or expect.updates_per_s is not None:
+            if expect.updates_per_s is not None:
                 raise _Broken(Verdict.FAILED, *said, max(within_s, during_s))
+            allowed = allowance(self.bench, since_s, within_s)
+            deadline_s = since_s + within_s + allowed.any_s
+            if self.bench.now_s() >= deadline_s:
+                raise _too_late(*said, max(within_s, during_s), allowed)
             await self._tick(deadline_s)
+        self._met(_wanted(expect.tag, within_s), since_s, within_s)
         if expect.updates_per_s is None:
             end_s = self.bench.now_s() + during_s
             while self.bench.now_s() < end_s:  # and it stays so
@@ -238,8 +400,8 @@ class Runner:
         end_s = self.bench.now_s() + during_s
         while self.bench.now_s() < end_s:
             await self._tick(end_s)
-            if not expression.evaluate(self._look):
-                got = self._seen_of(expression)
+            if (truth := expression.truth(self._knowledge.look)) is not True:
+                got = ("unknown: " if truth is None else "") + self._knowledge.of_expression(expression)
                 raise _Broken(
                     Verdict.FAILED, f"{expression.text} for {during_s:g} s", got, self._bound(expression, during_s)
                 )
@@ -271,99 +433,51 @@ class Runner:
         self._look_at_all()
 
     def _look_at_all(self) -> None:
-        """What must always and never hold, now. Raises `_Broken`."""
-        for number, text, expression, _ in self._always:
-            if not self._is_known(number, expression):
-                continue
-            if not expression.evaluate(self._look):
-                seen, bound_s = self._seen_of(expression), self._bound(expression)
-                raise _Broken(
-                    self._of_lateness(expression.asks_lateness), f"{number}: {text}", seen, bound_s, self._recently()
-                )
-        for n, one in self._never:
-            if not isinstance(one, Expression) or not self._is_known(f"never {n}", one):
-                continue
-            if one.evaluate(self._look):
-                seen, bound_s = self._seen_of(one), self._bound(one)
-                raise _Broken(
-                    self._of_lateness(one.asks_lateness), f"never {n}: {one.text}", seen, bound_s, self._recently()
-                )
-        if (said := self._whole.look()) is not None:
-            verdict = self._of_lateness("plc.late" in said.names)
-            since_s = self.bench.now_s() - said.bound_s - RECENT_S
-            got = "; ".join([said.got, *([self._seen(names)] if (names := self._readable(said.names)) else [])])
-            raise _Broken(verdict, f"{said.number}: {said.expected}", got, said.bound_s, since_s)
-        excused = [self._is_excused(one) for _, one in self._never]
-        while self._watched:
-            exchange = self._watched.popleft()
-            for (n, one), now, before in zip(self._never, excused, self._excused or excused, strict=True):
-                if isinstance(one, WireForm) and not (now or before) and self._forbidden(one, exchange):
-                    raise _Broken(Verdict.FAILED, f"never {n}: {_said(one)}", exchange.text)
-        self._excused = excused
-
-    def _is_known(self, number: str, expression: Expression) -> bool:
-        """Whether all that it names is known, or was before: from then on it is judged."""
-        if number not in self._judged and any(self.bench.reading(name) is None for name in expression.names):
-            return False
-        self._judged.add(number)
-        return True
+        """Look at the rules of the whole run. Raises `_RuleBroken`."""
+        said = self._standing.look() or self._refused.look() or self._whole.look()
+        if said is None:
+            return
+        verdict = Verdict.INCONCLUSIVE if said.nobody_knows else self._of_lateness(said.asks_lateness)
+        since_s = self.bench.now_s() - said.bound_s - RECENT_S
+        broken = _Broken(verdict, said.expected, said.got, said.bound_s, since_s)
+        verdict, expected, got = self._judged_on_time(broken, since_s)
+        since_ns, now_ns = round(said.since_s * _NS), self._now_ns()
+        raise _RuleBroken(
+            CheckResult(
+                said.number,
+                said.expected,
+                verdict,
+                now_ns,
+                min(since_ns, now_ns),
+                expected,
+                got,
+                where=said.where,
+                names=said.names,
+            )
+        )
 
     def _of_lateness(self, asked: bool) -> Verdict:
         """The verdict on a check that asks how late scans are: a plant answers for it, a host that plays one does not."""
         ours = asked and Can.EXACT_TIME not in self.bench.can and self.bench.target != "real"
         return Verdict.INCONCLUSIVE if ours else Verdict.FAILED
 
-    def _recently(self) -> float:
-        return self.bench.now_s() - RECENT_S
-
-    def _is_excused(self, one: Expression | WireForm) -> bool:
-        """Whether `unless` holds: what was seen since the last look may be older than this moment."""
-        if not isinstance(one, WireForm) or one.unless is None:
-            return False
-        return bool(self.scenario.expression(one.unless, "never").evaluate(self._look))
-
-    def _forbidden(self, form: WireForm, exchange: Exchange) -> bool:
-        if exchange.device != form.wire or (form.function is not None and exchange.function != form.function):
-            return False
-        if form.access is not None and form.access not in exchange.access:
-            return False
-        if form.register_ is not None and form.register_ not in exchange.tags:
-            return False
-        return form.value is None or exchange.tags.get(form.register_ or "") == form.value
-
     async def _hold_to_the_end(self) -> tuple[Verdict, str]:
-        """What held all the time is said so, once; what could never be judged makes the scenario inconclusive."""
-        since_s = self.bench.now_s()
-        try:
-            while self._whole.pending_until_s:
-                await self._tick(self._whole.pending_until_s)
-        except _Broken as broken:
-            verdict, expected, got = self._judged_on_time(broken, since_s)
-            number = expected.partition(":")[0]
-            now_ns = self._now_ns()
-            self.results.append(CheckResult(number, expected, verdict, now_ns, round(since_s * _NS), expected, got))
-            return verdict, f"{expected}: {got}"
+        """Add a result for each rule of the whole run. A rule that could not be judged makes the scenario INCONCLUSIVE."""
+        while self._whole.pending_until_s:
+            await self._tick(self._whole.pending_until_s)
         now_ns, verdict, reason = self._now_ns(), Verdict.PASSED, ""
-        for number, text, expression, _ in self._always:
-            found = Verdict.PASSED if number in self._judged else Verdict.INCONCLUSIVE
-            if found is not Verdict.PASSED:
-                verdict, reason = found, f"{number}: nothing was ever known of {', '.join(expression.names)}"
-            self.results.append(CheckResult(number, text, found, now_ns, 0, names=tuple(expression.names)))
-        for n, one in self._never:
-            number = f"never {n}"
-            if isinstance(one, Expression):
-                text, known, about = one.text, number in self._judged, ", ".join(one.names)
-            else:
-                text, known, about = _said(one), self._whole.requests[one.wire] > 0, f"the wire of {one.wire}"
-            found = Verdict.PASSED if known else Verdict.INCONCLUSIVE
-            if not known:
-                verdict, reason = found, f"{number}: nothing was ever known of {about}"
-            self.results.append(CheckResult(number, text, found, now_ns, 0))
-        for number, text, seen, known in self._whole.summary():
-            found = Verdict.PASSED if known else Verdict.INCONCLUSIVE
-            if not known:
-                verdict, reason = found, f"{number}: {text}: nothing was there to judge"
-            self.results.append(CheckResult(number, text, found, now_ns, 0, got=seen))
+        standing = self._standing.results(now_ns, self._whole.requests)
+        for rule in (*standing, *self._refused.results(now_ns), *self._whole.results(now_ns)):
+            self.results.append(rule)
+            if rule.vacuous and self._by_chance is not None:  # the campaign asks whether any of its seeds judged it
+                continue
+            if rule.verdict is not Verdict.PASSED and verdict is not Verdict.FAILED:
+                verdict, reason = rule.verdict, f"{rule.number}: {rule.text}: {rule.got}"
+        if self.scenario.invariants and not self._invariants:
+            got = "not judged: the controller is another program, so nothing is published that they look at"
+            self.results.append(
+                CheckResult("invariants", "those of the system file", Verdict.SKIPPED, now_ns, 0, got=got)
+            )
         if verdict is Verdict.PASSED and not self._judges():
             return Verdict.INCONCLUSIVE, "it expects nothing: no expect, no wait, nothing that always or never holds"
         return verdict, reason
@@ -371,63 +485,21 @@ class Runner:
     def _judges(self) -> bool:
         """Whether anything in it could have failed."""
         form = self.scenario.form
-        whole = (form.always, form.never, form.within, form.rate, form.cycle, form.judge)
+        if self._invariants:
+            return True
+        whole = (form.always, form.never, form.within, form.rate, form.cycle, form.judge, form.stopped, form.refused)
         return any(whole) or any(step.expect is not None or step.wait is not None for step in form.steps)
 
     def _on_event(self, event: Event) -> None:
+        self._knowledge.hear(event)
         self._whole.hear(event)
+        self._refused.hear(event)
         if event.kind is Kind.FRAME:
             for exchange in self._decoder.feed(event):
-                self._whole.requests[exchange.device] += 1
+                self._whole.requests[exchange.device] += not exchange.is_stray
                 self._dropped += len(self.exchanges) == KEPT
                 self.exchanges.append(exchange)
-                if any(isinstance(one, WireForm) for _, one in self._never):
-                    self._watched.append(exchange)
-
-    # -- what is known ----------------------------------------------------------------------------------------------------
+                self._standing.saw(exchange)
 
     def _now_ns(self) -> int:
         return round(self.bench.now_s() * _NS)
-
-    def _look(self, function: str, name: str) -> Any:
-        if name == "plc.late":
-            return self.bench.late_ms() / 1000
-        if name == "command_pending":
-            return self.bench.now_s() - self._sent_s <= PENDING_S
-        reading = self.bench.reading(name)
-        if reading is None:
-            return {"quality": "bad", "reason": "never read", "updates": 0}.get(function)
-        if function == "age":
-            return reading.age_s
-        return getattr(reading, function)
-
-    def _seen_of(self, expression: Expression) -> str:
-        late = [f"scans up to {self.bench.late_ms():.3g} ms late"] if expression.asks_lateness else []
-        return "; ".join([*late, *([self._seen(expression.names)] if expression.names else [])])
-
-    def _readable(self, names: Iterable[str]) -> list[str]:
-        """Those that have a value: no device, nor ``plc.late``."""
-        return [name for name in names if name in self.scenario.known]
-
-    def _seen(self, names: Iterable[str]) -> str:
-        told = []
-        for name in dict.fromkeys(names):
-            reading, shown = self.bench.reading(name), "never published"
-            if reading is not None:
-                value = SECRET if is_secret(self.scenario.system, name) else repr(reading.value)
-                shown = f"{value} {reading.quality}, {reading.age_s:.3f} s old"
-            told.append(f"{name}: {shown}")
-        return "; ".join(told)
-
-
-def _numbered(texts: list[str], expressions: tuple[Expression, ...]) -> Iterable[tuple[int, tuple[str, Expression]]]:
-    return enumerate(zip(texts, expressions, strict=True), 1)
-
-
-def _said(part: Any) -> str:
-    """A step's own words."""
-    if hasattr(part, "model_dump"):
-        part = part.model_dump(exclude_none=True, exclude_defaults=True, by_alias=True)
-    if isinstance(part, dict):
-        return ", ".join(f"{key} {_said(value)}" for key, value in part.items())
-    return str(part)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -32,6 +32,8 @@ class Kind(Enum):
     STATE   PROGRAM.VARIABLE  ``value``: an output or local of a program that changed
     FAULT   a fault's id    ``name``, ``on`` true | false, ``target``; ``said``, as a fault file has it, while on
     STEP    a step's number ``text``, ``verdict`` once it has one
+    REFUSED  DEVICE.TAG     a write that did not reach its device: ``value``, ``cause``, ``reason``, ``by``, ``program``,
+                            ``place`` (FILE:LINE of the program), ``fault`` program | device | "" (by design, or tried again)
     NOTE    who says it     ``text``; of the far end (`FAR_END`) ``period_s``, when it commands one
     """
 
@@ -40,6 +42,7 @@ class Kind(Enum):
     STATE = "state"
     FAULT = "fault"
     STEP = "step"
+    REFUSED = "refused"
     NOTE = "note"
 
 
@@ -133,6 +136,30 @@ class Trace:
         finally:
             self._sink.close()
             self._sink = None
+
+
+REFUSAL_KEYS = ("value", "cause", "reason", "by", "program", "place", "fault")
+"""What an event of the kind REFUSED holds, of an entry of the gateway's journal (`gateway.runtime.refusals.Refusal`)."""
+
+
+def refusal_data(described: Mapping[str, Any]) -> dict[str, Any]:
+    """The data of a REFUSED event from an entry of the journal as plain data. Its value is that of the entry's first refusal."""
+    return {key: described["first" if key == "value" else key] for key in REFUSAL_KEYS}
+
+
+def refusal_text(where: str, data: Mapping[str, Any]) -> str:
+    """A REFUSED event, or an entry of the journal, in one line: tag, value, who asked, reason, line of the program."""
+    by = "" if data.get("by") == "plc" else f" (asked by {data.get('by')})"
+    at = ", ".join(part for part in (data.get("program"), data.get("place")) if part)
+    said = (
+        f"{where} = {_shown(data.get('first', data.get('value')))} did not reach the device{by}: {data.get('reason')}"
+    )
+    times = f"; {data['count']} times" if data.get("count", 1) > 1 else ""
+    return f"{said}{times}" + (f" ({at})" if at else "")
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def read_trace(lines: list[bytes]) -> list[Event]:

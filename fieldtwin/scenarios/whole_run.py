@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from emulators.faults.schema import seconds
+from fieldtwin.report.model import CheckResult, Verdict
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.expectation import bounds_text, inside
 from fieldtwin.scenarios.expression import Expression, Look
 from fieldtwin.scenarios.form import Scenario
+from fieldtwin.scenarios.invariants import Followed, Invariants
+from fieldtwin.scenarios.knowledge import Knowledge
+from fieldtwin.scenarios.lateness import allowance
 from fieldtwin.scenarios.trace import Event, Kind
+from fieldtwin.scenarios.violation import Violation
 from fieldtwin.scenarios.words import Cycle, Rate
 
 SAMPLES = 500
@@ -24,42 +29,43 @@ SAMPLES = 500
 _NS = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class Violation:
-    """What did not hold. `bound_s` is the time that it is about: a host that is later than a part of it proves nothing."""
-
-    number: str
-    expected: str
-    got: str
-    names: tuple[str, ...]
-    bound_s: float
-
-
 class WholeRun:
-    """All of them, of one scenario. `look()` returns the first that is broken now; `summary()` tells what held."""
+    """All of them, of one scenario. `look` returns the first that is broken now; `results` is asked once, at the end."""
 
-    def __init__(self, scenario: Scenario, bench: Bench, look: Look) -> None:
+    def __init__(
+        self, scenario: Scenario, bench: Bench, knowledge: Knowledge, invariants: Invariants, *, by_chance: bool = False
+    ) -> None:
         form = scenario.form
         self.requests: Counter[str] = Counter()
         """Exchanges by device, as the runner counts them."""
         self.withins = [
-            _Within(
+            WithinRule(
                 f"within {n}",
+                scenario.line("within", n - 1),
                 scenario.expression(one.after, "within", n - 1, "after"),
                 scenario.expression(one.then, "within", n - 1, "then"),
                 seconds(one.within),
             )
             for n, one in enumerate(form.within, 1)
-        ]
+        ] + [within_rule(followed) for followed in invariants.followed]
         self._rates = [
-            _Rate(f"rate {n}", one, seconds(one.over), _condition(scenario, one, "rate", n - 1))
+            _Rate(
+                f"rate {n}",
+                scenario.line("rate", n - 1),
+                one,
+                seconds(one.over),
+                _condition(scenario, one, "rate", n - 1),
+            )
             for n, one in enumerate(form.rate, 1)
         ]
         self._cycles = [
-            _Cycle(f"cycle {n}", one, _condition(scenario, one, "cycle", n - 1)) for n, one in enumerate(form.cycle, 1)
+            _Cycle(f"cycle {n}", scenario.line("cycle", n - 1), one, _condition(scenario, one, "cycle", n - 1))
+            for n, one in enumerate(form.cycle, 1)
         ]
+        if by_chance:  # of a system that is disturbed at random
+            self._rates, self._cycles = [], []
         self._bench = bench
-        self._look = look
+        self._knowledge = knowledge
 
     def hear(self, event: Event) -> None:
         """An event of the trace."""
@@ -72,15 +78,21 @@ class WholeRun:
         return max((one.due_s for one in self.withins if one.due_s is not None), default=0.0)
 
     def look(self) -> Violation | None:
-        now_s = self._bench.now_s()
+        """Return the first rule that is broken now."""
+        said = self._first_broken(self._bench.now_s(), self._knowledge.look)
+        if said is None or not (known := self._knowledge.of(said.names)):
+            return said
+        return replace(said, got=f"{said.got}; {known}")
+
+    def _first_broken(self, now_s: float, look: Look) -> Violation | None:
         for within in self.withins:
-            if (said := within.look(now_s, self._look)) is not None:
+            if (said := within.look(now_s, look, self._bench)) is not None:
                 return said
         for rate in self._rates:
-            if (said := rate.look(now_s, self._look, self._count(rate.form))) is not None:
+            if (said := rate.look(now_s, look, self._count(rate.form))) is not None:
                 return said
         for cycle in self._cycles:
-            if (said := cycle.look(now_s, self._look, self._bench)) is not None:
+            if (said := cycle.look(now_s, look, self._bench)) is not None:
                 return said
         return None
 
@@ -90,62 +102,124 @@ class WholeRun:
         reading = self._bench.reading(form.tag or "")
         return reading.updates if reading is not None else 0
 
-    def summary(self) -> Iterator[tuple[str, str, str, bool]]:
-        """(number, text, what was seen, whether anything was) of each."""
-        for within in self.withins:
-            yield within.number, within.text, f"{within.times} times", within.times > 0
-        for rate in self._rates:
-            yield rate.number, rate.text, f"{rate.judged} looks", rate.judged > 0
-        for cycle in self._cycles:
-            yield cycle.number, cycle.text, f"{cycle.judged} looks", cycle.judged > 0
+    def results(self, now_ns: int) -> Iterator[CheckResult]:
+        """Yield a result for each rule, in the order of the file. A rule that judged nothing is INCONCLUSIVE."""
+        rules: list[WithinRule | _Rate | _Cycle] = [*self.withins, *self._rates, *self._cycles]
+        for rule in rules:
+            got, known = rule.summary()
+            verdict, vacuous = Verdict.PASSED if known else Verdict.INCONCLUSIVE, False
+            if isinstance(rule, WithinRule):
+                vacuous = rule.never_came
+                if (
+                    vacuous and rule.invariant and rule.known
+                ):  # it stands for every run, and most do not see its occasion
+                    verdict = Verdict.PASSED
+            yield CheckResult(
+                rule.number, rule.text, verdict, now_ns, 0, got=got, where=rule.where, names=rule.names, vacuous=vacuous
+            )
 
 
 def _condition(scenario: Scenario, form: Rate | Cycle, word: str, n: int) -> Expression | None:
     return scenario.expression(form.while_, word, n, "while") if form.while_ is not None else None
 
 
+def within_rule(followed: Followed) -> WithinRule:
+    """Return the rule of an invariant of the system file."""
+    return WithinRule(followed.number, followed.where, followed.after, followed.then, followed.limit_s, invariant=True)
+
+
 @dataclass
-class _Within:
-    """`then` within `limit_s` of each time that `after` becomes true."""
+class WithinRule:
+    """`then` within `limit_s` of each time that `after` becomes true.
+
+    `then` must be seen to be true in time: unknown is not enough. If `after` was unknown for a while after it was known, an
+    occasion may have been missed, and the rule is INCONCLUSIVE.
+    """
 
     number: str
+    where: str
     after: Expression
     then: Expression
     limit_s: float
+    invariant: bool = False
+    """Whether it stands in the system file."""
     times: int = 0
     due_s: float | None = None
-    _was: bool = False
+    _before: bool | None = None
     _since_s: float = 0.0
+    _known: bool = False
+    _unknown_s: float | None = None
+
+    @property
+    def never_came(self) -> bool:
+        """Whether `after` never became true, and was not unknown after it was known."""
+        return not self.times and self._unknown_s is None
+
+    @property
+    def known(self) -> bool:
+        """Whether `after` was ever known."""
+        return self._known
 
     @property
     def text(self) -> str:
         return f"{self.then.text} within {self.limit_s:g} s after {self.after.text}"
 
-    def look(self, now_s: float, look: Look) -> Violation | None:
-        is_so = bool(self.after.evaluate(look))
-        if is_so and not self._was and self.due_s is None:
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*self.after.names, *self.then.names)
+
+    def look(self, now_s: float, look: Look, bench: Bench) -> Violation | None:
+        truth = self.after.truth(look)
+        self._known |= truth is not None
+        if self._known and truth is None and self._unknown_s is None:
+            self._unknown_s = now_s
+        if truth and not self._before and self.due_s is None:
             self.times += 1
             self._since_s, self.due_s = now_s, now_s + self.limit_s
-        self._was = is_so
+        self._before = truth
         if self.due_s is None:
             return None
-        if self.then.evaluate(look):
+        then = self.then.truth(look)
+        allowed = allowance(bench, self._since_s, self.limit_s, (self.after, self.then))
+        self.due_s = self._since_s + self.limit_s + allowed.any_s
+        if then:
             self.due_s = None
+            if not allowed.in_time(now_s - self._since_s):
+                got = (
+                    f"so {now_s - self._since_s:.3f} s after it; this host was late by itself for {allowed.own_s:.3f} s"
+                )
+                return Violation(
+                    self.number, self.text, got, self.names, self.limit_s, self._since_s, self.where, nobody_knows=True
+                )
         elif now_s >= self.due_s:
-            got = f"that was at {self._since_s:.3f} s, and not so until {now_s:.3f} s"
-            return Violation(self.number, self.text, got, (*self.after.names, *self.then.names), self.limit_s)
+            so = "and unknown at" if then is None else "and not so until"
+            got = f"that was at {self._since_s:.3f} s, {so} {now_s:.3f} s"
+            bound_s = 0.0 if allowed.applies and not allowed.exhausted else self.limit_s
+            if allowed.any_s:
+                got += f", {allowed.any_s:.3f} s of that for the lateness of this host"
+            return Violation(self.number, self.text, got, self.names, bound_s, self._since_s, self.where)
         return None
+
+    def summary(self) -> tuple[str, bool]:
+        """Return what was seen, and whether the rule was judged."""
+        seen = f"{self.times} times" if self.times else "0 times: nothing was there to judge"
+        if self._unknown_s is not None:
+            return f"{seen}; whether {self.after.text} was unknown from {self._unknown_s:.3f} s on for a while", False
+        return seen, self.times > 0
 
 
 @dataclass
 class _Rate:
-    """So often a second, in every stretch of `over_s` in which the condition held all the time."""
+    """So often a second, in every stretch of `over_s` in which the condition was true all the time."""
 
     number: str
+    where: str
     form: Rate
     over_s: float
     condition: Expression | None
     judged: int = 0
+    seen: bool = False
+    """Whether the tag was ever published, or the device ever asked: else a rate of 0 is no evidence."""
     _samples: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=SAMPLES * 2))
 
     @property
@@ -158,7 +232,8 @@ class _Rate:
         return self.form.updates_per_s or self.form.requests_per_s
 
     def look(self, now_s: float, look: Look, count: int) -> Violation | None:
-        if self.condition is not None and not self.condition.evaluate(look):
+        self.seen |= count > 0
+        if self.condition is not None and self.condition.truth(look) is not True:
             self._samples.clear()
             return None
         samples = self._samples
@@ -173,16 +248,29 @@ class _Rate:
         rate = (count - before) / (now_s - since_s)
         if inside(rate, self._bounds):
             return None
-        name = self.form.tag or self.form.wire or ""
         got = f"{rate:.3g}/s: {count - before} from {since_s:.3f} s to {now_s:.3f} s"
-        return Violation(self.number, self.text, got, (name,), self.over_s)
+        return Violation(self.number, self.text, got, self.names, self.over_s, since_s, self.where)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.form.tag or self.form.wire or "",)
+
+    def summary(self) -> tuple[str, bool]:
+        """Return what was seen, and whether the rule was judged."""
+        if not self.judged:
+            return "0 looks: nothing was there to judge", False
+        if not self.seen:
+            what = "was never published" if self.form.tag else "was never asked"
+            return f"{self.judged} looks, but {self.names[0]} {what}", False
+        return f"{self.judged} looks", True
 
 
 class _Cycle:
     """Changes of a name so far apart; or scans so late at most."""
 
-    def __init__(self, number: str, form: Cycle, condition: Expression | None) -> None:
+    def __init__(self, number: str, where: str, form: Cycle, condition: Expression | None) -> None:
         self.number = number
+        self.where = where
         self.form = form
         self.judged = 0
         self._condition = condition
@@ -191,6 +279,8 @@ class _Cycle:
         self._late_s = seconds(form.late) if form.late is not None else None
         self._value: Any = None
         self._last_s: float | None = None
+        self._read = False
+        """Whether the name is a tag that was read from its device."""
         self._between: deque[tuple[float, float]] = deque(maxlen=10_000)
 
     @property
@@ -204,7 +294,15 @@ class _Cycle:
     def hear(self, event: Event) -> None:
         if event.where != self.form.changes_of or event.kind not in (Kind.TAG, Kind.STATE):
             return
+        if event.kind is Kind.TAG and not self._read:  # what is read counts from now on, not what a program commands
+            self._read, self._value, self._last_s = True, None, None
+            self._between.clear()
+        elif event.kind is Kind.STATE and self._read:
+            return
         value = event.data.get("value")
+        if value is None or value != value:  # unknown: a gap, and no change
+            self._value = self._last_s = None
+            return
         if value == self._value:
             return
         known, self._value = self._value is not None, value
@@ -214,18 +312,16 @@ class _Cycle:
         self._last_s = at_s if known else None
 
     def look(self, now_s: float, look: Look, bench: Bench) -> Violation | None:
-        if self._condition is not None and not self._condition.evaluate(look):
+        if self._condition is not None and self._condition.truth(look) is not True:
             self._last_s = None
             self._between.clear()
             return None
         if self._late_s is not None:
             self.judged += 1
             late_s = bench.late_ms() / 1000
-            return (
-                None
-                if late_s <= self._late_s
-                else self._said(f"{late_s * 1000:g} ms late at {now_s:.3f} s", ("plc.late",))
-            )
+            if late_s <= self._late_s:
+                return None
+            return self._broken(f"{late_s * 1000:g} ms late at {now_s:.3f} s", now_s)
         while self._between:
             since_s, at_s = self._between.popleft()
             self.judged += 1
@@ -233,11 +329,21 @@ class _Cycle:
             if (self._min_s is not None and apart_s < self._min_s) or (
                 self._max_s is not None and apart_s > self._max_s
             ):
-                return self._said(f"{apart_s:.3f} s, from {since_s:.3f} s to {at_s:.3f} s")
+                return self._broken(f"{apart_s:.3f} s, from {since_s:.3f} s to {at_s:.3f} s", since_s)
         if self._max_s is not None and self._last_s is not None and now_s - self._last_s > self._max_s:
-            return self._said(f"none from {self._last_s:.3f} s to {now_s:.3f} s")
+            return self._broken(f"none from {self._last_s:.3f} s to {now_s:.3f} s", self._last_s)
         return None
 
-    def _said(self, got: str, names: tuple[str, ...] = ()) -> Violation:
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ("plc.late",) if self.form.changes_of is None else (self.form.changes_of,)
+
+    def _broken(self, got: str, since_s: float) -> Violation:
         bound_s = self._late_s or self._max_s or self._min_s or 0.0
-        return Violation(self.number, self.text, got, names or (self.form.changes_of or "",), bound_s)
+        late = self._late_s is not None
+        return Violation(self.number, self.text, got, self.names, bound_s, since_s, self.where, asks_lateness=late)
+
+    def summary(self) -> tuple[str, bool]:
+        """Return what was seen, and whether the rule was judged."""
+        unit = "looks" if self._late_s is not None else "changes"
+        return f"{self.judged} {unit}{'' if self.judged else ': nothing was there to judge'}", self.judged > 0

@@ -119,12 +119,19 @@ class ScenarioForm(_Form):
     system: str
     prototype: str | None = None
     seed: int | None = None
+    start: Literal["fresh"] | None = None
+    """PLC, simulations and devices begin anew first, on every target."""
     needs: list[str] = []
+    stopped: list[Literal["plc"]] = []
+    """Parts of the system that stop in this scenario. Without it a part that stops fails the scenario; with it, a part that does
+    not stop."""
     always: list[str] = []
     never: list[str | WireForm] = []
     within: list[Within] = []
     rate: list[Rate] = []
     cycle: list[Cycle] = []
+    refused: list[str] = []
+    """Tags whose outputs are expected to be refused, each at least once. Any other refused output fails the scenario."""
     judge: Literal["run"] | None = None
     """Besides, by what a run in virtual time is judged by."""
     probes: dict[str, ProbeForm] = {}

@@ -88,6 +88,8 @@ class Service:
                 self.url = await self._server.open(*parse_place(self._options.metrics))
             if self._log is not None:
                 self._log.write(self._started())
+                for warning in self._session.system.warnings:
+                    self._log.write(Event(Priority.WARNING, "system_file", warning))
                 self._nursery.start(self._tell(), "events")
             self._nursery.start(self._reload(), "reload")
             if self._notifier.wanted:

@@ -43,6 +43,7 @@ def changes(before: Snapshot | None, now: Snapshot) -> list[Event]:
         *_plc(before.plc if before else None, now.plc),
         *_reloaded(before.gateway if before else None, now.gateway),
         *_thread(before.thread if before else None, now.thread),
+        *_refused(before.gateway if before else None, now.gateway),
         *_dropped(before.gateway if before else None, now.gateway),
     ]
 
@@ -95,11 +96,13 @@ def _devices(before: Mapping[str, Status], now: Mapping[str, Status]) -> list[Ev
 def _plc(before: Status | None, now: Status | None) -> list[Event]:
     if now is None:
         return []
-    was = (before or {}).get("state")
-    if now["state"] == was:
+    was, waiting = before or {}, now.get("waiting", {})
+    if now["state"] == was.get("state") and now["error"] == was.get("error"):
         return []
-    priority = Priority.NOTICE if now["state"] == "running" else Priority.ERROR
-    text = f"PLC: {now['state']}" + (f": {now['error']}" if now["error"] else "")
+    healthy = now["state"] == "running" or (now["state"] == "waiting" and not now["error"])
+    priority = Priority.NOTICE if healthy else Priority.ERROR
+    why = now["error"] or "; ".join(f"program {program} for {start['reason']}" for program, start in waiting.items())
+    text = f"PLC: {now['state']}" + (f": {why}" if why else "")
     return [Event(priority, "plc_state", text, {"state": now["state"], "error": now["error"]})]
 
 
@@ -119,6 +122,19 @@ def _thread(before: Status | None, now: Status | None) -> list[Event]:
         if now is not None and text != was:
             priority = Priority.WARNING if text else Priority.NOTICE
             found.append(Event(priority, f"thread_{key}", f"{what}: {text or 'all is well again'}", {"error": text}))
+    return found
+
+
+def _refused(before: Status | None, now: Status | None) -> list[Event]:
+    """Writes that did not reach their device. A value is not among the fields, as nowhere here."""
+    last = max((e["number"] for e in (before or {}).get("refusals", {}).get("entries", [])), default=0)
+    found = []
+    for entry in (now or {}).get("refusals", {}).get("entries", []):
+        if entry["number"] > last:
+            priority = Priority.WARNING if entry["fault"] else Priority.NOTICE
+            named = {"tag": entry["tag"], "cause": entry["cause"], "by": entry["by"], "place": entry["place"]}
+            text = f"{entry['tag']}: a write did not reach the device ({entry['cause']})"
+            found.append(Event(priority, "output_refused", text, named))
     return found
 
 

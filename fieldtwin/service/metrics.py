@@ -216,6 +216,9 @@ def _plc(page: Page, plc: Status) -> None:
     running = page.gauge("plc_running", "Whether a task runs; 0 is stopped or failed.")
     for task, status in tasks.items():
         running.add(int(status["state"] == "running"), task=task)
+    page.gauge("plc_programs_waiting", "Programs that wait for their inputs and have not started.").add(
+        len(plc.get("waiting", {}))
+    )
     page.counter("plc_restarts", "Restarts of the PLC's program after a failure.").add(plc["restarts"])
     page.gauge("plc_forces", "Variables that are forced.").add(len(plc["forces"]))
     counted = page.counter("plc_events", "What the PLC counted of its image and its messages, by event.")

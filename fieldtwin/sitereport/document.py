@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 Kind = Literal["check", "dump", "comparison", "difference"]
-Weight = Literal["deviation", "waived", "open"]
-"""A deviation is to be accepted or mended; a waived one somebody answers for; an open point could not be told."""
+Weight = Literal["deviation", "robustness", "field problem", "open", "waived"]
+"""A deviation contradicts the standard or the reference; the operator accepts it or has it corrected. No clause
+requires what a robustness finding or a known field problem is about. An open point could not be decided. A waived deviation
+has an owner."""
 SERIAL = "serial number"
 
 
@@ -131,7 +133,7 @@ class Document:
     @property
     def deviations(self) -> list[tuple[Device, Piece, Deviation]]:
         """All of them, those to be decided on first."""
-        order = {"deviation": 0, "open": 1, "waived": 2}
+        order = {weight: at for at, weight in enumerate(("deviation", "open", "robustness", "field problem", "waived"))}
         found = [(d, p, deviation) for d in self.devices for p in d.pieces for deviation in p.deviations]
         return sorted(found, key=lambda each: order[each[2].weight])
 

@@ -9,12 +9,17 @@ from pathlib import Path
 
 from fieldtwin.report.file import put
 from fieldtwin.report.markup import Markup, el, join
-from fieldtwin.sitereport.document import Deviation, Device, Document, Piece, Source, Table
+from fieldtwin.sitereport.document import Deviation, Device, Document, Piece, Source, Table, Weight
 from fieldtwin.sitereport.style import STYLE
 
 MOST_DEVIATIONS = 1000
 HEADINGS = {"check": "Conformance check", "dump": "Dump", "comparison": "Comparison", "difference": "Difference"}
-WORDS = {"deviation": "deviation", "open": "open point", "waived": "waived"}
+WORDS = {
+    "deviation": "deviation", "open": "open point", "robustness": "robustness", "field problem": "known field problem",
+    "waived": "waived",
+}  # fmt: skip
+NOTED: dict[Weight, str] = {"robustness": "robustness finding", "field problem": "known field problem"}
+"""Findings that are no deviation, as counted in the result."""
 
 
 def write_html(document: Document, path: Path) -> None:
@@ -28,7 +33,7 @@ def render_html(document: Document) -> str:
         _header(document),
         el("h2", "1 Devices"),
         _devices(document),
-        el("h2", "2 Deviations"),
+        el("h2", "2 Deviations and other findings"),
         _deviations(document),
         el("h2", "3 What was done"),
         [_device(device) for device in document.devices],
@@ -65,6 +70,9 @@ def plural(count: int, word: str) -> str:
 def _header(document: Document) -> Markup:
     deviations, opened, waived = (document.count("deviation"), document.count("open"), document.count("waived"))
     said = [plural(deviations, "deviation"), plural(opened, "open point")]
+    for weight in ("robustness", "field problem"):
+        if count := document.count(weight):
+            said.append(plural(count, NOTED[weight]))
     said += [f"{waived} waived"] if waived else []
     facts = [
         ("site", document.site),
@@ -138,7 +146,10 @@ def _deviations(document: Document) -> Markup:
     columns = ("no.", "device", "what", "expected", "found", "weight", "decision")
     table = _grid(columns, rows, (5, 9, 22, 18, 24, 10, 12))
     more = len(found) - MOST_DEVIATIONS
-    said = "Decision: A accepted, C to be corrected, N not applicable; initials and date."
+    said = (
+        "Decision: A accepted, C to be corrected, N not applicable; initials and date. A deviation contradicts what the "
+        "standard or the reference requires. Robustness findings and known field problems contradict no clause."
+    )
     return el(
         "div", el("p", said, cls="small"), table, el("p", f"and {more} more") if more > 0 else "", cls="deviations"
     )
@@ -150,7 +161,7 @@ def _deviation(number: int, device: Device, deviation: Deviation) -> list[object
     who = f"{device.number}" + (f" {device.label}" if device.label else f" {device.name}")
     return [
         str(number), who, join([where, deviation.what, source]), deviation.expected, deviation.found,
-        el("span", WORDS[deviation.weight], cls=f"weight {deviation.weight}"),
+        el("span", WORDS[deviation.weight], cls=f"weight {deviation.weight.split()[0]}"),
         Markup("&nbsp;") if deviation.weight == "waived" else Markup("☐ A &nbsp; ☐ C &nbsp; ☐ N"),
     ]  # fmt: skip
 

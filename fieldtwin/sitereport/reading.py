@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.conformance.case import Basis
 from fieldtwin.sitereport.document import Deviation, Device, Document, Kind, Piece, Source, Table, Weight
 from fieldtwin.sitereport.reading_dump import dump_piece
 from gateway.core.errors import FileInvalid, UsageError
@@ -110,13 +113,21 @@ def check_piece(data: dict[str, Any]) -> Piece:
     about, cases, counts = data["about"], data["cases"], data["counts"]
     weights: dict[str, Weight] = {"failed": "deviation", "error": "deviation", "inconclusive": "open"}
     deviations = []
+    noted: Counter[str] = Counter()
     for case in cases:
         weight: Weight | None = "waived" if case["waived"] else weights.get(case["verdict"])
+        if weight == "deviation" and case["verdict"] == "failed":
+            weight = _weight(case)
+            noted[weight] += weight != "deviation"
         if weight is not None:
             deviations.append(_case(case, weight))
-    words = ("passed", "failed", "inconclusive", "skipped")
+    words = ("passed", "failed", "robustness", "field problem", "inconclusive", "skipped")
+    shown = Counter(counts)
+    shown["failed"] -= noted.total()
+    shown += noted
     skipped = [c for c in cases if c["verdict"] == "skipped" and not c["waived"]]
     here = [c for c in skipped if c["reason"] != "not on this wire"]
+    shown["skipped"] -= len(skipped) - len(here)
     bad = any(d.weight == "deviation" for d in deviations)
     facts = [
         ("played", f"cases up to danger {about['at_most']}"),
@@ -137,9 +148,25 @@ def check_piece(data: dict[str, Any]) -> Piece:
     return Piece(
         "check", str(about["protocol"]), int(about["address"]), str(about["endpoint"]), str(about["started"]),
         str(about["by"]), "failed" if bad else "passed" if counts.get("passed") else "inconclusive",
-        ", ".join(f"{counts[w] - (len(skipped) - len(here) if w == 'skipped' else 0)} {w}" for w in words if counts.get(w)),
+        ", ".join(f"{shown[w]} {w}" for w in words if shown[w]),
         {str(k): str(v) for k, v in about["identity"].items()}, tuple(facts), tuple(deviations), tables, str(about["command"]),
     )  # fmt: skip
+
+
+def _weight(case: dict[str, Any]) -> Weight:
+    """How much a failed case weighs: as its file says, or as its case says where the file is older than that (version 1)."""
+    said = case.get("basis") or bases().get(str(case["id"]), Basis.STANDARD.value)
+    weights: dict[str, Weight] = {Basis.ROBUSTNESS.value: "robustness", Basis.FIELD.value: "field problem"}
+    return weights.get(said, "deviation")
+
+
+@cache
+def bases() -> dict[str, str]:
+    """Case id -> the value of its basis, for all cases for devices."""
+    from fieldtwin.checking import canopen_cases, modbus_cases
+
+    found = {case.id: case.basis.value for case in modbus_cases.CASES}
+    return found | {case.id: case.basis.value for case in canopen_cases.CASES}
 
 
 def _case(case: dict[str, Any], weight: Weight) -> Deviation:
@@ -165,10 +192,16 @@ def compare_piece(data: dict[str, Any]) -> Piece:
         Deviation("deviation", "latency differs", _ms(row["recorded_s"]), _ms(row["other_s"]), str(row["service"]))
         for row in slow
     ]
+    unjudged = int(data.get("not_compared", 0))
+    if unjudged:
+        where = "the recording has no values at the position at which the dialogue continued it"
+        deviations.append(
+            Deviation("open", "not everything was compared", "all exchanges", f"{unjudged} not compared", source=where)
+        )
     alike, timing = f"{100 * data['values']:.2f} %", data["timing"]
     facts = [
         ("against", str(about["against"])),
-        ("compared", f"{data['compared']} exchanges, {data['left_out']} left out"),
+        ("compared", f"{data['compared']} exchanges, {data['left_out']} left out, {unjudged} not compared"),
         ("values", f"{alike} alike, {100 * data['least']:g} % asked for"),
         ("timing", "not judged" if timing is None else f"{100 * timing:.1f} %"),
     ]
@@ -179,7 +212,8 @@ def compare_piece(data: dict[str, Any]) -> Piece:
         deviations = [
             replace(d, weight="waived", found=f"{d.found}; within the share that was asked for") for d in deviations
         ]
-    return _headed("comparison", about, "met" if data["met"] else "not met", summary, facts, deviations, tables)
+    verdict = "met" if data["met"] else "inconclusive" if data.get("inconclusive") else "not met"
+    return _headed("comparison", about, verdict, summary, facts, deviations, tables)
 
 
 def _difference(same: list[dict[str, Any]]) -> Deviation:

@@ -22,16 +22,17 @@ def dump_piece(path: Path) -> Piece:
     dump = load_dump(path)
     header = dump.header
     cells = sum(len(each.cells) for each in dump.passes)
-    silent = sum(1 for found in dump.maps.values() if found.get("given_up"))
     deviations = (
         []
         if dump.ended
         else [Deviation("open", "the dump did not end", "a whole dump", "it was broken off", path.name)]
     )
-    if silent:
-        deviations.append(
-            Deviation("open", "no answer in places", "an answer to each read", f"{silent} tables given up", path.name)
-        )
+    unknown, asked_for = dump.unknown
+    if unknown:
+        where = [text for found in dump.maps.values() for text in found.get("unknown", [])]
+        got = f"{unknown} of {asked_for} unknown: no reply, no valid reply, or not asked"
+        got += f" ({_spans(where)})" if where else ""
+        deviations.append(Deviation("open", "not everything was found out", "an answer everywhere", got, path.name))
     facts = [
         ("ranges", ", ".join(map(str, header["ranges"])) or "all that the profile or EDS names"),
         ("profile", str(header.get("profile") or "none")),
@@ -40,9 +41,18 @@ def dump_piece(path: Path) -> Piece:
     ]
     return Piece(
         "dump", dump.protocol, int(header.get("address", 0)), str(header.get("endpoint", "")), str(header.get("started", "")),
-        str(header.get("by", "")), "whole" if dump.ended else "broken off", f"{cells} values in {len(dump.passes)} times through",
+        str(header.get("by", "")), _verdict(dump), f"{cells} values in {len(dump.passes)} times through",
         identity(dump), tuple(facts), tuple(deviations), _tables(dump), str(header.get("command", "")),
     )  # fmt: skip
+
+
+def _verdict(dump: Dump) -> str:
+    """``whole`` only of a dump that ended and knows something definite about everything it was to ask for."""
+    if not dump.ended:
+        return "broken off"
+    if dump.is_mostly_unknown:
+        return "mostly unknown"
+    return "partly unknown" if dump.unknown[0] else "whole"
 
 
 def identity(dump: Dump) -> dict[str, str]:
@@ -74,13 +84,20 @@ def _raw(dump: Dump, function: int) -> bytes:
 
 
 def _tables(dump: Dump) -> tuple[Table, ...]:
+    names = ("readable", "refused", "silent", "invalid", "not_asked")
     maps = tuple(
-        (name, _spans(found.get("readable")), _spans(found.get("holes")), str(found.get("max_read", "")))
+        (name, *(_places(found, key) for key in names), _longest(found))
         for name, found in sorted(dump.maps.items())
+        if name != "objects"
+    )
+    objects = tuple(
+        (str(found["counts"][key]) for key in names) for name, found in dump.maps.items() if name == "objects"
     )
     latency = tuple((name, *_latency(found)) for name, found in sorted(dump.latency.items()))
+    heads = ("readable", "refused", "no reply", "invalid reply", "not asked")
     return (
-        Table("What can be read", ("table", "readable", "holes", "longest read"), maps),
+        Table("What can be read", ("table", *heads, "longest read"), maps),
+        *(Table("Objects", heads, (tuple(row),)) for row in objects),
         Table("How fast it answers", ("function", "requests", "median", "95 %", "slowest"), latency),
     )
 
@@ -89,6 +106,23 @@ def _spans(texts: Any, most: int = 8) -> str:
     if not isinstance(texts, list) or not texts:
         return "none"
     return ", ".join(map(str, texts[:most])) + (f" and {len(texts) - most} more" if len(texts) > most else "")
+
+
+def _places(found: dict[str, Any], key: str) -> str:
+    """The ranges in which every address has that state, and of the sampled ones how many have it."""
+    sampled = [
+        f"{s['asked'] if key != 'not_asked' else s['addresses'] - s['asked']} of {s['range']}"
+        for s in found.get("sampled", [])
+        if key in (s["state"], "not_asked")
+    ]
+    return _spans([*found.get(key, []), *sampled])
+
+
+def _longest(found: dict[str, Any]) -> str:
+    """The longest read that was taken; without a refused longer one it is a lower bound."""
+    if not found.get("max_read"):
+        return ""
+    return str(found["max_read"]) if found.get("limit_proved") else f"{found['max_read']} or more"
 
 
 def _latency(found: Any) -> tuple[str, str, str, str]:

@@ -26,7 +26,8 @@ tr { break-inside: avoid; }
 .verdict { border: 1px solid #111; padding: 0 8px; border-radius: 9px; font-size: 12.5px; }
 .verdict.good { border-color: #1a7f37; } .verdict.bad { border-color: #c1121f; }
 .weight { white-space: nowrap; } .part td:first-child { white-space: nowrap; }
-.weight.deviation { font-weight: 700; color: #c1121f; } .weight.waived { color: #444; }
+.weight.deviation { font-weight: 700; color: #c1121f; } .weight.robustness, .weight.field { color: #8a5a00; }
+.weight.waived { color: #444; }
 .blank { display: inline-block; width: 90%; border-bottom: 1px solid #111; height: 1.3em; }
 .device + .device { border-top: 1px solid #999; padding-top: 2px; margin-top: 14px; }
 .deviations td:last-child { white-space: nowrap; font-size: 11px; height: 46px; }

@@ -6,6 +6,7 @@ A `Bench` lives from `open` to `aclose`; its folder holds its files and virtual 
 from __future__ import annotations
 
 import asyncio
+import math
 import shutil
 import tempfile
 from collections.abc import Mapping
@@ -114,6 +115,9 @@ class Bench:
         """What `device` holds for `tag` now, in engineering units; None while it never held anything."""
         found = self._tag(device, tag)
         config = self.system.devices[device]
+        put = self.field.faults.value_set(device, tag)
+        if put is not None:  # a sensor that samples notes it at its next sample only
+            return _as_held(found, put)
         emulated = self.field.devices[device]
         raw = next((h.raw for h in reversed(list(emulated.journal.since(0))) if h.tag == tag), None)
         if raw is None:
@@ -134,6 +138,16 @@ class Bench:
         """Put a fault in; its id. Times in it count from now."""
         self.field.faults.start_ns = self.field._clock.monotonic_ns()
         return self.field.faults.inject(said)
+
+
+def _as_held(tag: Tag, value: float) -> float | int | bool:
+    """`value` as the tag's type holds it, in engineering units: to the nearest step of an integer."""
+    if tag.type == "bool":
+        return bool(value)
+    if tag.type.startswith("float") or math.isnan(value) or tag.scale_by is not None:
+        return value
+    number = round((value - tag.offset) / tag.scale)
+    return number if (tag.scale, tag.offset) == (1, 0) else number * tag.scale + tag.offset
 
 
 def new_folder() -> Path:

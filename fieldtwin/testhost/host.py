@@ -184,7 +184,7 @@ class Host:
     async def _exchanges(self, args: dict[str, Any]) -> dict[str, Any]:
         log = self._bench(args).log
         found = log.since(int(args.get("since") or 0))
-        return {"exchanges": found, "last": log.number}
+        return {"exchanges": found, "pending": log.pending(), "last": log.number, "now_s": log.now_s}
 
     # -- gateway and PLC before a field side ------------------------------------------------------------------------------
 

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 
 from fieldtwin.running.children import Child
+from fieldtwin.running.plc_client import step_and_wait
 from fieldtwin.running.shore import Shore
 from gateway.core.clock import Clock
 from gateway.core.control import ControlClient, RemoteError
@@ -109,6 +110,8 @@ class RunningPlc:
         """One of `STEERING`."""
         if verb not in STEERING:
             raise UsageError(f"no way to steer a PLC: {verb!r}", expected=", ".join(STEERING))
+        if verb == "step":
+            return {"scans": await step_and_wait(self._call, int(args["count"]), BY)}
         return await self._call(verb, **args, by=BY)
 
     def send(self, period_s: int) -> None:

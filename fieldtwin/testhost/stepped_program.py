@@ -11,8 +11,9 @@ from gateway.core.clock import NS_PER_MS
 from gateway.core.errors import UsageError
 from gateway.core.image import Message, TagKind
 from gateway.core.values import Quality, Reason, TagValue
-from plc.binding import load_program
+from plc.binding import BoundProgram, load_program
 from plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
+from plc.scan import failed
 from plc.states import StateMachine
 
 MAX_SCANS = 10_000_000
@@ -55,7 +56,8 @@ class SteppedProgram:
             _fits(name, variable.kind, value)
             self.program.check(name, value)
         good = Quality.BAD if value is None else QUALITIES[quality]
-        self._inputs[name] = TagValue(value, good, Reason.NONE if value is not None else Reason.TIMEOUT, self.now_ns)
+        reason = Reason.TIMEOUT if good is Quality.BAD else Reason.NONE
+        self._inputs[name] = TagValue(value, good, reason, self.now_ns)
 
     def scan(self, scans: int) -> None:
         """So many scans. Raises `ProgramFailed` with file and line where the program fails."""
@@ -76,7 +78,7 @@ class SteppedProgram:
         except ProgramFailed:
             raise
         except Exception as e:  # the logic is the user's, and can raise anything; translated here, once
-            raise ProgramFailed(type(program).__name__, f"{type(e).__name__}: {e}") from e
+            raise failed(BoundProgram(type(program).__name__, program), e) from e
         for v in program.variables.values():
             box = program.__dict__[v.name]
             if isinstance(box, Outbox):

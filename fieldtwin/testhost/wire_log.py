@@ -6,7 +6,7 @@ Fed with bytes by the emulators' ends, with frames by a listener on a CAN bus. K
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.decoding.decoder import Decoder
@@ -19,8 +19,6 @@ from twin.system import System
 MOST = 20_000
 AT_ONCE = 5_000
 MAX_CONNECTIONS = 256
-QUIET_NS = 50_000_000
-"""A request that has no answer for so long is shown as one without; should one come after all, it is a stray."""
 
 
 @dataclass
@@ -28,6 +26,11 @@ class _Line:
     decoder: Decoder
     end: object
     last_ns: int = 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether the connection is gone, so that no reply can follow."""
+        return getattr(self.end, "lost", None) is not None
 
 
 class WireLog:
@@ -70,14 +73,26 @@ class WireLog:
             self._kept.append((self.number, exchange))
 
     def since(self, number: int) -> list[dict[str, Any]]:
-        """Those after `number`, the oldest first, `AT_ONCE` at most, as plain data with their number, times (s since the log
-        began) and words. Of secrets there is no value."""
-        now_ns = self._clock.monotonic_ns()
-        for line in self._lines.values():
-            if now_ns - line.last_ns >= QUIET_NS:
-                self._take(line.decoder.finish())
+        """Those after `number`, in the order in which they ended, `AT_ONCE` at most, as plain data with their number, times (s
+        since the log began) and words. Of secrets there is no value. Looking changes nothing."""
         found = [(n, e) for n, e in self._kept if n > number][:AT_ONCE]
         return [_plain(n, e) for n, e in found]
+
+    def pending(self) -> list[dict[str, Any]]:
+        """Requests whose reply may still come, with the number 0. On a connection that is closed no reply can come: there the
+        problem is ``no reply``. Looking changes nothing."""
+        found = []
+        for line in self._lines.values():
+            waiting = line.decoder.pending()
+            if line.closed:
+                waiting = [replace(e, problem="no reply", reply_text="no reply") for e in waiting]
+            found += waiting
+        return [_plain(0, e) for e in sorted(found, key=lambda e: e.t_ns)]
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since the log began."""
+        return (self._clock.monotonic_ns() - self._start_ns) / 1e9
 
 
 def _plain(number: int, exchange: Exchange) -> dict[str, Any]:
@@ -86,6 +101,7 @@ def _plain(number: int, exchange: Exchange) -> dict[str, Any]:
         "t_s": exchange.t_ns / 1e9,
         "bus": exchange.bus,
         **exchange.describe(),
+        "transaction": exchange.transaction,
         "access": exchange.access,
         "address": exchange.address,
         "count": exchange.count,

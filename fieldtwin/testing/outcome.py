@@ -21,7 +21,7 @@ VERDICTS = ("passed", "failed", "error", "inconclusive", "skipped")
 class Outcome:
     """How a scenario ended. `verdict` is one of `VERDICTS`; only the first is a pass. `case` is its id, `role` whom it
     judges, `danger` its class (observe, read, write, disrupt). `checks` are its steps and checks, as
-    `fieldtwin test --json` has them."""
+    `fieldtwin test --json` has them. `on_the_wire` are the exchanges before the check that failed, as lines with a heading."""
 
     name: str
     verdict: str
@@ -36,6 +36,7 @@ class Outcome:
     case: str = ""
     role: str = ""
     danger: str = ""
+    on_the_wire: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -48,7 +49,10 @@ class Outcome:
     def __str__(self) -> str:
         return "\n".join(self.lines())
 
-    __repr__ = __str__
+    def __repr__(self) -> str:
+        """In one line, as pytest shows it in a failed assertion; the lines stand in the report's section ``scenario``."""
+        reason = " ".join(self.reason.split())
+        return f"<{self.verdict} scenario {self.name!r}" + (f": {reason}>" if reason else ">")
 
     def lines(self) -> list[str]:
         """The verdict, what was expected and seen, and the line that runs it again."""
@@ -57,6 +61,7 @@ class Outcome:
             if check["verdict"] != "passed":
                 said += [f"  {check['number']}: {check['text']}", f"    expected {check['expected']}"]
                 said += [f"    got      {check['got']}"] if check["got"] else []
+        said += [f"  {'  ' if n else ''}{line}" for n, line in enumerate(self.on_the_wire)]
         return [*said, f"  again: {self.reproduce}"]
 
 
@@ -91,5 +96,5 @@ def run_scenario(
     except (ValueError, LookupError, TypeError):
         raise FieldtwinUnavailable(f"no results: {done.stdout[:200]!r} {said}") from None
     known = {key: plain[key] for key in Outcome.__dataclass_fields__ if key in plain}
-    known |= {key: tuple(plain.get(key, ())) for key in ("requirements", "checks")}
+    known |= {key: tuple(plain.get(key, ())) for key in ("requirements", "checks", "on_the_wire")}
     return Outcome(**known)

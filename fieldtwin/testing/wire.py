@@ -5,6 +5,7 @@ Standard library only: see `fieldtwin.testing.runner`.
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +15,8 @@ from typing import Any
 from fieldtwin.testing.runner import Runner
 
 POLL_S = 0.02
+SHOWN = 10
+"""Exchanges that a failed expectation shows: the last ones."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +26,13 @@ class Exchange:
     `function` is the Modbus function code, 0 on CANopen; `access` is read, write, read and write, or ""; `address` the first
     register, bit or object (index) as it is sent, `count` how many. `tags` are the values carried, in engineering units, by the
     profile's names. `exception` or `abort` is the code where it was refused. `problem` is "" where all is well, else
-    ``no reply``, ``exception``, ``abort``, ``check sum``, ``stray`` or ``malformed``. `t_s` counts from when the wire came up.
-    `request` and `reply` are the bytes, `text` and `reply_text` the same in words.
+    ``pending``, ``no reply``, ``exception``, ``abort``, ``check sum``, ``stray`` or ``malformed``. `t_s` counts from when the
+    wire came up. `request` and `reply` are the bytes, `text` and `reply_text` the same in words. `transaction` is the
+    transaction id on Modbus TCP.
+
+    A request is ``pending`` until its reply comes. It has ``no reply`` once none can follow: the next request was sent on a
+    serial line, a later request was answered on Modbus TCP, or the connection was closed. A ``stray`` is a frame that answers no
+    request: it has a `reply` and no `request`. `number` counts what has ended; that of a pending request is 0.
     """
 
     number: int
@@ -47,8 +55,11 @@ class Exchange:
     reply_text: str = ""
     request: bytes = b""
     reply: bytes = b""
+    transaction: int | None = None
 
     def __str__(self) -> str:
+        if self.problem == "stray":
+            return f"{self.t_s:.3f} s  {self.text}"
         return f"{self.t_s:.3f} s  {self.text} -> {self.reply_text or self.problem or 'no answer wanted'}"
 
 
@@ -69,13 +80,21 @@ class Wire:
         self._bench = bench
         self._device = device
         self._since = 0
+        self._after_s = 0.0
 
-    def exchanges(self, **like: Any) -> list[Exchange]:
-        """What was exchanged since the test began, or since `clear`, the oldest first; the latest 20,000 are kept.
+    def exchanges(self, *, strays: bool = False, **like: Any) -> list[Exchange]:
+        """Return what was exchanged since the test began, or since `clear`, by the time of the request; the latest 20,000 are
+        kept. Looking changes nothing: a request that waits for its reply has the problem ``pending``, and is whole later.
 
         `like` leaves those whose fields are equal: ``exchanges(function=16)``; ``tag="period"`` those that carry that tag.
-        A request that has had no answer for 50 ms is one with the problem ``no reply``.
+        Frames that answer no request are left out, unless `strays` is true or ``problem="stray"`` is asked for.
         """
+        __tracebackhide__ = True
+        strays = strays or like.get("problem") == "stray"
+        found = [e for e in self._all() if self._is(e, like) and (strays or e.problem != "stray")]
+        return sorted(found, key=lambda e: e.t_s)
+
+    def _all(self) -> list[Exchange]:
         __tracebackhide__ = True
         found: list[Exchange] = []
         since = self._since
@@ -83,7 +102,8 @@ class Wire:
             answer = self._runner.call("exchanges", id=self._bench, since=since)
             found += map(_exchange, answer["exchanges"])
             if not answer["exchanges"]:
-                return [e for e in found if self._is(e, like)]
+                found += map(_exchange, answer["pending"])
+                return [e for e in found if e.t_s >= self._after_s]
             since = found[-1].number
 
     def _is(self, exchange: Exchange, like: dict[str, Any]) -> bool:
@@ -94,29 +114,75 @@ class Wire:
         )
 
     def clear(self) -> None:
-        """Forget what was exchanged so far."""
-        while answer := self._runner.call("exchanges", id=self._bench, since=self._since)["exchanges"]:
-            self._since = answer[-1]["number"]
+        """Forget what was exchanged so far, also requests whose reply is still to come."""
+        while True:
+            answer = self._runner.call("exchanges", id=self._bench, since=self._since)
+            self._after_s = answer["now_s"]
+            if not answer["exchanges"]:
+                return
+            self._since = answer["exchanges"][-1]["number"]
 
     def count(self, **like: Any) -> int:
-        """How many `exchanges`."""
+        """Return how many `exchanges` there are. Stray frames are no requests and are not counted."""
         return len(self.exchanges(**like))
 
-    def expect(self, times: int = 1, within_s: float = 2.0, **like: Any) -> list[Exchange]:
-        """Wait until there are `times` such exchanges, and return them. `AssertionError` with what there was instead, where there
-        are more, or fewer after `within_s`."""
+    def expect(
+        self,
+        times: int | None = None,
+        within_s: float = 2.0,
+        *,
+        at_least: int | None = None,
+        at_most: int | None = None,
+        **like: Any,
+    ) -> list[Exchange]:
+        """Wait until there are `times` such exchanges (by default 1), and return them.
+
+        Instead of `times`, give bounds: `at_least` returns as soon as there are so many, `at_most` watches for all of
+        `within_s`, because one more could come until then. A pending request is waited for; at the end of `within_s` it counts,
+        and counts as one with ``no reply``. Raises `AssertionError` with what was on the wire where the number is another.
+        Blocks; in a coroutine use `expect_async`.
+        """
         __tracebackhide__ = True
+        wanted = _Wanted.of(times, at_least, at_most, like)
         until = time.monotonic() + within_s
         while True:
-            found = self.exchanges(**like)
-            if len(found) >= times or time.monotonic() >= until:
-                break
+            found, over = self._look(wanted, like, until)
+            if over:
+                return found
             time.sleep(POLL_S)
-        if len(found) != times:
-            wanted = ", ".join(f"{key}={value!r}" for key, value in like.items()) or "exchanges"
-            there = "\n".join(f"  {e}" for e in self.exchanges()[-10:]) or "  nothing"
-            raise AssertionError(f"{times} times {wanted} expected, {len(found)} seen; on the wire was:\n{there}")
-        return found
+
+    async def expect_async(
+        self,
+        times: int | None = None,
+        within_s: float = 2.0,
+        *,
+        at_least: int | None = None,
+        at_most: int | None = None,
+        **like: Any,
+    ) -> list[Exchange]:
+        """Do as `expect` does, while the event loop goes on."""
+        __tracebackhide__ = True
+        wanted = _Wanted.of(times, at_least, at_most, like)
+        until = time.monotonic() + within_s
+        while True:
+            found, over = await asyncio.to_thread(self._look, wanted, like, until)
+            if over:
+                return found
+            await asyncio.sleep(POLL_S)
+
+    def _look(self, wanted: _Wanted, like: dict[str, Any], until: float) -> tuple[list[Exchange], bool]:
+        """One look: the exchanges, and whether the wait is over. Raises `AssertionError` where they cannot be right any more."""
+        __tracebackhide__ = True
+        late = time.monotonic() >= until
+        found = self.exchanges(**like)
+        if late and like.get("problem") == "no reply":
+            silent = self.exchanges(**{**like, "problem": "pending"})
+            found = sorted(found + silent, key=lambda e: e.t_s)
+        ended = len(found) if late or like.get("problem") == "pending" else sum(e.problem != "pending" for e in found)
+        if len(found) > wanted.most or (late and len(found) < wanted.least):
+            there = "\n".join(f"  {e}" for e in self.exchanges(strays=True)[-SHOWN:]) or "  nothing"
+            raise AssertionError(f"{wanted} expected, {len(found)} seen; on the wire was:\n{there}")
+        return found, late or (ended >= wanted.least and not wanted.to_the_end)
 
     @contextmanager
     def fault(self, name: str, **more: Any) -> Iterator[str]:
@@ -134,3 +200,30 @@ class Wire:
 def _keys(more: dict[str, Any]) -> dict[str, Any]:
     """Keyword arguments as a fault file's keys: ``from_`` is a word of Python's."""
     return {key.removesuffix("_"): value for key, value in more.items()}
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """How many exchanges are expected, and in words which."""
+
+    least: int
+    most: float
+    to_the_end: bool
+    words: str
+
+    @classmethod
+    def of(cls, times: int | None, at_least: int | None, at_most: int | None, like: dict[str, Any]) -> _Wanted:
+        __tracebackhide__ = True
+        if times is not None and (at_least is not None or at_most is not None):
+            raise TypeError("times is an exact number: give times, or at_least and at_most")
+        if times is None and at_least is None and at_most is None:
+            times = 1
+        words = ", ".join(f"{key}={value!r}" for key, value in like.items()) or "exchanges"
+        if times is not None:
+            return cls(times, times, times == 0, f"{times} times {words}")
+        bounds = [f"at least {at_least}"] * (at_least is not None) + [f"at most {at_most}"] * (at_most is not None)
+        most = float("inf") if at_most is None else at_most
+        return cls(at_least or 0, most, at_most is not None, f"{' and '.join(bounds)} times {words}")
+
+    def __str__(self) -> str:
+        return self.words

@@ -53,8 +53,9 @@ def _command(run: VirtualPrototype, period_s: Number) -> None:
 
 
 def otherwise(run: VirtualPrototype, state: KnownState) -> list[str]:
-    """Programs whose state is not the one that is known of them."""
-    outputs = run.plc.outputs.last()
+    """Programs that have started, and whose state is not the one that is known of them."""
+    waiting = {f"{start.name}.state" for start in run.plc.starts.waiting}
+    outputs = {tag: value for tag, value in run.plc.outputs.last().items() if tag not in waiting}
     known = {name: variables["state"] for name, variables in state.programs.items() if "state" in variables}
     return [name for name, is_so in known.items() if outputs.get(f"{name}.state", is_so) != is_so]
 

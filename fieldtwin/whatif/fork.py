@@ -29,6 +29,7 @@ from gateway.core.nursery import Nursery
 from gateway.core.values import Quality, Reason
 from gateway.wallclock import WallClock
 from plc.publishing import Change
+from plc.task import StopReason
 from twin.field_process import FieldConfig, resolve
 from twin.virtual import VirtualPrototype
 
@@ -139,6 +140,8 @@ class _ForkRun:
             for fault in self.plan.faults:
                 run.field.faults.inject(fault)
             await self._watch(run, loop)
+            if run.plc.stop_reason is not StopReason.NONE:  # whatever its variables say: nothing holds any more
+                self.outcome.error = f"the PLC stopped ({run.plc.stop_reason.value}): {run.plc.error or 'on request'}"
             self.outcome.ends(loop.now_ns)
             run.gateway.tags.on_put, self._over = None, True  # what its end brings (safe outputs) is none of the plan's
             for requirement, expression in self._at_the_end:
@@ -160,9 +163,9 @@ class _ForkRun:
             failure = run.failure()
             if failure is not None:
                 raise failure
-            if not begun:
+            if not begun and (not run.plc.starts.waiting or loop.now_ns >= settled_ns):
                 begun = True
-                if all(c.at_s > BEGUN_S for c in self.plan.commands):
+                if all(c.at_s > max(BEGUN_S, self._now_s()) for c in self.plan.commands):
                     self.outcome.not_taken.extend(otherwise(run, self.fork.state))
             if loop.now_ns >= settled_ns:
                 for requirement, expression in self._requirements:
@@ -189,7 +192,7 @@ class _ForkRun:
         return self._words[tag].get(value, value) if tag in self._words else value
 
     def _judge(self, requirement: Requirement, expression: Expression) -> None:
-        if requirement.broken_s is None and not expression.evaluate(self._look):
+        if requirement.broken_s is None and expression.truth(self._look) is not True:  # nor is an unknown one met
             requirement.broken_s = self._now_s()
             requirement.seen = "; ".join(
                 f"{name}: {self._look('value', name)!r}" for name in dict.fromkeys(expression.names)
@@ -216,6 +219,8 @@ class _ForkRun:
         now_ns = run.clock.monotonic_ns()
         seen = tags.current(name, now_ns)
         match function:
+            case "quality" if seen.value is None:
+                return None  # it has not gone bad: it never had a value
             case "quality":
                 return Quality(seen.quality).name.lower()
             case "reason":

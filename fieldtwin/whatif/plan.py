@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +16,8 @@ from gateway.core.statemachine import encode_period
 from gateway.core.yaml_file import YamlFile, load, validate
 
 MAX_PLANS = 1000
+MOST_NAMED = 6
+"""Commands and faults in the name of a plan that is made of them; the others are counted."""
 Text = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
@@ -65,6 +68,24 @@ def command(text: str) -> Scripted:
         return Scripted(seconds(at) if at else 0.0, int(period))
     except (ValueError, FieldtwinError) as e:
         raise UsageError("a command", expected="PERIOD_S or PERIOD_S@TIME, such as 60@10min", got=repr(text)) from e
+
+
+def in_words(commands: Sequence[Scripted], faults: Sequence[Mapping[str, Any]]) -> str:
+    """Return a name for a plan that has none: ``command 2 s at 5 s, command 60 s at 10 min, fault silence on ctd``."""
+    said = [f"command {one.period_s} s at {_time(one.at_s)}" for one in sorted(commands, key=lambda one: one.at_s)]
+    for fault in faults:
+        on = fault.get("device") or fault.get("bus")
+        said.append(f"fault {fault['name']}" + (f" on {on}" if on else ""))
+    more = len(said) - MOST_NAMED
+    return ", ".join(said[:MOST_NAMED] or ["no commands"]) + (f" and {more} more" if more > 0 else "")
+
+
+def _time(time_s: float) -> str:
+    """Return a time of the plan in its largest whole unit."""
+    for unit_s, unit in ((3600, "h"), (60, "min")):
+        if time_s and time_s % unit_s == 0:
+            return f"{time_s / unit_s:g} {unit}"
+    return f"{time_s:g} s"
 
 
 def load_plans(path: Path) -> tuple[str, list[Plan]]:

@@ -17,6 +17,7 @@ import msgspec
 
 from gateway.core.control import ControlClient
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import read_input
 from twin.system import System
 
 VERSION = 1
@@ -55,7 +56,7 @@ class KnownState:
 def read_state(path: Path, system: System) -> KnownState:
     """A state file. Raises `FileInvalid`; names that the system does not have are refused."""
     try:
-        data = path.read_bytes() if path.stat().st_size <= MAX_BYTES else b""
+        data = read_input(path, MAX_BYTES)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     if not data:

@@ -40,12 +40,15 @@ class ClientConnection(TcpConnection, Client):
         self._loop = asyncio.get_running_loop()
         self.last_used_s = self._loop.time()
         self.on_arrival = self._used
+        self._end_of_stream: ConnectionLost | None = None
+        self._secured = False
 
     def _used(self, data: bytes) -> None:
         self.last_used_s = self._loop.time()
 
     async def take(self, sock: socket.socket, tls: ssl.SSLContext | None) -> None:
         """Become the connection of an accepted socket, and shake hands where a context is given."""
+        self._secured = tls is not None
         limit_s = HANDSHAKE_LIMIT_S if tls is not None else None
         await self._loop.connect_accepted_socket(lambda: self._wire, sock, ssl=tls, ssl_handshake_timeout=limit_s)
         if tls is not None:
@@ -54,6 +57,19 @@ class ClientConnection(TcpConnection, Client):
             self.role = role_in(shaken.getpeercert(binary_form=True) or b"")
         if self._lost is not None:  # its place was given away meanwhile
             self._wire.transport.abort()
+
+    def on_end_of_stream(self, error: ConnectionLost) -> bool:
+        """Without TLS, which has no half-closed connections: what arrived before is read, and may still be answered."""
+        if self._secured:
+            return super().on_end_of_stream(error)
+        self._end_of_stream = error
+        self._wake()
+        return True
+
+    def _waits(self, waiter: asyncio.Future[None]) -> asyncio.Future[None]:
+        if self._end_of_stream is not None and self._lost is None:
+            raise ConnectionLost(self._end_of_stream.message, where=self._end_of_stream.where)
+        return super()._waits(waiter)
 
     def evict(self, why: str) -> None:
         """End it at once."""

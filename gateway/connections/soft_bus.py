@@ -19,8 +19,9 @@ import can
 from can.typechecking import CanFilters
 from msgspec.structs import replace
 
+from gateway.connections.addresses import address_of
 from gateway.connections.soft_bus_hello import Welcome, ask, read_answer
-from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
+from gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CANConnection, CanConnection, closed_here
 from gateway.core.endpoint import Endpoint
@@ -154,6 +155,7 @@ class _Wire(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         transport = cast(asyncio.Transport, transport)  # uvloop's is one in all but its class
         self._transport = transport
+        self._connection.local = address_of(transport)
 
     def data_received(self, data: bytes) -> None:
         self._buffer += data
@@ -209,7 +211,8 @@ class _Wire(asyncio.Protocol):
 class SoftBus(can.BusABC):
     """python-can's interface ``fieldtwin``. `channel` is ``HOST:PORT`` of a software CAN bus.
 
-    `bitrate` (bit/s) is checked against the bus's; 0 takes the bus's. With `receive_own_messages` own frames come back,
+    `bitrate` (bit/s) is checked against the bus's; 0 takes the bus's. With `fd` it sends and receives CAN FD
+    frames too, and `data_bitrate` (bit/s, 0: any) is checked likewise. With `receive_own_messages` own frames come back,
     ``is_rx`` false, when they were on the wire. Time stamps are seconds since 1970, from the bus's exact end of frame.
     `recv` takes exactly one record from the socket, so its descriptor stays readable while more wait; `fileno` serves
     `can.Notifier` with a loop. Here, at python-can's border, errors are python-can's: `CanInitializationError` when the
@@ -230,11 +233,14 @@ class SoftBus(can.BusABC):
         receive_own_messages: bool = False,
         timeout: float = OPEN_TIMEOUT_S,
         fd: bool = False,
+        data_bitrate: int = 0,
         bus_errors: bool = False,
         single_handle: bool = True,  # what python-can's programs pass to every interface; every handle is single here
     ) -> None:
-        if fd:
-            raise can.CanInitializationError("the software CAN bus is a classic one: no CAN FD")
+        if data_bitrate and not fd:
+            raise can.CanInitializationError("a data bit rate is for CAN FD: fd=True")
+        self._fd = fd
+        self._record_size = FD_RECORD_SIZE if fd else RECORD_SIZE
         clock = WallClock()
         self._clock = clock
         self._partial = b""
@@ -251,8 +257,13 @@ class SoftBus(can.BusABC):
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
             asked_ns = clock.monotonic_ns()
-            self._socket.sendall(ask(bitrate, confirmations=receive_own_messages, violations=bus_errors))
-            welcome = read_answer(self._read_answer(), bitrate, f"can:fieldtwin/{channel}")
+            request = ask(
+                bitrate, confirmations=receive_own_messages, violations=bus_errors, fd=fd, data_bitrate=data_bitrate
+            )
+            self._socket.sendall(request)
+            welcome = read_answer(
+                self._read_answer(), bitrate, f"can:fieldtwin/{channel}", fd=fd, data_bitrate=data_bitrate
+            )
             offset_ns = welcome.clock_offset_ns(asked_ns, clock.monotonic_ns())
             self._utc_minus_bus_ns = offset_ns + clock.utc_ns() - clock.monotonic_ns()
             self._socket.setblocking(False)
@@ -262,6 +273,7 @@ class SoftBus(can.BusABC):
         self.channel_info = f"fieldtwin bus {channel} at {welcome.bitrate} bit/s"
         self._channel = channel
         super().__init__(channel, can_filters)
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
 
     def _read_answer(self) -> bytes:
         answer = b""
@@ -273,12 +285,27 @@ class SoftBus(can.BusABC):
         """The socket's descriptor, for `select` and `add_reader`; -1 after `shutdown`."""
         return self._socket.fileno()
 
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """Return the next message, or None after `timeout` seconds (None: wait without a limit).
+
+        If another thread calls `shutdown` meanwhile, it returns None at the end of its time-out, or at once without one:
+        python-can's Notifier polls until it is stopped itself. Raises `can.CanOperationError` if the bus is gone.
+        """
+        deadline_ns = self._clock.monotonic_ns() + int((timeout or 0) * NS_PER_S)
+        try:
+            return super().recv(timeout)
+        except can.CanOperationError:
+            if not self._is_shutdown:
+                raise
+        threading.Event().wait(max(0, deadline_ns - self._clock.monotonic_ns()) / NS_PER_S)  # nothing sets it
+        return None
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
             if not select.select([self._socket], [], [], timeout)[0]:
                 return None, False
             # Never more than the rest of one record: what follows must keep the descriptor readable.
-            data = self._socket.recv(RECORD_SIZE - len(self._partial))
+            data = self._socket.recv(self._record_size - len(self._partial))
         except BlockingIOError:
             return None, False  # another thread was quicker
         except (OSError, ValueError) as e:  # ValueError: shut down by another thread
@@ -286,7 +313,7 @@ class SoftBus(can.BusABC):
         if not data:
             raise can.CanOperationError("the software CAN bus closed")
         self._partial += data
-        if len(self._partial) < RECORD_SIZE:
+        if len(self._partial) < self._record_size:
             return None, False
         record, self._partial = self._partial, b""
         try:
@@ -306,11 +333,16 @@ class SoftBus(can.BusABC):
             dlc=frame.dlc,
             data=frame.data,
             is_rx=not own,
+            is_fd=frame.fd,
+            bitrate_switch=frame.brs,
+            error_state_indicator=frame.esi,
         )
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Hand `msg` to the bus, waiting up to `timeout` seconds while it takes no more (None: as long as it takes)."""
-        record = pack_record(_frame_of(msg))
+        if msg.is_fd and not self._fd:
+            raise can.CanOperationError("a CAN FD frame needs an interface that was opened with fd=True")
+        record = pack_record(_frame_of(msg), fd=self._fd)
         deadline_ns = None if timeout is None else self._clock.monotonic_ns() + int(timeout * NS_PER_S)
         with self._sending:
             self._flush(deadline_ns)  # a record that a time-out cut in two comes first
@@ -318,7 +350,7 @@ class SoftBus(can.BusABC):
             try:
                 self._flush(deadline_ns)
             except can.CanTimeoutError:
-                if len(self._unsent) == RECORD_SIZE:
+                if len(self._unsent) == self._record_size:
                     self._unsent = b""  # not a byte of it left: it was not sent
                     raise
 
@@ -350,14 +382,15 @@ class SoftBus(can.BusABC):
                 self._socket.settimeout(left_ns / NS_PER_S)
                 if not self._socket.recv(65536):
                     break
+            self._socket.shutdown(socket.SHUT_RDWR)  # a `recv` of another thread waits no longer
         except OSError:
             pass  # the bus was gone already, or is slow
         self._socket.close()
 
 
 def _frame_of(msg: can.Message) -> CanFrame:
-    if msg.is_error_frame or msg.is_fd:
-        raise can.CanOperationError("only classic data and remote frames can be sent")
+    if msg.is_error_frame:
+        raise can.CanOperationError("only data and remote frames can be sent")
     try:
         return CanFrame(
             msg.arbitration_id,
@@ -365,6 +398,9 @@ def _frame_of(msg: can.Message) -> CanFrame:
             extended=msg.is_extended_id,
             remote=msg.is_remote_frame,
             dlc=min(msg.dlc, 8) if msg.is_remote_frame else -1,
+            fd=msg.is_fd,
+            brs=msg.bitrate_switch,
+            esi=msg.error_state_indicator,
         )
     except Desync as e:
         raise can.CanOperationError(str(e)) from e

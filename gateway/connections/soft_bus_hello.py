@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from gateway.core.canframe import RECORD_SIZE
 from gateway.core.errors import EndpointBusy, Unreachable, UsageError
 
-_LAYOUT = struct.Struct("!BBBBIQ4sHxx")
+_LAYOUT = struct.Struct("!BBBBIQ4sHH")
 _MARK = 0x80
-_VERSION = 1
+_VERSION, _FD_VERSION = 1, 2
 _CONFIRM, _ERRORS, _VIOLATIONS = 0x01, 0x02, 0x04
 _MAGIC = b"ftcb"
 
@@ -29,6 +29,8 @@ class Welcome:
     bitrate: int
     window: int
     bus_ns: int
+    data_bitrate: int = 0
+    """bit/s, rounded down to kbit/s; 0 on a connection that carries no CAN FD."""
 
     def clock_offset_ns(self, asked_ns: int, answered_ns: int) -> int:
         """What to add to the bus's time stamps to get this host's monotonic time.
@@ -41,17 +43,27 @@ class Welcome:
         return (asked_ns + answered_ns) // 2 - self.bus_ns
 
 
-def ask(bitrate: int, *, confirmations: bool, errors: bool = True, violations: bool = False) -> bytes:
+def ask(
+    bitrate: int,
+    *,
+    confirmations: bool,
+    errors: bool = True,
+    violations: bool = False,
+    fd: bool = False,
+    data_bitrate: int = 0,
+) -> bytes:
     """The request to join a bus of `bitrate` bit/s (0: any), with or without a confirmation of each own frame.
 
     `errors`: error frames when the state of this node's controller changes, or frames for it were lost (as a kernel's interface
-    tells); `violations`: one for each error on the wire too (as with ``berr-reporting``).
+    tells); `violations`: one for each error on the wire too (as with ``berr-reporting``). `fd`: records carry CAN FD, and the bus
+    must have the `data_bitrate` (0: any).
     """
     options = (_CONFIRM if confirmations else 0) | (_ERRORS if errors else 0) | (_VIOLATIONS if violations else 0)
-    return _LAYOUT.pack(_MARK, _VERSION, 0, options, bitrate, 0, _MAGIC, 0)
+    version, data_kbitrate = (_FD_VERSION, data_bitrate // 1000) if fd else (_VERSION, 0)
+    return _LAYOUT.pack(_MARK, version, 0, options, bitrate, 0, _MAGIC, 0, data_kbitrate)
 
 
-def read_answer(record: bytes, wanted_bitrate: int, where: str) -> Welcome:
+def read_answer(record: bytes, wanted_bitrate: int, where: str, *, fd: bool = False, data_bitrate: int = 0) -> Welcome:
     """The bus's answer to `ask`. `where` names the endpoint in errors.
 
     Raises `UsageError` for a wrong bit rate, `EndpointBusy` when the bus is full, `Unreachable` when the other end is of
@@ -59,9 +71,17 @@ def read_answer(record: bytes, wanted_bitrate: int, where: str) -> Welcome:
     """
     if len(record) != RECORD_SIZE:
         raise Unreachable("what answers there is no software CAN bus", got=f"{len(record)} bytes", where=where)
-    mark, version, status, _, bitrate, bus_ns, magic, window = _LAYOUT.unpack(record)
+    mark, version, status, _, bitrate, bus_ns, magic, window, data_kbitrate = _LAYOUT.unpack(record)
     if mark != _MARK or magic != _MAGIC:
         raise Unreachable("what answers there is no software CAN bus", got=record.hex(), where=where)
+    if status == _WRONG_BITRATE and wanted_bitrate in (0, bitrate):
+        raise UsageError(
+            "the software CAN bus has another data bit rate",
+            expected=f"{data_bitrate} bit/s",
+            got=f"{data_kbitrate * 1000} bit/s",
+            where=where,
+            hint="start the bus with that one: fieldtwin can-bus --data-bitrate N",
+        )
     if status == _WRONG_BITRATE:
         raise UsageError(
             "the software CAN bus runs at another bit rate",
@@ -72,12 +92,13 @@ def read_answer(record: bytes, wanted_bitrate: int, where: str) -> Welcome:
         )
     if status == _FULL:
         raise EndpointBusy("the software CAN bus has no room for another node", where=where)
-    if status != _WELCOME or version != _VERSION:
+    wanted_version = _FD_VERSION if fd else _VERSION
+    if status != _WELCOME or version != wanted_version:
         raise Unreachable(
             "the software CAN bus speaks another version",
-            expected=f"version {_VERSION}",
+            expected=f"version {wanted_version}",
             got=f"version {version}, status {status}",
             where=where,
             hint="run the same fieldtwin on both sides",
         )
-    return Welcome(bitrate, max(window, 1), bus_ns)
+    return Welcome(bitrate, max(window, 1), bus_ns, data_kbitrate * 1000)

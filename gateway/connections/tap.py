@@ -82,7 +82,7 @@ class _TappedBytes(ByteConnection):
 
     def __init__(self, inner: ByteConnection, endpoint: Endpoint, observers: _Observers) -> None:
         super().__init__(inner.inbound, endpoint, inner.max_pending)
-        self._inner = inner
+        self._inner, self.local = inner, inner.local
         self._observers = observers
         for chunk in inner.inbound.data_stream:  # arrived while it was being opened
             observers.saw_bytes(endpoint, Direction.RECEIVED, chunk)
@@ -131,6 +131,7 @@ class _TappedCan(CanConnection):
         self.bitrate = int(getattr(inner, "bitrate", 0))
         """What the medium runs at (bit/s), 0 where it does not know."""
         super().__init__(cast(CANConnection, inner.inbound), endpoint, inner.max_pending)
+        self.local = inner.local
         for frame in inner.inbound.data_stream:
             observers.saw_frame(endpoint, Direction.RECEIVED, frame)
         inner.on_arrival = self._arrived
@@ -241,6 +242,10 @@ class TapFile(Tap):
         if frame.error:
             line["error"] = True  # candump's notation does not tell an error frame from a data frame
         self._write(line)
+
+    def on_refusal(self, refusal: Mapping[str, object]) -> None:
+        """A write that did not reach its device, with its ``t_ns``: no traffic, but part of what happened."""
+        self._write({"t_ns": refusal["t_ns"], "refused": dict(refusal)})
 
     def close(self) -> None:
         """Finish the file. Closing twice does nothing; what comes afterwards is counted as dropped."""

@@ -10,6 +10,7 @@ import socket
 import ssl
 from typing import Self, cast
 
+from gateway.connections.addresses import address_of
 from gateway.core.connection import ByteConnection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost, Unreachable
@@ -93,6 +94,11 @@ class TcpConnection(ByteConnection):
         if self._wire.closing:
             raise _ended(self.endpoint)
 
+    def on_end_of_stream(self, error: ConnectionLost) -> bool:
+        """Take note that the far side sends nothing more. True: it may still be sent to."""
+        self.feed_lost(error)
+        return False
+
     async def aclose(self) -> None:
         """Send what was written (at most `CLOSE_LIMIT_S`), then close. Closing twice does nothing."""
         self.feed_lost(closed_here(self.endpoint))
@@ -137,6 +143,7 @@ class _Wire(asyncio.BufferedProtocol):
         self.transport = transport
         transport.set_write_buffer_limits(high=WRITE_HIGH_WATER)
         _tune(transport.get_extra_info("socket"))
+        self._connection.local = address_of(transport)
 
     def get_buffer(self, sizehint: int) -> bytearray:
         return self._buffer
@@ -147,8 +154,7 @@ class _Wire(asyncio.BufferedProtocol):
             self.transport.pause_reading()
 
     def eof_received(self) -> bool:
-        self._connection.feed_lost(_ended(self._connection.endpoint))
-        return False
+        return self._connection.on_end_of_stream(_ended(self._connection.endpoint))
 
     def connection_lost(self, exc: Exception | None) -> None:
         if exc is None:

@@ -10,6 +10,7 @@ import asyncio
 import socket
 from typing import cast
 
+from gateway.connections.addresses import address_of
 from gateway.connections.tcp import resolve
 from gateway.core.connection import ByteConnection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
@@ -88,6 +89,7 @@ class _Wire(asyncio.DatagramProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.DatagramTransport, transport)  # on 3.11 it is none by inheritance
         cast(asyncio.WriteTransport, transport).set_write_buffer_limits(high=WRITE_HIGH_WATER)
+        self._connection.local = address_of(transport)
 
     def datagram_received(self, data: bytes, addr: object) -> None:
         connection = self._connection

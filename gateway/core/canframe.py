@@ -1,7 +1,8 @@
-"""One CAN 2.0 frame, and the fixed-size record that carries it over the software CAN bus.
+"""One CAN frame, and the fixed-size record that carries it over the software CAN bus.
 
 The record is a carrier, not a protocol under test: both sides may share it. Its layout (network byte order, 24 bytes):
-flags u8, dlc u8, two spare bytes, identifier u32, time stamp u64 (ns), data 8 bytes padded with zeros.
+flags u8, dlc u8, two spare bytes, identifier u32, time stamp u64 (ns), data 8 bytes padded with zeros. A connection that carries
+CAN FD has records of 80 bytes, which differ only in their 64 bytes of data; their dlc is the number of bytes.
 Fixed size, so that a reader can take exactly one from a socket and leave the rest readable (DESIGN.md decision 4).
 """
 
@@ -11,23 +12,34 @@ import struct
 
 import msgspec
 
-from gateway.core.errors import Desync
+from gateway.core.errors import Desync, UsageError
 
 _RECORD = struct.Struct("!BBxxIQ8s")
+_FD_RECORD = struct.Struct("!BBxxIQ64s")
 RECORD_SIZE = _RECORD.size
+FD_RECORD_SIZE = _FD_RECORD.size
+FD_LENGTHS = frozenset({*range(9), 12, 16, 20, 24, 32, 48, 64})
+"""Bytes that a CAN FD frame can carry (ISO 11898-1:2015, 10.4.2.4)."""
 
 FLAG_EXTENDED = 0x01
 FLAG_REMOTE = 0x02
 FLAG_ERROR = 0x04
 FLAG_TX_CONFIRMED = 0x08
 """The bus tells the sender that this very frame was on the wire (record only; never on a received frame)."""
+FLAG_FD = 0x10
+FLAG_BIT_RATE_SWITCH = 0x20
+FLAG_ERROR_STATE = 0x40
+_FD_FLAGS = FLAG_FD | FLAG_BIT_RATE_SWITCH | FLAG_ERROR_STATE
 
 
 _set = msgspec.structs.force_setattr
 
 
 class CanFrame(msgspec.Struct, frozen=True, gc=False):
-    """A classic CAN frame. `can_id` is 11 bits, 29 with `extended`; `data` is 0 to 8 bytes.
+    """A classic CAN frame, or one of CAN FD. `can_id` is 11 bits, 29 with `extended`; `data` is 0 to 8 bytes.
+
+    With `fd` it carries up to 64 bytes (`FD_LENGTHS`) and `dlc` is their number; with `brs` its data phase is sent at the data
+    bit rate, and `esi` says that its sender was error-passive.
 
     A remote frame (`remote`) has no data and asks for `dlc` bytes. `t_ns` is when it was received (monotonic, 0 if
     unknown) and does not count for equality of content: compare `key()`.
@@ -40,11 +52,17 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
     error: bool = False
     dlc: int = -1
     t_ns: int = 0
+    fd: bool = False
+    brs: bool = False
+    esi: bool = False
 
     def __post_init__(self) -> None:
         length = len(self.data)
         if self.dlc < 0:
             _set(self, "dlc", length)
+        if self.fd or self.brs or self.esi:
+            self._check_fd()
+            return
         if 0 <= self.can_id <= 0x7FF and length <= 8 and self.dlc <= 8:
             return  # whatever its flags
         limit = 0x1FFFFFFF if self.extended or self.error else 0x7FF
@@ -55,42 +73,72 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
                 got=f"{self.can_id:X}h with {len(self.data)} bytes",
             )
 
+    def _check_fd(self) -> None:
+        limit, length = 0x1FFFFFFF if self.extended else 0x7FF, len(self.data)
+        good = self.fd and not self.remote and not self.error and length in FD_LENGTHS and self.dlc == length
+        if not good or not 0 <= self.can_id <= limit:
+            raise Desync(
+                "not a CAN FD frame",
+                expected=f"a data frame, an identifier up to {limit:X}h, and 0 to 8, 12, 16, 20, 24, 32, 48 or 64 bytes",
+                got=f"{self.can_id:X}h with {length} bytes",
+            )
+
     def at(self, t_ns: int) -> CanFrame:
         """The same frame, received at `t_ns`."""
         frame: CanFrame = self.__copy__()  # type: ignore[attr-defined]  # each Struct's: what is a frame is not checked again
         _set(frame, "t_ns", t_ns)
         return frame
 
-    def key(self) -> tuple[int, bytes, bool, bool, bool, int]:
+    def key(self) -> tuple[int, bytes, bool, bool, bool, int, bool, bool, bool]:
         """All that is on the wire: equal for frames that look the same to a bus analyser."""
-        return self.can_id, self.data, self.extended, self.remote, self.error, self.dlc
+        return self.can_id, self.data, self.extended, self.remote, self.error, self.dlc, self.fd, self.brs, self.esi
 
     def __str__(self) -> str:
-        """As candump writes it: ``705#7F`` or ``605#R8``."""
+        """As candump writes it: ``705#7F`` or ``605#R8``; ``123##1CAFE`` for CAN FD with bit-rate switch."""
         width = 8 if self.extended else 3
+        if self.fd:
+            return f"{self.can_id:0{width}X}##{self.brs + 2 * self.esi:X}{self.data.hex().upper()}"
         body = f"R{self.dlc}" if self.remote else self.data.hex().upper()
         return f"{self.can_id:0{width}X}#{body}"
 
 
-def pack_record(frame: CanFrame, *, confirmed: bool = False) -> bytes:
-    """The 24-byte record of a frame."""
+def pack_record(frame: CanFrame, *, confirmed: bool = False, fd: bool = False) -> bytes:
+    """Return the record of a frame: 24 bytes, or 80 on a connection that carries CAN FD (`fd`).
+
+    Raises `UsageError` for a CAN FD frame on a connection that carries none.
+    """
     flags = (
         (FLAG_EXTENDED if frame.extended else 0)
         | (FLAG_REMOTE if frame.remote else 0)
         | (FLAG_ERROR if frame.error else 0)
         | (FLAG_TX_CONFIRMED if confirmed else 0)
     )
+    if fd:
+        flags |= (
+            (FLAG_FD if frame.fd else 0)
+            | (FLAG_BIT_RATE_SWITCH if frame.brs else 0)
+            | (FLAG_ERROR_STATE if frame.esi else 0)
+        )
+        return _FD_RECORD.pack(flags, frame.dlc, frame.can_id, frame.t_ns, frame.data)
+    if frame.fd:
+        raise UsageError("this connection carries classic CAN frames only", got=str(frame))
     return _RECORD.pack(flags, frame.dlc, frame.can_id, frame.t_ns, frame.data.ljust(8, b"\0"))
 
 
 def unpack_record(record: bytes) -> tuple[CanFrame, bool]:
-    """A frame and whether the record is a TX confirmation. Raises `Desync` on a record that is none."""
-    if len(record) != RECORD_SIZE:
+    """Return a frame and whether the record is a TX confirmation; its length says which kind of record it is.
+
+    Raises `Desync` on a record that is none.
+    """
+    if len(record) not in (RECORD_SIZE, FD_RECORD_SIZE):
         raise Desync("a record of the software CAN bus", expected=f"{RECORD_SIZE} bytes", got=f"{len(record)} bytes")
-    flags, dlc, can_id, t_ns, data = _RECORD.unpack(record)
-    if dlc > 15 or flags & 0xF0:
+    of_fd = len(record) == FD_RECORD_SIZE
+    flags, dlc, can_id, t_ns, data = (_FD_RECORD if of_fd else _RECORD).unpack(record)
+    fd = bool(flags & FLAG_FD)
+    if flags & 0x80 or (flags & _FD_FLAGS and not of_fd) or dlc > (64 if fd else 15):
         raise Desync("a record of the software CAN bus", expected="dlc 0 to 15, known flags", got=record.hex())
-    dlc = min(dlc, 8)  # a classic frame's length codes 9 to 15 mean 8 bytes (ISO 11898-1, 8.4.2.4)
+    if not fd:
+        dlc = min(dlc, 8)  # a classic frame's length codes 9 to 15 mean 8 bytes (ISO 11898-1, 8.4.2.4)
     remote = bool(flags & FLAG_REMOTE)
     frame = CanFrame(
         can_id,
@@ -100,5 +148,8 @@ def unpack_record(record: bytes) -> tuple[CanFrame, bool]:
         error=bool(flags & FLAG_ERROR),
         dlc=dlc,
         t_ns=t_ns,
+        fd=fd,
+        brs=bool(flags & FLAG_BIT_RATE_SWITCH),
+        esi=bool(flags & FLAG_ERROR_STATE),
     )
     return frame, bool(flags & FLAG_TX_CONFIRMED)

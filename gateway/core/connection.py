@@ -92,6 +92,8 @@ class _End(Generic[T]):
         """Told of every item at the moment it arrives, read or not (a tap). It may not feed, read or raise."""
         self.intercept: Callable[[T], bool] | None = None
         """Handed each item before anybody sees it; True: it took the item, and may pass it on with `feed_through`."""
+        self.local = ""
+        """The address of this end, ``HOST:PORT``, where the medium has such addresses."""
         self._lost: FieldtwinError | None = None
         self._waiter: asyncio.Future[None] | None = None
 

@@ -31,6 +31,9 @@ from gateway.core.errors import (
 VERSION = 1
 MAX_LINE = 4 * 1024 * 1024
 MAX_CLIENTS = 64
+LINE_WITHIN_S = 10.0
+"""A request that has begun is complete by then, and a client that needs a token has shown it; otherwise it is dropped. Without
+this limit, clients that send nothing, or one byte at a time, would take every place."""
 
 Verb = Callable[[dict[str, Any]], Awaitable[Any]]
 
@@ -109,12 +112,13 @@ class ControlServer:
             return
         self._clients[writer] = asyncio.current_task()
         try:
-            while line := await reader.readline():
+            until_s = asyncio.get_running_loop().time() + LINE_WITHIN_S
+            while line := await _read_line(reader, None if trusted else until_s):
                 answer, trusted = await self._answer(line, trusted)
                 writer.write(answer)
                 await writer.drain()
-        except (ConnectionError, asyncio.CancelledError, ValueError):
-            pass  # client gone, server closing, or a line over the limit: only this client is dropped
+        except (ConnectionError, TimeoutError, asyncio.CancelledError, ValueError):
+            pass  # client gone or too slow, server closing, or a line over the limit: only this client is dropped
         finally:
             self._clients.pop(writer, None)
             writer.close()
@@ -137,6 +141,18 @@ class ControlServer:
         except Exception as e:  # a verb's bug must not take the channel down; it is reported to the caller
             error = Bug(f"{type(e).__name__}: {e}")
         return _encode(request_id, {"ok": False, "error": _describe(error)}), trusted
+
+
+async def _read_line(reader: asyncio.StreamReader, until_s: float | None) -> bytes:
+    """Read a request; empty at the end. Raises `TimeoutError` if it is not complete `LINE_WITHIN_S` after its first byte, or at
+    the loop's time `until_s`, and `ValueError` if it is too long.
+    """
+    async with asyncio.timeout_at(until_s):
+        first = await reader.read(1)
+        if first in (b"", b"\n"):
+            return first
+        async with asyncio.timeout(LINE_WITHIN_S):
+            return first + await reader.readline()
 
 
 def _parse(line: bytes) -> dict[str, Any]:

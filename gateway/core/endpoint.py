@@ -13,8 +13,9 @@
 ``pty:line1``                                       (listening side only) a virtual serial port with that link name
 ==================================================  =====================================================
 
-A serial port also takes ``rs485=1``: the driver switches the transceiver's direction. Secrets are named by their file,
-never written into an endpoint: endpoints are shown everywhere.
+A serial port also takes ``rs485=1``: the driver switches the transceiver's direction. An RTU port takes ``silence_us=1000``:
+the silence before a request, in microseconds. Secrets are named by their file, never written into an endpoint: endpoints are
+shown everywhere.
 
 Pure text handling: this module opens nothing and knows no operating system.
 """
@@ -33,7 +34,8 @@ SOCKET_SCHEMES = ("tcp", "rtu+tcp", "udp", "tls")
 SCHEMES = (*SERIAL_SCHEMES, *SOCKET_SCHEMES, "can", "pty")
 DEFAULT_PORTS = {"tcp": 502, "udp": 502, "tls": 802}
 
-SERIAL_PARAMS = ("baudrate", "frame", "rs485")
+SERIAL_PARAMS = ("baudrate", "frame", "rs485", "silence_us")
+MOST_SILENCE_US = 100_000
 TLS_PARAMS = ("ca", "cert", "key", "name")
 
 _FRAME = re.compile(r"^([78])([NEO])([12])$")
@@ -92,11 +94,10 @@ class Endpoint:
         scheme, colon, rest = url.partition(":")
         scheme = scheme.lower()
         if not colon or scheme not in SCHEMES:
-            near = difflib.get_close_matches(scheme, SCHEMES, n=1) if colon else []
             raise UsageError(
                 f"cannot read endpoint {url!r}",
                 expected="one of " + ", ".join(f"{s}:" for s in SCHEMES),
-                hint=f"did you mean {near[0]}:?" if near else "",
+                hint=_meant(url, scheme if colon else ""),
             )
         rest, _, query = rest.partition("?")
         params = tuple(parse_qsl(query, keep_blank_values=True))
@@ -149,6 +150,25 @@ class Endpoint:
         return text == "1"
 
     @property
+    def silence_s(self) -> float | None:
+        """The silence that a Modbus RTU client keeps before a request, in seconds. None: the one that the standard recommends.
+
+        Above 19200 baud that is 1.75 ms (SL 2.5.1.1). A shorter one, of at least 3.5 characters, is for devices that take it.
+        """
+        text = self.param("silence_us")
+        if not text:
+            return None
+        if self.scheme != "rtu":
+            raise UsageError(
+                f"endpoint {self}: silence_us", expected="an rtu: endpoint; no other framing ends by silence"
+            )
+        least_us = -int(-3.5e6 * self.serial.char_time_s // 1)
+        if not _NUMBER.match(text) or not least_us <= int(text) <= MOST_SILENCE_US:
+            expected = f"{least_us} (3.5 characters) to {MOST_SILENCE_US} microseconds"
+            raise UsageError(f"endpoint {self}: silence_us", expected=expected, got=repr(text))
+        return int(text) / 1e6
+
+    @property
     def address(self) -> tuple[str, int]:
         """Host and port of a socket endpoint, or of a software CAN bus."""
         if self.is_can:
@@ -193,6 +213,15 @@ def _check_params(endpoint: Endpoint) -> None:
     if endpoint.is_serial or endpoint.scheme == "pty":
         endpoint.serial  # noqa: B018  reading it checks it
         endpoint.rs485  # noqa: B018
+        endpoint.silence_s  # noqa: B018
+
+
+def _meant(url: str, scheme: str) -> str:
+    """Return a hint for a text that is not an endpoint: a device's path without its scheme, or a misspelt scheme."""
+    if url.startswith("/dev/"):
+        return f"a serial port is rtu:{url}?baudrate=9600&frame=8N1"
+    near = difflib.get_close_matches(scheme, SCHEMES, n=1)
+    return f"did you mean {near[0]}:?" if near else ""
 
 
 def _host_port(url: str, scheme: str, rest: str) -> tuple[str, int]:

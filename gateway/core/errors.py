@@ -85,11 +85,13 @@ class NotAllowed(UsageError):
 class FileInvalid(FieldtwinError):
     """A file that a user wrote or recorded cannot be used as it is.
 
-    `line` and `column` count from 1; 0 where the file has none.
+    `line` and `column` count from 1; 0 where the file has none. `others` are the further errors that the same check found (at
+    most `MAX_OTHERS`); the command line prints each on a line of its own.
     """
 
     exit_code = 3
     blame = Blame.FILE
+    MAX_OTHERS: ClassVar[int] = 50
 
     def __init__(
         self,
@@ -101,10 +103,12 @@ class FileInvalid(FieldtwinError):
         expected: str = "",
         got: str = "",
         hint: str = "",
+        others: tuple[FileInvalid, ...] = (),
     ) -> None:
         self.path = path
         self.line = line
         self.column = column
+        self.others = others[: self.MAX_OTHERS]
         where = path
         if line:
             where += f":{line}" + (f":{column}" if column else "")
@@ -156,6 +160,14 @@ class CrcError(WireError):
 
 class Desync(WireError):
     """A frame arrived that is no answer to the request: another unit, function, size, transaction or index."""
+
+
+class WrongSize(Desync):
+    """A reply to this function arrived whole and carries `got_bytes` bytes of values, which is not the number asked for."""
+
+    def __init__(self, message: str, *, expected: str = "", got: str = "", hint: str = "", got_bytes: int = 0) -> None:
+        self.got_bytes = got_bytes
+        super().__init__(message, expected=expected, got=got, hint=hint)
 
 
 # -- the device ---------------------------------------------------------------------------------------------------

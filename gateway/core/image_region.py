@@ -145,10 +145,12 @@ class RegionWriter(_Region):
         but: Mapping[int, Quality] | None = None,
         *,
         same: bool = False,
+        missing: Mapping[int, Reason] | None = None,
     ) -> int:
         """`publish` for a writer whose values are all of one quality and instant (a scan): no object a tag is made.
 
-        `but` has the quality of the few tags, by index, that differ. A None has no value and is BAD, NEVER_READ.
+        `but` has the quality of the few tags, by index, that differ. A None has no value and is BAD,
+        NEVER_READ, or for the reason that `missing` has for its index.
         `same`: `values`, `quality`, `reason` and `but` are what the caller published last; then they are not looked at.
         """
         count = len(values)
@@ -163,6 +165,11 @@ class RegionWriter(_Region):
         if None in values:
             marks = bytes([Quality.BAD if v is None else m for v, m in zip(values, marks, strict=True)])
             reasons = bytes([Reason.NEVER_READ if v is None else reason for v in values])
+            if missing:
+                mixed = bytearray(reasons)
+                for index, other_reason in missing.items():
+                    mixed[index] = other_reason if values[index] is None else mixed[index]
+                reasons = bytes(mixed)
         stamps = now_ns.to_bytes(8, "little", signed=True) * count
         return self._publish(values, marks, reasons, stamps, now_ns, messages, flags)
 

@@ -84,6 +84,10 @@ class Tag:
         assert self.at is not None
         return self.at
 
+    def number_of(self, value: int | float | str) -> int | float | str:
+        """Return the number of a value that the profile names (`values: {0: OFF}`), and every other value unchanged."""
+        return next((number for number, name in self.values if name == value), value)
+
     @property
     def readable(self) -> bool:
         return self.access != "wo"
@@ -95,6 +99,11 @@ class Tag:
     @property
     def is_text(self) -> bool:
         return self.type in ("string", "bytes")
+
+    @property
+    def is_bit(self) -> bool:
+        """True when the value is a single bit: type bool, or one bit of a register."""
+        return self.type == "bool" or (self.bits is not None and self.bits[0] == self.bits[1])
 
     @property
     def is_integer(self) -> bool:

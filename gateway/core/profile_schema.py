@@ -191,6 +191,10 @@ class ProfileForm(Strict):
     limits: Limits = Limits()
     timing: TimingForm = TimingForm()
     gaps: list[str] = Field(default=[], description='registers that no read may go over, such as "holding:10..19"')
+    undeclared: Literal["exception", "zero", "hold"] = Field(
+        default="exception",
+        description="what registers are that no tag names, in the tables that have tags: refused (02), 0, or 0 until written",
+    )
     defaults: Defaults = Defaults()
     eds: str | None = None
     identify: list[IdentifyForm] = []
@@ -203,6 +207,11 @@ class ProfileForm(Strict):
     effects: list[EffectForm] = Field(default=[], description="what reading or writing a tag does to others")
     server_id: str | None = Field(
         default=None, pattern=r"^([0-9A-Fa-f]{2} ?){1,249}$", description="what function 11h tells, in hex"
+    )
+    server_data: str = Field(
+        default="",
+        pattern=r"^([0-9A-Fa-f]{2} ?){0,249}$",
+        description="what function 11h tells after the run indicator, in hex",
     )
     identification: dict[ByteNumber, Annotated[str, Field(max_length=244)]] = Field(
         default={}, description="objects of function 2Bh/0Eh: 0 vendor, 1 product code, 2 revision, 3 to 6, 128 to 255"

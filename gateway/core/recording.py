@@ -27,6 +27,7 @@ from typing import BinaryIO, Literal, TypeVar
 import msgspec
 
 from gateway.core.errors import Bug, FileInvalid
+from gateway.core.input_file import open_input
 
 VERSION = 1
 MAX_LINE_BYTES = 65_536
@@ -153,7 +154,7 @@ class RecordingReader:
         self.lines = 0
         self.truncated = False
         try:
-            self._file: BinaryIO = path.open("rb")
+            self._file: BinaryIO = open_input(path)
         except OSError as error:
             raise FileInvalid(f"cannot read the recording: {error.strerror}", path=str(path)) from error
         try:

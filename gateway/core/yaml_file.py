@@ -11,20 +11,27 @@ column of every key and value are kept, so that a validation error can name them
 from __future__ import annotations
 
 import difflib
+import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from gateway.core.errors import FileInvalid
+from gateway.core.input_file import read_input
 
 MAX_BYTES = 8 * 1024 * 1024
 """A configuration file larger than this is a mistake (a recording given as a system file, say)."""
 
 MAX_VALUES = 100_000
+
+MAX_DIGITS = 21
+"""Characters of an integer, with its sign."""
 
 Key = str | int
 Position = tuple[int, int]
@@ -44,6 +51,27 @@ for _tag, _pattern, _first in (
 ):
     _Loader.add_implicit_resolver(_tag, re.compile(_pattern), list(_first))
 
+
+def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
+    """An integer of at most 64 bits: more digits cost time, and no register, object or time has them."""
+    text = str(node.value)
+    value = (
+        int(text, 0) if len(text) <= MAX_DIGITS and "x" in text else int(text) if len(text) <= MAX_DIGITS else 1 << 64
+    )
+    if not -(1 << 63) <= value < 1 << 64:
+        raise yaml.constructor.ConstructorError(None, None, "an integer of more than 64 bits", node.start_mark)
+    return value
+
+
+def _number(loader: _Loader, node: yaml.ScalarNode) -> float:
+    value = float(node.value)
+    if not math.isfinite(value):
+        raise yaml.constructor.ConstructorError(None, None, "a number that is too large", node.start_mark)
+    return value
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _integer)
+_Loader.add_constructor("tag:yaml.org,2002:float", _number)
 
 _OTHER_FILES = (
     (b"PK\x03\x04", "a zip; if it is a template: fieldtwin template unpack"),
@@ -81,10 +109,7 @@ class YamlFile:
 def load(path: Path) -> YamlFile:
     """Read and parse `path`. The top must be a mapping."""
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise FileInvalid("the file is too large", path=str(path), expected=f"at most {MAX_BYTES} bytes")
-        raw = path.read_bytes()
-        text = raw.decode("utf-8")
+        text = read_input(path, MAX_BYTES).decode("utf-8")
     except OSError as e:
         raise FileInvalid(f"cannot read the file: {e.strerror or e}", path=str(path)) from e
     except UnicodeDecodeError as e:
@@ -152,7 +177,10 @@ def _note_positions(
 
 
 def validate(file: YamlFile, model: type[M]) -> M:
-    """The file as a `model`; the first thing wrong is named with its line, what was expected and what came."""
+    """Return the file as a `model`.
+
+    Raises `FileInvalid` for the first error, with line, expected and given value; `FileInvalid.others` holds the other errors.
+    """
     try:
         return model.model_validate(file.data)
     except ValidationError as e:
@@ -161,28 +189,83 @@ def validate(file: YamlFile, model: type[M]) -> M:
 
 def _translate(file: YamlFile, model: type[BaseModel], e: ValidationError) -> FileInvalid:
     errors = sorted(e.errors(), key=lambda d: d["type"] != "extra_forbidden")  # a misspelt key explains a missing one
-    first = errors[0]
-    loc = _in_file(file, first["loc"])
+    places: dict[tuple[Key, ...], list[ErrorDetails]] = {}
+    for error in errors:
+        missing = (str(error["loc"][-1]),) if error["type"] == "missing" else ()
+        places.setdefault((*_in_file(file, error["loc"]), *missing), []).append(error)
+    first, *others = (_translate_place(file, model, found) for found in places.values())
+    first.others = tuple(others[: FileInvalid.MAX_OTHERS])
+    return first
+
+
+def _translate_place(file: YamlFile, model: type[BaseModel], errors: list[ErrorDetails]) -> FileInvalid:
+    """One error for a value that fits no branch of a union, with what every branch expects."""
+    expected = [expected_value(error, _keys_at(model, error["loc"])) for error in errors]
+    if not all(expected):
+        return _translate_one(file, model, errors[0])
+    loc = _in_file(file, errors[0]["loc"])
+    name = ".".join(str(part) for part in loc) or "the file"
+    given = errors[0]["input"]
+    got = str(given).lower() if isinstance(given, bool) else repr(given)[:80]
+    return file.error(loc, name, expected=" or ".join(dict.fromkeys(expected)), got=got)
+
+
+_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "string": "text",
+    "bool": "true or false",
+    "list": "a list",
+    "tuple": "a list",
+    "dict": "keys with values",
+    "model": "keys with values",
+}
+_LIMITS = {"greater_than": "gt", "greater_than_equal": "ge", "less_than": "lt", "less_than_equal": "le"}
+_LIMIT_WORDS = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+
+
+def expected_value(error: ErrorDetails, keys: Iterable[str] = ()) -> str:
+    """Return in plain English what pydantic expected of a value, or an empty text if its own message has to do.
+
+    `keys` are those of the form that a value should have been.
+    """
+    kind, _, rest = error["type"].partition("_")
+    if kind == "model" and keys:
+        return f"the keys {', '.join(keys)}"
+    if rest in ("type", "parsing", "from_float", "attributes_type"):
+        return _KINDS.get(kind, "")
+    if limit := _LIMITS.get(error["type"]):
+        value = error["ctx"][limit]
+        return f"{_LIMIT_WORDS[limit]} {f'{value:g}' if isinstance(value, float) else value}"
+    return ""
+
+
+def _keys_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """The keys of the form at `loc`; none if there is no form there."""
+    return _known_keys(model, loc) if loc else list(model.model_fields)
+
+
+def _translate_one(file: YamlFile, model: type[BaseModel], error: ErrorDetails) -> FileInvalid:
+    loc = _in_file(file, error["loc"])
     name = ".".join(str(part) for part in loc)
-    more = f"; {len(errors) - 1} more" if len(errors) > 1 else ""
-    if first["type"] == "extra_forbidden":
-        known = _known_keys(model, first["loc"][:-1])
+    if error["type"] == "extra_forbidden":
+        known = _known_keys(model, error["loc"][:-1])
         near = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.5)
         expected = "one of " + ", ".join(sorted(known))
         hint = f"did you mean {near[0]!r}?" if near else ""
-        return file.error(loc, f"unknown key {str(loc[-1])!r}{_inside(loc)}{more}", expected=expected, hint=hint)
-    if first["type"] == "missing":
-        missing = str(first["loc"][-1])
-        return file.error(loc, f"the key {missing!r} is missing{_inside((*loc, missing))}{more}")
-    if first["type"] == "too_short" and not first["input"]:
-        return file.error(loc, f"{name} is empty{more}")
-    got = "" if first["type"] == "value_error" else repr(first["input"])[:80]
-    if first["type"] == "literal_error":
-        known = re.findall(r"'([^']*)'", str(first["ctx"]["expected"]))
-        near = difflib.get_close_matches(str(first["input"]), known, n=1, cutoff=0.5)
+        return file.error(loc, f"unknown key {str(loc[-1])!r}{_inside(loc)}", expected=expected, hint=hint)
+    if error["type"] == "missing":
+        missing = str(error["loc"][-1])
+        return file.error(loc, f"the key {missing!r} is missing{_inside((*loc, missing))}")
+    if error["type"] == "too_short" and not error["input"]:
+        return file.error(loc, f"{name} is empty")
+    got = "" if error["type"] == "value_error" else repr(error["input"])[:80]
+    if error["type"] == "literal_error":
+        known = re.findall(r"'([^']*)'", str(error["ctx"]["expected"]))
+        near = difflib.get_close_matches(str(error["input"]), known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else ""
-        return file.error(loc, f"{name}{more}", expected=" or ".join(known), got=got, hint=hint)
-    return file.error(loc, f"{name}: {first['msg'].removeprefix('Value error, ')}{more}", got=got)
+        return file.error(loc, name, expected=" or ".join(known), got=got, hint=hint)
+    return file.error(loc, f"{name}: {error['msg'].removeprefix('Value error, ')}", got=got)
 
 
 def _inside(loc: tuple[Key, ...]) -> str:

@@ -123,11 +123,17 @@ class CanopenDriver(DeviceDriver):
             return self._started
         return state is NmtState.OPERATIONAL and not self.master.heartbeat_lost(self.node)
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether a lost node would be noticed: its heartbeat has a limit, and was heard. A node that produces none, because the
+        gateway only listens, is not watched (CiA 301, 7.2.8.3.2.2: monitoring starts with the first heartbeat)."""
+        return self.config.heartbeat is not None and self.master.heartbeat_watched(self.node)
+
     def stale_after_ms(self, tag: Tag) -> int | None:
         """How long a value of `tag` is good without being refreshed; None for what cannot change while the node runs, and
         for what a TPDO tells only when it changes, while a heartbeat tells that the node would."""
         constant = tag.name in self.config.expect or (tag.object is not None and tag.object[0] in CONSTANT)
-        if constant or (tag.name in self._by_change and self.config.heartbeat is not None):
+        if constant or (tag.name in self._by_change and self.is_watched):
             return None
         return max(self.config.stale_after_ms, 3 * self.config.poll.get(tag.poll, 0))
 
@@ -183,7 +189,7 @@ class CanopenDriver(DeviceDriver):
         """
         if self.config.canopen.configuration is not None:
             await download_configuration(self.master, self.node, self.config.canopen.configuration)
-        if self.config.heartbeat is not None:
+        if self.config.heartbeat is not None and self.config.heartbeat.producer_ms is not None:
             await set_heartbeat_producer(self.master, self.node, self.config.heartbeat.producer_ms)
         if self.config.tpdo1 is not None:
             objects = [self._entry(self.profile.tags[t]) for t in self.config.tpdo1.tags]

@@ -34,9 +34,12 @@ class BusConfig:
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """CANopen heartbeat times in milliseconds: the node's producer time and our consumer time."""
+    """CANopen heartbeat times in milliseconds: the node's producer time and our consumer time.
 
-    producer_ms: int
+    `producer_ms` None: the node's producer time (1017h) is left as it is, and the gateway only listens.
+    """
+
+    producer_ms: int | None
     consumer_ms: int
 
 
@@ -68,6 +71,8 @@ class DeviceConfig:
     stale_after_ms: int = 5000
     writable: frozenset[str] = frozenset()
     safe: dict[str, float] = field(default_factory=dict)
+    write_groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """By name: tags that are written whole or not at all, in the order in which they are written."""
     heartbeat: Heartbeat | None = None
     tpdo1: Tpdo | None = None
     start: bool = False

@@ -8,7 +8,8 @@ are as old as the sample and not as the poll: a sensor that answers and does not
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Coroutine, Iterable
+from collections.abc import Coroutine, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from gateway.core.connection import PROTOCOL, ByteConnection
@@ -22,8 +23,14 @@ from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Lear
 from gateway.protocols.modbus.client import ModbusClient, UnitPace
 from gateway.protocols.modbus.replies import BitsReply, RegistersReply
 
+MOST_REGISTERS, MOST_COILS = 123, 1968
+"""What one request may write (AP 6.11 and 6.12)."""
 SAMPLED_STEPS = 0x80000000
 """A sample counter that moved by more than this went backwards: the device restarted."""
+
+
+NOTHING_READ = 1 << 16
+"""More registers or bits than a device has."""
 
 
 class Reading:
@@ -37,6 +44,14 @@ class Reading:
         self.blocks: list[tuple[Read, bytes]] = []
         self.values: dict[str, TagValue] = {}
         self.items: list[DATA] = []
+
+
+@dataclass
+class Progress:
+    """How far the writing of several tags got: those that were sent, and those that the device confirmed."""
+
+    sent: set[str] = field(default_factory=set)
+    confirmed: set[str] = field(default_factory=set)
 
 
 class RegisterDriver(DeviceDriver):
@@ -134,6 +149,14 @@ class RegisterDriver(DeviceDriver):
             raise WrongDevice(
                 "another device answers", expected=expected, got=self.identity_error, where=self.config.where
             )
+
+    def cost(self, what: str) -> int:
+        """Return how many registers or bits the first transaction of the group `what` reads: the cost of a failed try.
+
+        A group that reads nothing tells nothing about the device, so it costs more than any other.
+        """
+        plan = self.plans.get(what)
+        return plan.reads[0].range.count if plan is not None and plan.reads else NOTHING_READ
 
     def begin(self, what: str) -> Reading:
         """Start to read `what`, a poll group. Nothing is sent yet."""
@@ -286,6 +309,10 @@ class RegisterDriver(DeviceDriver):
         self.check(item)
         tag = self._tag_of(item)
         await self._write_tag(tag, item.data)
+        await self._verify(tag, item)
+
+    async def _verify(self, tag: Tag, item: COMMAND) -> None:
+        """Raise `VerifyFailed` where the device holds another value than the one that was written."""
         if tag.readable:
             held = await self._read_tag(tag)
             if int.from_bytes(held.raw) != int.from_bytes(item.data):  # a coil comes back as one byte
@@ -295,6 +322,47 @@ class RegisterDriver(DeviceDriver):
                     got=held.raw.hex(),
                     where=f"{self.config.where} {tag.registers}",
                 )
+
+    async def write_together(self, commands: Sequence[COMMAND], progress: Progress) -> None:
+        """Write the tags of `commands` and read each back: with one request where their registers, or coils, are adjacent, else
+        one after another in their order. When this raises, it may be called again with the same `progress` for the rest."""
+        tags = [self._tag_of(command) for command in commands]
+        data = {tag.name: command.data for tag, command in zip(tags, commands, strict=True)}
+        together = self._adjacent(tags)
+        if together:
+            progress.sent.update(data)
+            await self._write_adjacent(together, data)
+        for tag, command in zip(tags, commands, strict=True):
+            if tag.name in progress.confirmed:
+                continue
+            self.check(command)
+            progress.sent.add(tag.name)
+            if not together:
+                await self._write_tag(tag, command.data)
+            await self._verify(tag, command)
+            progress.confirmed.add(tag.name)
+
+    def _adjacent(self, tags: Sequence[Tag]) -> list[Tag]:
+        """`tags` by address, where one request can write them all; else none."""
+        ordered = sorted(tags, key=lambda tag: tag.registers.address)
+        table, function = ordered[0].registers.table, 15 if ordered[0].registers.table == "coil" else 16
+        end = ordered[0].registers.address
+        for tag in ordered:
+            if tag.registers.table != table or tag.registers.address != end:
+                return []
+            end += tag.registers.count
+        functions = self.profile.form.limits.functions
+        fits = end - ordered[0].registers.address <= (MOST_COILS if function == 15 else MOST_REGISTERS)
+        return ordered if fits and (functions is None or function in functions) else []
+
+    async def _write_adjacent(self, ordered: Sequence[Tag], data: Mapping[str, bytes]) -> None:
+        first = ordered[0].registers
+        raw = b"".join(data[tag.name] for tag in ordered)
+        words = [int.from_bytes(raw[i : i + 2]) for i in range(0, len(raw), 2)]
+        if first.table == "coil":
+            await self.client.write_coils(self.config.address, first.address, [bool(word) for word in words])
+        else:
+            await self.client.write_registers(self.config.address, first.address, words)
 
     async def _write_tag(self, tag: Tag, data: bytes) -> None:
         """Write a tag's registers with one request: function 10h, or 06 where the device has no other; a coil with 05, or

@@ -80,7 +80,8 @@ class LineFront:
             await self._clock.sleep_until_ns(self._clock.monotonic_ns() + int(backoff.next_s() * NS_PER_S))
 
     async def _listen(self, connection: ByteConnection) -> None:
-        line = RtuRequests(round(self.endpoint.serial.char_time_s * NS_PER_S))
+        ours = [unit for unit in range(256) if self._ours(unit)]
+        line = RtuRequests(round(self.endpoint.serial.char_time_s * NS_PER_S), ours)
         while True:
             data, noise_bytes = await self._next(connection, line), line.noise_bytes
             requests = line.feed(data) if data else line.silence()

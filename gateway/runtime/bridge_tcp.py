@@ -2,7 +2,8 @@
 
 Who answers is not known here: `ask` is given a request and returns its answer, or a promise of one. A client may have so
 many requests under way and no more (exception 06, case MB-053); one that does not read its answers is not read either.
-When it goes, its promises are cancelled: nobody waits for them any more (case MB-060).
+When its connection is lost, its promises are cancelled: nobody waits for them any more (case MB-060). A client that only
+closes its own direction (FIN after its last request) gets its answers before the connection is closed.
 """
 
 from __future__ import annotations
@@ -17,12 +18,16 @@ from gateway.connections.listeners import TcpListener
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Client, Clients, Listen
 from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
+from gateway.core.errors import ConnectionLost, Unreachable
 from gateway.core.nursery import Nursery
 from gateway.protocols.modbus.refusals import refusal
 from gateway.protocols.modbus.server import SERVER_BUSY, exception_pdu
 from gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
 from gateway.runtime.backoff import Backoff
+
+REQUEST_WITHIN_S = 10.0
+"""A request that has begun is complete by then; otherwise its client is closed. Without this limit a client that sends one
+byte at a time would keep its place for ever."""
 
 MOST_UNSENT = 64
 """Answers that may wait for a client to read; then no more of its requests are taken."""
@@ -52,12 +57,14 @@ Ask = Callable[[Caller, int, bytes], Answer]
 
 @dataclass
 class FrontCounters:
-    """Requests taken; refused because too many were under way; ADUs of other protocols; streams that made no sense."""
+    """Requests taken; refused because too many were under way; ADUs of other protocols; streams that made no sense; clients whose
+    request was not complete in time."""
 
     requests: int = 0
     busy: int = 0
     foreign: int = 0
     desyncs: int = 0
+    unfinished: int = 0
 
 
 class TcpFront:
@@ -131,18 +138,20 @@ class TcpFront:
             "busy": c.busy,
             "foreign": c.foreign,
             "desyncs": c.desyncs,
+            "unfinished": c.unfinished,
         }
 
     async def _serve(self, connection: Client) -> None:
-        session = _Session(connection, self._ask, self._in_flight, self.counters)
+        session = _Session(connection, self._ask, self._in_flight, self.counters, self._clock)
         await session.run()
 
 
 class _Session:
     """One client."""
 
-    def __init__(self, connection: Client, ask: Ask, in_flight: int, counters: FrontCounters) -> None:
+    def __init__(self, connection: Client, ask: Ask, in_flight: int, counters: FrontCounters, clock: Clock) -> None:
         self._connection = connection
+        self._clock = clock
         self._caller = Caller(f"{connection.peer}:{connection.peer_port}", connection.peer, connection.role)
         self._ask = ask
         self._in_flight = in_flight
@@ -152,22 +161,53 @@ class _Session:
         self._room = asyncio.Event()
 
     async def run(self) -> None:
-        """Until the client goes (`ConnectionLost`), or its stream makes no sense any more."""
+        """Until the client goes (`ConnectionLost`), its stream makes no sense any more, or a request takes too long to arrive."""
         stream = MbapRequests()
         try:
             async with Nursery() as nursery:
                 writer = nursery.start(self._write(), "answers")
-                while not stream.desync:
-                    data = await self._connection.read()
-                    foreign = stream.foreign
-                    for request in stream.feed(data):
-                        await self._take(request, writer)
-                    self._counters.foreign += stream.foreign - foreign
-                self._counters.desyncs += 1
+                try:
+                    begun_ns: int | None = None
+                    while not stream.desync:
+                        data = await self._read(begun_ns)
+                        if data is None:
+                            self._counters.unfinished += 1
+                            return
+                        foreign, requests = stream.foreign, stream.feed(data)
+                        for request in requests:
+                            await self._take(request, writer)
+                        self._counters.foreign += stream.foreign - foreign
+                        if not stream.unfinished:
+                            begun_ns = None
+                        elif begun_ns is None or requests:
+                            begun_ns = self._clock.monotonic_ns()
+                    self._counters.desyncs += 1
+                except ConnectionLost:
+                    await self._answer_the_rest(writer)
+                    raise
         finally:
             for _, answer in self._waiting:
                 if isinstance(answer, asyncio.Future):
                     answer.cancel()
+
+    async def _read(self, begun_ns: int | None) -> bytes | None:
+        """What the client sends next; None if the request that began at `begun_ns` is not complete in time."""
+        if begun_ns is None:
+            return await self._connection.read()
+        while (left_s := REQUEST_WITHIN_S - (self._clock.monotonic_ns() - begun_ns) / NS_PER_S) > 0:
+            if data := await self._connection.read_within(left_s):
+                return data
+        return None
+
+    async def _answer_the_rest(self, writer: asyncio.Task[None]) -> None:
+        """The client sends nothing more. If it only closed its own direction, it still waits for its answers.
+
+        A client that closed both directions looks the same until something is sent to it. So at most the request under way
+        and the next one are carried out for nobody.
+        """
+        while self._waiting and self._connection.lost is None and not writer.done():
+            self._room.clear()
+            await self._room.wait()
 
     async def _take(self, request: TcpRequest, writer: asyncio.Task[None]) -> None:
         while len(self._waiting) >= MOST_UNSENT and not writer.done():

@@ -13,6 +13,10 @@ from gateway.devices.config import DeviceConfig
 from gateway.devices.register_device import Reading, RegisterDriver
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.poll_schedule import PollSchedule, Rate, spread
+from gateway.runtime.probing import MARGIN_NS, Probing
+
+FOREVER_NS = 2**62
+"""No device waits for its next poll."""
 
 
 @dataclass
@@ -35,17 +39,34 @@ class DeviceState:
     """The group that is being read, of which some transactions are left; it began to be due at `reading_due_ns`."""
     reading_due_ns: int = 0
     triggered: set[str] = field(default_factory=set)
+    alone: bool = False
+    """It is the only device of its bus."""
+    asked_ns: int = 0
+    """When it was tried last while it was away."""
+    late_ns: int = 0
+    """What its reply took that came after a shortened timeout; 0: none did."""
+    last_cost_ns: int = 0
+    """How long it had the bus in vain although it answered at first."""
+    timeout_ns: int = 0
+    """The timeout of its next try; 0: its own."""
+    answered_ns: int = 0
+    """When it answered a poll last."""
+    silences: int = 0
+    """How often in a row a poll of it had no reply while it counts as there."""
+    fits: bool = True
+    """Whether its next try can end before another device misses a period."""
 
     @property
     def retries_left(self) -> bool:
-        """Whether a request that nobody answers is worth repeating: not while the device is known to be away."""
-        return self.online or not self.backoff.failures
+        """Whether a request without a reply is worth repeating: not while the device may be absent and others wait."""
+        return self.online or (self.alone and not self.backoff.failures)
 
 
 def states_of(drivers: list[RegisterDriver], offset: float) -> list[DeviceState]:
     """The devices of a bus, each with its groups' places in their periods; `offset` keeps several buses apart."""
     rates = rates_of([driver.config for driver in drivers], offset)
-    return [_state(driver, rates[driver.config.name]) for driver in drivers]
+    alone = len(drivers) == 1
+    return [_state(driver, rates[driver.config.name], alone) for driver in drivers]
 
 
 def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, dict[str, Rate]]:
@@ -59,14 +80,15 @@ def rates_of(configs: Sequence[DeviceConfig], offset: float = 0.0) -> dict[str, 
     return {config.name: {group: rates[config.name, group] for group in config.poll} for config in configs}
 
 
-def _state(driver: RegisterDriver, rates: dict[str, Rate]) -> DeviceState:
+def _state(driver: RegisterDriver, rates: dict[str, Rate], alone: bool) -> DeviceState:
     config, known = driver.config, driver.config.expect
     once = [
         group
         for group in driver.plans
         if group not in config.poll and any(t.name not in known for t in driver.profile.group(group))
     ]
-    return DeviceState(driver, PollSchedule(rates, once), Backoff(config.backoff_first_s, config.backoff_limit_s))
+    backoff = Backoff(config.backoff_first_s, config.backoff_limit_s)
+    return DeviceState(driver, PollSchedule(rates, once), backoff, alone=alone)
 
 
 def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], now_ns: int) -> None:
@@ -78,53 +100,130 @@ def restate(device: DeviceState, config: DeviceConfig, rates: dict[str, Rate], n
 
 
 class Turns:
-    """The order of polls among `devices`. Tries of those that are away get at most `probe_share` of the time, over 0 to
-    1, while others answer."""
+    """The order of polls among `devices`, and what `Probing` grants to those that are away. `share` is as there."""
 
-    def __init__(self, devices: list[DeviceState], probe_share: float) -> None:
+    def __init__(self, devices: list[DeviceState], share: float, t35_ns: int = 0) -> None:
         self._devices = devices
-        self._share = probe_share
+        self._probing = Probing(share, t35_ns)
         self._failed_ns = 0
-        self._free_ns = 0
+        self.doubt_ns = 0
+        """Polls of devices that answered since then go before those of the others, and repetitions last."""
 
-    def next(self, spaced_ns: Callable[[int], int], now_ns: int) -> tuple[DeviceState | None, str, int]:
+    def next(
+        self, spaced_ns: Callable[[int], int], now_ns: int, seen_ns: int = 0, bus_timeout_s: float = 1.0
+    ) -> tuple[DeviceState | None, str, int]:
         """The most overdue poll of those that may go now, else the one that may go first; and when that is.
 
-        `spaced_ns` tells until when a unit has its pause. A device that is away has only its next try (group ""); a group
-        of which some was read goes on before another one of its device begins.
+        `spaced_ns` tells until when a unit has its pause, `seen_ns` is the longest latency seen lately. A device that is away
+        has only its next try (group ""), for which its `timeout_ns` is set; a group of which some was read goes on before
+        another one of its device begins.
         """
-        best: tuple[int, int, int] | None = None
+        best: tuple[int, int, int, int] | None = None
         found: tuple[DeviceState | None, str] = None, ""  # a bus without polls only carries jobs
+        doubt_ns = self.doubt_ns
+        away: list[tuple[int, DeviceState, int]] = []
         for order, device in enumerate(self._devices):
-            if not device.online:
-                if device.tried and any(not d.tried for d in self._devices):
-                    continue  # first those that were not asked at all
-                choices: Iterable[tuple[str, int]] = (("", self._try_ns(device)),)
-            elif device.reading is not None:
-                choices = ((device.reading.what, device.reading_due_ns),)
-            else:
-                choices = device.schedule.due_ns.items()
             ready_ns = spaced_ns(device.driver.config.address)
             if ready_ns < now_ns:
                 ready_ns = now_ns
+            if not device.online:
+                away.append((order, device, ready_ns))
+                continue
+            choices: Iterable[tuple[str, int]]
+            if device.reading is not None:
+                choices = ((device.reading.what, device.reading_due_ns),)
+            else:
+                choices = device.schedule.due_ns.items()
             for group, due_ns in choices:
-                key = (due_ns if due_ns > ready_ns else ready_ns), due_ns, order
+                at_ns = due_ns if due_ns > ready_ns else ready_ns
+                doubt = 0 if device.answered_ns >= doubt_ns else 2 if device.silences else 1
+                key = at_ns, doubt, due_ns, order
                 if best is None or key < best:
                     best, found = key, (device, group)
+        if away:
+            free_ns = self._free_until_ns(best[0] if best is not None else None, now_ns)
+            probe = self._next_probe(away, now_ns, free_ns, seen_ns, bus_timeout_s)
+            if best is None or probe[0] < (best[0], best[2]):
+                return probe[1], "", probe[0][0]
         return *found, best[0] if best is not None else now_ns + NS_PER_S
 
-    def restate(self, probe_share: float) -> None:
+    def restate(self, share: float) -> None:
         """Another share, from the next try on."""
-        self._share = probe_share
+        self._probing.restate(share)
 
-    def _try_ns(self, device: DeviceState) -> int:
-        """When a device that is away is asked again. On a new connection each is asked once, whatever the share; polls
-        that fell due during one such try go before the next."""
-        return max(device.next_try_ns, self._free_ns) if device.tried else self._failed_ns
+    def _free_until_ns(self, poll_ns: int | None, now_ns: int) -> int | None:
+        """Until when the devices that answer can spare the bus; `now_ns` while a poll is due. None: no device answers."""
+        online = [device for device in self._devices if device.online]
+        if not online:
+            return None
+        if poll_ns is not None and poll_ns <= now_ns:
+            return now_ns
+        ends = [end for device in online if (end := device.schedule.free_until_ns()) is not None]
+        return min(ends, default=FOREVER_NS)
 
-    def failed(self, begun_ns: int, now_ns: int, clear_ns: int) -> None:
-        """A device had the bus in vain; the line can be used again at `clear_ns`, behind its quarantine. Those that answer
-        have their share of the time before the next try."""
+    def _next_probe(
+        self,
+        away: list[tuple[int, DeviceState, int]],
+        now_ns: int,
+        free_ns: int | None,
+        seen_ns: int,
+        bus_timeout_s: float,
+    ) -> tuple[tuple[int, int], DeviceState]:
+        """The device to ask first of those that are away, with when, and since when it waits.
+
+        Those that were not asked yet go before the others; among them, the one that was asked least recently.
+        """
+        untried = [entry for entry in away if not entry[1].tried]
+        best: tuple[tuple[int, int, int, int], DeviceState] | None = None
+        for order, device, ready_ns in untried or away:
+            due_ns = device.next_try_ns if device.tried else self._failed_ns
+            ready_ns = max(ready_ns, due_ns)
+            at_ns = self._probe_ns(device, ready_ns, now_ns, free_ns, seen_ns, bus_timeout_s)
+            key = at_ns, due_ns, device.asked_ns, order
+            if best is None or key < best[0]:
+                best = key, device
+        assert best is not None
+        return best[0][:2], best[1]
+
+    def _probe_ns(
+        self,
+        device: DeviceState,
+        ready_ns: int,
+        now_ns: int,
+        free_ns: int | None,
+        seen_ns: int,
+        bus_timeout_s: float,
+    ) -> int:
+        """When `device` may be asked, at `ready_ns` at the earliest. Sets what it gets then."""
+        own_ns = _own_ns(device, bus_timeout_s)
+        probing, failures, late_ns = self._probing, device.backoff.failures, device.late_ns
+        device.fits = True
+        if len(self._devices) == 1:
+            device.timeout_ns = 0
+            return ready_ns
+        if free_ns is None:
+            device.timeout_ns = probing.growing_ns(own_ns, seen_ns, late_ns, failures)
+            return ready_ns
+        device.timeout_ns = probing.short_ns(own_ns, seen_ns, late_ns)
+        if ready_ns > now_ns:
+            return ready_ns
+        device.fits = probing.fits(max(device.timeout_ns + MARGIN_NS, device.last_cost_ns), now_ns, free_ns)
+        if device.tried and probing.long_may_go(failures, now_ns):
+            device.timeout_ns, device.fits = own_ns, False
+        return probing.may_go_ns(device.fits, now_ns)
+
+    def short_s(self, device: DeviceState, seen_ns: int, bus_timeout_s: float) -> float:
+        """The shortened timeout of a device."""
+        return self._probing.short_ns(_own_ns(device, bus_timeout_s), seen_ns, device.late_ns) / NS_PER_S
+
+    def failed(self, device: DeviceState, begun_ns: int, now_ns: int, clear_ns: int) -> None:
+        """`device` had the bus in vain; the line can be used again at `clear_ns`, after its quarantine."""
         self._failed_ns = now_ns
-        if any(device.online for device in self._devices):
-            self._free_ns = clear_ns + int((clear_ns - begun_ns) * (1 / self._share - 1))
+        if any(other.online for other in self._devices):
+            self._probing.took(begun_ns, clear_ns, device.fits)
+
+
+def _own_ns(device: DeviceState, bus_timeout_s: float) -> int:
+    """How long the device may take to answer, in ns."""
+    own_s = device.driver.config.timeout_s
+    return round((bus_timeout_s if own_s is None else own_s) * NS_PER_S)

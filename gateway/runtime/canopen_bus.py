@@ -9,7 +9,7 @@ writes: on a plant that was not allowed, the nodes are listened to and nothing m
 from __future__ import annotations
 
 import asyncio
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -29,13 +29,14 @@ from gateway.protocols.canopen.emcy_log import EmcyLog
 from gateway.protocols.canopen.lss import UNCONFIGURED, LssAddress
 from gateway.protocols.canopen.lss_master import LssMaster
 from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
 from gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
+from gateway.protocols.canopen.sync_watch import SyncWatch
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.bus_turns import rates_of
 from gateway.runtime.coming import Coming
-from gateway.runtime.modbus_bus import reason_of
+from gateway.runtime.modbus_bus import MOST_LOCALS, reason_of
 from gateway.runtime.node_writes import Done, NodeWrites
 from gateway.runtime.poll_schedule import PollSchedule
 from gateway.runtime.tags import TagTable
@@ -62,6 +63,9 @@ class NodeStatus:
     online: bool = False
     error: str = "not asked yet"
     boots: int = 0
+    conflicts: int = 0
+    conflict: str = ""
+    """The last sign of a second node with this id. It stays, because nothing proves that the second node has gone."""
     emcy_log: EmcyLog = field(default_factory=EmcyLog)
     bring_ups: int = 0
     polls: int = 0
@@ -103,11 +107,14 @@ class CanopenBus:
         self.nodes = {d.node: self._status(d, drivers, clock) for d in drivers}
         self.connected = False
         self.opens = 0
+        self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
+        """The addresses that we connected from, latest last; empty texts for media without addresses."""
         self.error = ""
         self._coming: Coming | None = None
         self._nursery: Nursery | None = None
         self._stopping = False
         self._not_produced = 0
+        self.sync_watch = SyncWatch()
         self._connector = connector
         self._clock = clock
         self._tags = tags
@@ -218,7 +225,11 @@ class CanopenBus:
             master.latency = self.latency
             self._master, self._lss = master, LssMaster(master.send, self._clock)
             master.listen(LSS_REPLY, self._lss.on_reply)
+            if not self.sync_watch.verdict:
+                self.sync_watch = SyncWatch(own=bool(self.config.canopen.sync_ms and self._allow_writes))
+            master.on_sync = self.sync_watch.feed
             self.connected, self.error = True, ""
+            self.locals.append(connection.local)
             self.opens += 1
             try:
                 async with Nursery() as nursery:
@@ -361,7 +372,7 @@ class CanopenBus:
             brought = driver.pdo_tags
             names = [f"{driver.config.name}.{t.name}" for t in driver.profile.group(group)]
             self._tags.put_bad([name for name in names if name not in brought], reason_of(e))
-            if status.online and driver.config.heartbeat is None:
+            if status.online and not driver.is_watched:
                 self._failed(status, e)  # no heartbeat will tell
 
     def _failed(self, status: NodeStatus, error: FieldtwinError) -> None:
@@ -411,11 +422,19 @@ class CanopenBus:
             driver.consumer.observe(COMMAND(b"", "nmt_start"))
             await driver.send()
 
+    def _restate_limits(self, driver: CanopenDriver) -> None:
+        """How old values may be depends on whether the node's heartbeat is heard."""
+        for tag in driver.profile.tags.values():
+            if tag.readable:
+                self._tags.restate(f"{driver.config.name}.{tag.name}", driver.stale_after_ms(tag))
+
     def _on_event(self, event: NodeEvent) -> None:
         status = self.nodes.get(event.node)
         if status is None:
             return
         status.driver.on_event(event)
+        if event.kind == "state" and status.online and status.driver.config.heartbeat is not None:
+            self._restate_limits(status.driver)  # a first heartbeat begins the watch
         if event.kind == "boot-up":
             status.boots += 1
             status.emcy_log.restarted()
@@ -430,7 +449,8 @@ class CanopenBus:
             if event.state is NmtState.PRE_OPERATIONAL and status.online and status.driver.config.start:
                 self._start_again(status)
         elif event.kind == "conflict":
-            status.error = "two nodes answer under this node id"
+            status.conflicts += 1
+            status.conflict = conflict_text(event)
         elif event.kind == "emcy":
             status.emcy_log.add(parse_emcy(event.data), event.t_ns)
 

@@ -14,7 +14,7 @@ from gateway.core.connection import Connector, Listen
 from gateway.core.events import Consumer
 from gateway.core.image import Image
 from gateway.core.nursery import Nursery
-from gateway.core.values import DATA
+from gateway.core.values import DATA, Reason
 from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.config import BusConfig, DeviceConfig
 from gateway.devices.register_device import RegisterDriver, SensorDriver
@@ -25,7 +25,8 @@ from gateway.runtime.canopen_bus import CanopenBus
 from gateway.runtime.image_io import ImageExchange
 from gateway.runtime.mailbox_pump import MailboxPump
 from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.outputs import Output, OutputWriter
+from gateway.runtime.output import Output
+from gateway.runtime.outputs import OutputWriter
 from gateway.runtime.serve import ServeConfig, TagServer
 from gateway.runtime.tags import TagTable
 from gateway.runtime.taken import TakenFile
@@ -119,11 +120,12 @@ class Gateway:
                 remote=config.remote,
                 lent=d.config.name in config.lent,
                 taken=taken,
+                journal=self.outputs.journal,
             )
             for d in self.drivers.values()
             if isinstance(d, TransmitterDriver)
         ]
-        self.servers = [TagServer(s, self.tags, self.outputs, clock, listen) for s in config.serve]
+        self.servers = [TagServer(s, self.tags, self.outputs, clock, listen, audit) for s in config.serve]
         sources = self._message_sources()
         self.exchange = ImageExchange(image, self.tags, sources)
         self.plc_alive = False
@@ -157,14 +159,28 @@ class Gateway:
         return bus
 
     def _make_outputs(self) -> list[Output]:
-        made = []
+        """Every tag that a program or a client of ours may write, and every tag that has a safe value, whoever else writes it."""
         served = {t.tag for s in self.config.serve for t in s.tags if t.write}
-        for tag in sorted(self.config.outputs | served):
-            device, _, local = tag.partition(".")
-            driver = self.drivers[device]
-            if not isinstance(driver, TransmitterDriver):
-                made.append(Output(tag, local, driver, self.buses[driver.config.bus], driver.config.safe.get(local)))
-        return made
+        safe = {f"{device.name}.{local}" for device in self.config.devices.values() for local in device.safe}
+        return [
+            self._make_output(tag)
+            for tag in sorted(self.config.outputs | served | safe)
+            if not isinstance(self.drivers[tag.partition(".")[0]], TransmitterDriver)
+        ]
+
+    def _make_output(self, tag: str) -> Output:
+        device, _, local = tag.partition(".")
+        driver = self.drivers[device]
+        output = Output(tag, local, driver, self.buses[driver.config.bus], driver.config.safe.get(local))
+        output.commanded = tag in self.config.outputs
+        return output
+
+    def complete_outputs(self, driver: RegisterDriver | CanopenDriver) -> None:
+        """The configuration of a driver's device is another one: the tags that have a safe value only now are outputs, too."""
+        known = {output.tag for output in self.outputs.outputs}
+        tags = [f"{driver.config.name}.{local}" for local in driver.config.safe]
+        if not isinstance(driver, TransmitterDriver):
+            self.outputs.outputs += [self._make_output(tag) for tag in tags if tag not in known]
 
     def _message_sources(self) -> dict[str, Consumer[DATA]]:
         sources: dict[str, Consumer[DATA]] = {pump.driver.message_tag: pump.inbox for pump in self.pumps}
@@ -211,6 +227,8 @@ class Gateway:
         for pump in self.pumps:
             pump.refuse_when_local()
             self.exchange.untaken[pump.driver.outbox_tag] = pump.untaken
+        for tag in self.config.log_tags:
+            self.exchange.untaken[tag] = self.log.pending(tag)
         self.exchange.exchange(now_ns)
         for tag, messages in self.exchange.new_messages.items():
             for pump in self.pumps:
@@ -237,6 +255,8 @@ class Gateway:
                 seen = x.outputs.get(tag)
                 if seen is not None and isinstance(seen.value, _NUMBERS):
                     self.outputs.want(tag, seen.value)
+                elif seen is not None and seen.reason is Reason.NOT_A_NUMBER:
+                    self.outputs.want_no_number(tag)
         elif self.plc_alive or (not self.outputs.safe_active and now_ns - self._started_ns > PLC_GRACE_NS):
             self.plc_losses += 1
             self.outputs.make_safe("the PLC stopped" if x.plc_stopped else "the PLC's heartbeat was lost")
@@ -257,4 +277,5 @@ class Gateway:
                 await bus.stop_nodes(timeout_s / 2)
             else:
                 await bus.halt(timeout_s / 2)
+        self.outputs.journal.flush()
         return self.outputs.settled

@@ -109,7 +109,10 @@ class ImageExchange:
         columns = self._columns
         columns.refresh(now_ns)
         for at, tag in self._taken:
-            columns.put(at, self._reader.seen(tag) - self.untaken.get(tag, 0), now_ns)
+            taken = self._reader.seen(tag)
+            if tag in self.untaken:  # what came just now is dealt with after this
+                taken -= self.untaken[tag] + len(self.new_messages.get(tag, ()))
+            columns.put(at, taken, now_ns)
         self._writer.publish_mixed(
             columns.values,
             columns.qualities,

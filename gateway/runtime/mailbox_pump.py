@@ -18,6 +18,7 @@ from gateway.devices.transmitter import TransmitterDriver
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.mailboxes import Mailboxes
 from gateway.runtime.modbus_bus import ModbusBus
+from gateway.runtime.refusals import Cause, Refusals, cause_of
 from gateway.runtime.taken import TakenFile
 
 RETRY_NS = 1000 * NS_PER_MS
@@ -36,8 +37,13 @@ class MailboxPump:
         remote: bool,
         lent: bool = False,
         taken: TakenFile | None = None,
+        journal: Refusals | None = None,
     ) -> None:
+        """`journal` takes the messages that do not reach the transmitter, and the commands that are refused."""
         self.driver = driver
+        self._journal = journal
+        self._withheld: tuple[str, object] | None = None
+        """What the journal was told last of a plant that may not be written, so that it is told once."""
         self._taken = taken or TakenFile(None)
         driver.taken_before = self._taken.of(driver.config.name)
         self.inbox: Consumer[DATA] = Consumer(driver.emitter.event, capacity=64)
@@ -52,7 +58,7 @@ class MailboxPump:
         self._allow_writes = allow_writes
         self._lent = lent
         self._sending = 0
-        self._next_ns = 0
+        self._next_ns = self._now_ns = 0
         self._recorded: tuple[str, object] | None = None
 
     def command(self, payload: bytes, by: str) -> bool:
@@ -92,10 +98,29 @@ class MailboxPump:
                         result="the plant says local",
                         payload=item.data.hex(),
                     )
+                self._tell("inbox", item.data.hex(), Cause.LOCAL, "the plant says local", "far side")
+
+    def _tell(
+        self, tag: str, value: object, cause: Cause, reason: str, by: str = "plc", *, audit: bool = False
+    ) -> None:
+        if self._journal is not None:
+            name = self.driver.config.name
+            self._journal.note(name, f"{name}.{tag}", value, cause, reason, by, self._now_ns, audit=audit)
+
+    def _withhold(self) -> None:
+        """A plant that may only be read: the first message that waits stays where it is, and is reported."""
+        if self.driver.consumer.queue:
+            waits = ("outbox", self.driver.consumer.queue[0].data.hex())
+            if waits != self._withheld:
+                self._withheld = waits
+                self._tell(*waits, Cause.READ_ONLY, "this plant is read-only (start with --allow-writes)", audit=True)
 
     def tick(self, now_ns: int, all_consumed: bool) -> None:
         """Start the next exchange. `all_consumed` says that the PLC has consumed everything that it was given."""
+        self._now_ns = now_ns
         self._keep(all_consumed)
+        if not self._allow_writes:
+            self._withhold()
         if now_ns < self._next_ns or not self._allow_writes or not self._boxes.ready:
             return
         if self.driver.to_acknowledge and all_consumed and not self.inbox.queue:
@@ -134,5 +159,7 @@ class MailboxPump:
         if self._recorded is not None:
             (tag, new), self._recorded = self._recorded, None
             result = "done" if error is None else f"failed: {error}"
+            if error is not None:
+                self._tell(tag.rpartition(".")[2], new, cause_of(error), str(error))
             with suppress(Unreachable):  # the next write will not start without a record
                 self._audit.note("write", self.driver.config.name, by="plc", result=result, tag=tag, new=new)

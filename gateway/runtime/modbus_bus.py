@@ -35,12 +35,14 @@ from gateway.devices.register_device import RegisterDriver
 from gateway.devices.transmitter import TransmitterDriver
 from gateway.protocols.modbus.client import ModbusClient
 from gateway.protocols.modbus.framings import framing_of
-from gateway.protocols.modbus.refusals import Acknowledged, ServerBusy
+from gateway.protocols.modbus.refusals import Acknowledged, GatewayRefusal, ServerBusy
+from gateway.protocols.modbus.server import NO_RESPONSE
 from gateway.runtime.backoff import Backoff
 from gateway.runtime.bridge_queue import GuestQueue
 from gateway.runtime.bus_turns import DeviceState, Turns, rates_of, restate, states_of
 from gateway.runtime.coming import Coming
 from gateway.runtime.tags import TagTable
+from gateway.runtime.unanswered import MOST_UNANSWERED, Unanswered
 
 T = TypeVar("T")
 
@@ -51,6 +53,8 @@ def reason_of(error: FieldtwinError) -> Reason:
     """What a tag's quality says after `error`."""
     if isinstance(error, WrongDevice):
         return Reason.WRONG_DEVICE
+    if isinstance(error, GatewayRefusal):
+        return Reason.TIMEOUT if error.code == NO_RESPONSE else Reason.UNREACHABLE
     if isinstance(error, DeviceRefused):
         return Reason.REFUSED
     if isinstance(error, ReplyTimeout):
@@ -58,8 +62,8 @@ def reason_of(error: FieldtwinError) -> Reason:
     return Reason.UNREACHABLE if isinstance(error, Unreachable) else Reason.WIRE_ERROR
 
 
-MOST_UNANSWERED = 5
-"""On a socket: behind a connection that a firewall or a crash left half open nobody will ever answer (TG 4.2.2)."""
+ALARM_NS = 10 * NS_PER_S
+"""For how long the devices of a bus are polled with shortened timeouts after one of them fell silent."""
 STREAMS = frozenset({"tcp", "tls", "rtu+tcp"})
 
 
@@ -70,6 +74,10 @@ class Job:
     driver: RegisterDriver
     run: Callable[[], Awaitable[None]]
     done: Callable[[FieldtwinError | None], None]
+
+
+MOST_LOCALS = 64
+"""Addresses of ours that are remembered: one for each time that the bus was opened."""
 
 
 class ModbusBus:
@@ -93,13 +101,17 @@ class ModbusBus:
         self.devices = states_of(drivers, offset)
         self.connected = False
         self.opens = 0
+        self.locals: deque[str] = deque(maxlen=MOST_LOCALS)
+        """The addresses that we connected from, latest last; empty texts for media without addresses."""
         self.error = ""
         self.down: FieldtwinError | None = None
         """Why the wire could not be opened when that was tried last; None while it is open, or was until just now."""
         self.guests = GuestQueue()
         self.guests.on_put = self._wake
         self._guest_was_last = False
-        self._turns = Turns(self.devices, config.probe_share)
+        line = config.endpoint
+        t35_ns = round(3.5 * line.serial.char_time_s * NS_PER_S) if line.is_serial else 0
+        self._turns = Turns(self.devices, config.probe_share, t35_ns)
         self._connector = connector
         self._clock = clock
         self._tags = tags
@@ -112,6 +124,8 @@ class ModbusBus:
         self._sleeper: asyncio.Future[None] | None = None
         self._idle = asyncio.Event()
         self._halted = False
+        self._alarm_until_ns = 0
+        """Until then, devices that answer are polled with shortened timeouts, because one of them fell silent."""
         self.latency = Latencies()
         self._past: Counter[str] = Counter()
         self._client: ModbusClient | None = None
@@ -216,6 +230,7 @@ class ModbusBus:
             client.latency = self.latency
             self._client = client
             self.connected, self.error, self.down = True, "", None
+            self.locals.append(connection.local)
             self.opens += 1
             try:
                 for device in self.devices:
@@ -244,13 +259,13 @@ class ModbusBus:
             self._jobs.popleft().done(error)
 
     async def _serve(self, client: ModbusClient, backoff: Backoff) -> None:
-        answered = timeouts = 0
+        unanswered = Unanswered(client)
+        stream = self.config.endpoint.scheme in STREAMS
         while True:
             self._awake = False
-            counters = client.counters
-            if counters.replies + counters.exceptions != answered:
-                answered, timeouts = counters.replies + counters.exceptions, counters.timeouts
-            elif counters.timeouts - timeouts >= MOST_UNANSWERED and self.config.endpoint.scheme in STREAMS:
+            if client.late_ns:
+                self._heard_late(client)
+            if stream and unanswered.too_many(any(device.online for device in self.devices)):
                 raise ConnectionLost(
                     f"{MOST_UNANSWERED} requests in a row were not answered: the connection is made anew",
                     where=str(self.config.endpoint),
@@ -268,7 +283,8 @@ class ModbusBus:
                 if job is not None:
                     await self._run_job(job)
                     continue
-            device, group, at_ns = self._turns.next(client.spaced_ns, now_ns)
+            seen_ns, timeout_s = self.latency.recent_longest_ns, self.config.timeout_s
+            device, group, at_ns = self._turns.next(client.spaced_ns, now_ns, seen_ns, timeout_s)
             due = at_ns <= now_ns
             if self.guests.size and not (due and self._guest_was_last) and await self._carry_guest():
                 backoff.reset()
@@ -321,23 +337,84 @@ class ModbusBus:
         """One turn of a device: a transaction of a group, or first contact."""
         begun_ns = self._clock.monotonic_ns()
         device.polls += not device.online or device.reading is None
+        unit, probed = device.driver.config.address, not device.online
         try:
-            if not device.online:
-                device.tried = True
+            if probed:
+                device.tried, device.asked_ns = True, begun_ns
+                if device.timeout_ns:
+                    client.hurry(unit, device.timeout_ns / NS_PER_S)
                 group = await self._bring_online(device)
+            elif not device.alone:
+                client.hurry(unit, self._patience_s(device, begun_ns))
             await self._turn(device, group)
         except ConnectionLost:
             raise
-        except (WireError, WrongDevice, Unreachable) as e:
-            device.poll_errors += 1
-            self._offline(device, e)
-            now_ns = self._clock.monotonic_ns()
-            self._turns.failed(begun_ns, now_ns, max(now_ns, client.clear_ns))
+        except ReplyTimeout as e:
+            self._silent(client, device, e, begun_ns, probed)
+        except (WireError, WrongDevice, Unreachable, GatewayRefusal) as e:
+            self._failed(client, device, e, begun_ns, probed)
         except DeviceRefused as e:
             self._refused(device, group, e)
         else:
             device.online, device.error = True, ""
+            device.last_cost_ns = device.silences = 0
+            device.answered_ns = self._clock.monotonic_ns()
             device.backoff.reset()
+        finally:
+            if client.hurried(unit):
+                client.relax(unit)
+
+    def _patience_s(self, device: DeviceState, now_ns: int) -> float:
+        """How long a poll of a device that answers waits for it, if others want the line."""
+        if now_ns < self._alarm_until_ns:
+            return self._turns.short_s(device, self.latency.recent_longest_ns, self.config.timeout_s)
+        return self._own_s(device)
+
+    def _own_s(self, device: DeviceState) -> float:
+        stated_s = device.driver.config.timeout_s
+        return self.config.timeout_s if stated_s is None else stated_s
+
+    def _silent(
+        self, client: ModbusClient, device: DeviceState, error: ReplyTimeout, begun_ns: int, probed: bool
+    ) -> None:
+        """A device did not answer. One that did before keeps its place while it has repetitions left; others go on meanwhile.
+
+        Several devices often fall silent together, by a cut cable. So for a while the others are polled with shortened
+        timeouts too: each of them would cost its whole timeout otherwise, while those that still answer wait.
+        """
+        if not probed and not device.alone:
+            shortened = self._patience_s(device, begun_ns) < self._own_s(device)
+            if begun_ns >= self._alarm_until_ns:
+                self._turns.doubt_ns = begun_ns
+            self._alarm_until_ns = self._clock.monotonic_ns() + ALARM_NS
+            # A shortened timeout is no proof: a slow device has another try, with more time once its late reply was heard.
+            tries = max(self._retries_of(device), 1 if shortened else 0)
+            if device.reading is not None and device.silences < tries:
+                device.silences += 1
+                device.poll_errors += 1
+                return
+        self._failed(client, device, error, begun_ns, probed)
+
+    def _failed(
+        self, client: ModbusClient, device: DeviceState, error: FieldtwinError, begun_ns: int, probed: bool
+    ) -> None:
+        """A device is away, or still away; the time that this took counts."""
+        device.poll_errors += 1
+        self._offline(device, error)
+        now_ns = self._clock.monotonic_ns()
+        clear_ns = max(now_ns, client.clear_ns)
+        answered_first = probed and not client.hurried(device.driver.config.address)
+        device.fits = device.fits and probed and not answered_first
+        device.last_cost_ns = clear_ns - begun_ns if answered_first else 0
+        self._turns.failed(device, begun_ns, now_ns, clear_ns)
+
+    def _heard_late(self, client: ModbusClient) -> None:
+        """Devices answered after their shortened timeouts, within their own: they are there, and get more time, now."""
+        for device in self.devices:
+            late_ns = client.late_ns.get(device.driver.config.address)
+            if late_ns is not None and late_ns <= self._own_s(device) * NS_PER_S:
+                device.late_ns, device.next_try_ns = max(device.late_ns, late_ns), self._clock.monotonic_ns()
+        client.late_ns.clear()
 
     async def _bring_online(self, device: DeviceState) -> str:
         """First contact, or contact again: is it the right device, and where do its mailboxes stand. Which group to read
@@ -354,7 +431,8 @@ class ModbusBus:
         device.online = bool(driver.config.expect) or isinstance(driver, TransmitterDriver) or not group
         if device.online:
             device.error = ""
-        return group
+            return group
+        return group if device.alone else min(device.schedule.due_ns, key=driver.cost)
 
     async def _turn(self, device: DeviceState, group: str) -> None:
         """The next transaction of `group`: its trigger, its first or a further one."""
@@ -369,7 +447,7 @@ class ModbusBus:
                 return
             reading = device.reading = driver.begin(group)
         going = reading
-        if await self._attempts(device, lambda: driver.read_next(going)):
+        if await self._attempts(device, lambda: driver.read_next(going), later=True):
             device.reading = None
             driver.finish(reading)
 
@@ -415,6 +493,7 @@ class ModbusBus:
         was_online = device.online
         device.online, device.error = False, str(error)
         device.reading = None
+        device.silences = 0
         device.schedule.stop()
         device.next_try_ns = self._clock.monotonic_ns() + int(device.backoff.next_s() * NS_PER_S)
         self._tags.put_bad(device.driver.tag_names, reason_of(error))
@@ -436,17 +515,23 @@ class ModbusBus:
         else:
             job.done(None)
 
-    async def _attempts(self, device: DeviceState | None, what: Callable[[], Awaitable[T]]) -> T:
+    def _retries_of(self, device: DeviceState) -> int:
+        stated = device.driver.config.retries
+        return self.config.retries if stated is None else stated
+
+    async def _attempts(
+        self, device: DeviceState | None, what: Callable[[], Awaitable[T]], *, later: bool = False
+    ) -> T:
         """Try `1 + retries` times as long as the wire is at fault; what the device refuses is not asked again, nor is
-        one that was away asked more than once."""
+        one that was away asked more than once. `later`: where other devices wait, silence is not answered here."""
         retries = self.config.retries
         if device is not None:
-            stated = device.driver.config.retries
-            retries = 0 if not device.retries_left else retries if stated is None else stated
+            retries = self._retries_of(device) if device.retries_left else 0
         while True:
             try:
                 return await what()
-            except WireError:
-                if not retries:
+            except WireError as e:
+                wait = later and isinstance(e, ReplyTimeout) and device is not None and not device.alone
+                if not retries or wait:
                     raise
                 retries -= 1

@@ -2,106 +2,34 @@
 
 A dead PLC cannot make anything safe, so the gateway holds each output's safe value and writes it when the PLC's heartbeat
 stops (DESIGN.md, "Who makes outputs safe"). A value is written when it differs from what the device last confirmed; a device
-that comes back, or that reads back something else, gets it again. Outputs that share one frame (an RPDO) are written
-together. Nothing is written to a plant that was not allowed,
-and every write and refusal is on record before it is on the wire.
+that comes back, or that reads back something else, gets it again. At the start the writer waits for the first reading of an
+output, and writes nothing where the device holds what is wanted already. Outputs that share one frame (an RPDO) are written
+together. Nothing is written to a plant that was not allowed, and every write and refusal is on record before it is on the wire.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 
 from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
-from gateway.core.values import COMMAND, Quality, TagValue
+from gateway.core.values import Quality, Reason
 from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.register_device import RegisterDriver
 from gateway.runtime.audit import AuditLog
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.first_reading import is_known, waits_for_reading
+from gateway.runtime.output import SAFE, Output, as_sent
+from gateway.runtime.output_groups import OutputGroup, groups_of
+from gateway.runtime.refusals import Cause, Refusals, cause_of
 from gateway.runtime.tags import TagTable
 
 MIN_SPACING_NS = 100 * NS_PER_MS
 """At most ten writes a second to one tag; what changes faster is written with its newest value."""
 RETRY_NS = NS_PER_S
-SAFE = "safe: "
-
-
-@dataclass
-class Output:
-    """One output: its tag, its device, and how far the last write got."""
-
-    tag: str
-    local: str
-    driver: RegisterDriver | CanopenDriver
-    bus: ModbusBus | CanopenBus
-    safe: float | None
-    wanted: float | None = None
-    by: str = ""
-    held: float | None = None
-    held_since_ns: int = 0
-    compared: TagValue | None = None
-    """What the device was last heard to hold, found to be what it was told."""
-    pending: bool = False
-    refused: tuple[float, str] | None = None
-    next_try_ns: int = 0
-    asked: Callable[[FieldtwinError | None], None] | None = None
-    """Who asked for one write and waits for its end; None for what the PLC or the safe state commands."""
-
-    @property
-    def ready(self) -> bool:
-        """Whether the device takes a write now."""
-        if isinstance(self.driver, CanopenDriver):
-            assert isinstance(self.bus, CanopenBus)
-            return self.bus.takes(self.driver, self.local)
-        assert isinstance(self.bus, ModbusBus)
-        return self.bus.online(self.driver)
-
-    @property
-    def frame(self) -> object | None:
-        """What it shares one frame with: the same object for each of those outputs. None where it is written by itself."""
-        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
-            return self.bus.frame_of(self.driver, self.local)
-        return None
-
-    @property
-    def settle_ns(self) -> int:
-        """How long after a write the device may still be heard to say what it held before."""
-        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
-            return self.bus.settle_ns(self.driver, self.local)
-        return 0
-
-    def submit(self, command: COMMAND, done: Callable[[FieldtwinError | None], None]) -> None:
-        """Put the write on its way."""
-        if isinstance(self.driver, CanopenDriver):
-            assert isinstance(self.bus, CanopenBus)
-            self.bus.write(self.driver, self.local, command, done)
-        else:
-            assert isinstance(self.bus, ModbusBus)
-            self.driver.consumer.observe(command)
-            self.bus.submit(Job(self.driver, self.driver.send, done))
-
-    def shown(self, value: object) -> object:
-        """`value` as the audit log may show it: a secret is not written down."""
-        return "(secret)" if self.driver.profile.tags[self.local].secret else value
-
-    def answer(self, error: FieldtwinError | None) -> None:
-        """Tell who asked how it ended. It was for once: nothing is written again behind a person's back."""
-        asked, self.asked = self.asked, None
-        if asked is not None:
-            if not self.by.startswith(SAFE):
-                self.wanted = None
-            asked(error)
-
-
-def as_sent(output: Output) -> bytes:
-    """What `output` holds, as it would be sent now; empty where it may not be sent any more."""
-    try:
-        return output.driver.command(output.local, output.held).data if output.held is not None else b""
-    except NotAllowed:
-        return b""
+AWAY_AFTER_NS = NS_PER_S
+"""An output that has waited so long for its device is reported as refused (cause "away")."""
+AWAY_REPORTED = -1
 
 
 class OutputWriter:
@@ -109,37 +37,85 @@ class OutputWriter:
 
     def __init__(self, outputs: list[Output], tags: TagTable, audit: AuditLog, allow_writes: bool) -> None:
         self.outputs = outputs
+        self._groups = groups_of(outputs)
+        self._group_of = {output.tag: group for group in self._groups for output in group.outputs}
         self.allow_writes = allow_writes
-        self.writes = self.refusals = self.failures = self.rewrites = 0
+        self.journal = Refusals(audit)
+        """Every write that did not reach its device, and why."""
+        self.writes = self.refusals = self.failures = self.rewrites = self.superseded = 0
+        """`superseded`: values of programs that a newer value replaced before they were written."""
         self.safe_active = False
         self._tags = tags
         self._audit = audit
         self._now_ns = 0
 
     def want(self, tag: str, value: float) -> None:
-        """The PLC commands `value`."""
+        """The PLC commands `value`. A value that cannot be written is refused now, not when its turn would come: by then a
+        newer value may have taken its place."""
         for output in self.outputs:
-            if output.tag == tag:
-                output.wanted, output.by = value, "plc"
+            if output.tag == tag and (output.wanted != value or output.by != "plc" or output.not_a_number):
+                self._command(output, value)
+
+    def _command(self, output: Output, value: float) -> None:
+        unwritten = output.by == "plc" and output.wanted is not None and output.held != output.wanted
+        self.superseded += unwritten and output.refused != (output.wanted, output.by) and not output.pending
+        output.wanted, output.by, output.not_a_number = value, "plc", False
+        output.waits_since_ns = None
+        try:
+            self._check_allowed(output)
+            output.driver.command(output.local, value)
+        except NotAllowed as e:
+            self._refuse(output, value, e)
+        else:
+            self.journal.settle(output.tag)
+
+    def want_no_number(self, tag: str) -> None:
+        """The PLC's program set the output to something that is not a number: the device keeps what it holds."""
+        for output in self.outputs:
+            if output.tag == tag and not output.not_a_number:
+                output.not_a_number, output.by = True, "plc"
+                error = NotAllowed(f"{output.local}: not a number", expected="a finite number", got="nan")
+                self._note(output, "nan", Cause.LIMIT, error, "plc")
+                self.refusals += 1
 
     def request(self, tag: str, value: float, by: str, done: Callable[[FieldtwinError | None], None]) -> None:
-        """Somebody (`by`) asks for one write of a tag that the PLC does not command. `done` is told how it ended.
+        """A client (`by`) asks for one write of a tag that the PLC does not command. `done` is told how it ended.
 
-        While the outputs are in their safe state, those that have a safe value keep it.
+        While the outputs are in their safe state, those that have a safe value keep it. A write that is not carried out is in the
+        journal and in the audit log, whatever the reason.
         """
         output = next((o for o in self.outputs if o.tag == tag), None)
         where = output.driver.config.where if output is not None else tag
-        if output is None or output.by == "plc":
-            done(NotAllowed(f"{tag} cannot be commanded from here", where=where))
-        elif self.safe_active and output.safe is not None:
-            done(EndpointBusy("the outputs are in their safe state", where=where))
-        elif output.pending or self._now_ns < output.next_try_ns:
-            done(EndpointBusy("another write has just been made, or is under way", where=where))
-        elif not output.ready:
-            done(Unreachable("the device does not answer", where=where))
+        cause, error = self._turned_away(output, tag, where)
+        if output is None or error is not None:
+            assert error is not None
+            self.refusals += 1
+            if output is not None:
+                self._note(output, value, cause, error, by)
+            else:
+                self.journal.note(tag.partition(".")[0], tag, value, cause, str(error), by, self._now_ns)
+            done(error)
         else:
             output.wanted, output.by, output.asked = value, by, done
             self._start(output, value)
+
+    def _turned_away(self, output: Output | None, tag: str, where: str) -> tuple[Cause, FieldtwinError | None]:
+        """Why a client's write of a tag is not even started; no error where it is."""
+        if output is None or output.by == "plc":
+            return Cause.NOT_WRITABLE, NotAllowed(f"{tag} cannot be commanded from here", where=where)
+        if output.tag in self._group_of:
+            group = self._group_of[output.tag].name
+            return Cause.NOT_WRITABLE, NotAllowed(f"{tag} is written with its group {group!r} only", where=where)
+        if self.safe_active and output.safe is not None:
+            return Cause.NOT_NOW, EndpointBusy("the outputs are in their safe state", where=where)
+        if output.pending or self._now_ns < output.next_try_ns:
+            return Cause.NOT_NOW, EndpointBusy("another write has just been made, or is under way", where=where)
+        if not output.ready:
+            wrong = output.driver.identity_error
+            if wrong:
+                return Cause.WRONG_DEVICE, Unreachable(f"writes are blocked: {wrong}", where=where)
+            return Cause.AWAY, Unreachable("the device does not answer", where=where)
+        return Cause.NOT_NOW, None
 
     def make_safe(self, why: str) -> None:
         """Command every output's safe value; outputs without one keep what they have."""
@@ -149,8 +125,12 @@ class OutputWriter:
                 output.wanted, output.by = output.safe, f"{SAFE}{why}"
 
     def release(self) -> None:
-        """The PLC is back: its commands count again."""
+        """The PLC is back: its commands count again. The gateway leaves alone what no program writes; an output that a program
+        writes keeps its safe value until the program has started."""
         self.safe_active = False
+        for output in self.outputs:
+            if not output.commanded and output.by.startswith(SAFE):
+                output.wanted, output.by = None, ""
 
     def restated(self, driver: RegisterDriver | CanopenDriver, held: Mapping[str, bytes]) -> None:
         """The configuration of a driver's device is another one. `held` is what it held, as sent, by tag: what that would
@@ -172,7 +152,7 @@ class OutputWriter:
         """A device was lost: what it holds when it comes back is not known."""
         for output in self.outputs:
             if output.driver is driver:
-                output.held = None
+                output.held, output.untouched = None, False
 
     @property
     def settled(self) -> bool:
@@ -182,22 +162,124 @@ class OutputWriter:
         )
 
     def _possible(self, output: Output) -> bool:
-        return output.ready and output.refused != (output.wanted, output.by)
+        return output.ready and output.refused != (output.wanted, output.by) and not self.held_back(output)
+
+    def held_back(self, output: Output) -> bool:
+        """Whether the group of an output is not written, or is the safe state's business, so that the output waits with it."""
+        group = self._group_of.get(output.tag)
+        if group is None or output.by.startswith(SAFE):
+            return False
+        return not group.by_programs or group.obstacle is not None
 
     def tick(self, now_ns: int) -> None:
         """Start what needs writing now."""
         self._now_ns = now_ns
         due: list[tuple[Output, float]] = []
+        unread: set[object] = set()
+        """Outputs that wait for the first reading of their device, and their frames."""
         for output in self.outputs:
             if output.wanted is None or output.pending:
                 continue
             self._compare_with_device(output, now_ns)
-            if output.held != output.wanted and self._possible(output) and now_ns >= output.next_try_ns:
+            if output.untouched and output.ready and self._waits_for_reading(output):
+                unread |= {output.tag, output.frame}
+                continue
+            if output.tag in self._group_of and not output.by.startswith(SAFE):
+                continue  # with its group, below
+            if output.held == output.wanted or output.refused == (output.wanted, output.by):
+                output.waits_since_ns = None
+            elif not output.ready:
+                self._wait(output, output.wanted)
+            elif now_ns >= output.next_try_ns:
+                output.waits_since_ns = None
                 due.append((output, output.wanted))
-        waiting = self._waiting_frames(now_ns) if due else set()
+        waiting = self._waiting_frames(now_ns) | unread if due else set()
         for output, value in due:
             if output.frame is None or output.frame not in waiting:
                 self._start(output, value)
+        for group in self._groups:
+            if unread.isdisjoint(output.tag for output in group.outputs):
+                self._tick_group(group)
+
+    def _waits_for_reading(self, output: Output) -> bool:
+        """Before the first write: whether to wait until the device was read. What it is found to hold is not written again."""
+        current = self._tags.current(output.tag, self._now_ns)
+        if waits_for_reading(output, current, self._now_ns):
+            return True
+        output.untouched = False
+        if output.wanted is not None and is_known(output, current) and self._may(output):
+            sent = output.driver.command(output.local, output.wanted).data
+            if int.from_bytes(current.raw) == int.from_bytes(sent):
+                output.held, output.held_since_ns, output.compared = output.wanted, self._now_ns, current
+        return False
+
+    def _may(self, output: Output) -> bool:
+        """Whether what is wanted may be written. What may not is refused, also where the device holds it."""
+        try:
+            self._check(output)
+            output.driver.command(output.local, output.wanted or 0.0)
+        except NotAllowed:
+            return False
+        return output.refused != (output.wanted, output.by)
+
+    def _tick_group(self, group: OutputGroup) -> None:
+        """Write a group whose device does not hold what its programs want, or hold it back as a whole."""
+        differing = group.differing()
+        if not differing or not group.by_programs or any(o.pending for o in group.outputs):
+            return
+        obstacle = group.obstacle
+        if obstacle is not None:
+            self._hold_back(group, differing, *obstacle)
+        elif not all(o.ready for o in group.outputs):
+            for output in differing:
+                assert output.wanted is not None
+                self._wait(output, output.wanted)
+        elif self._now_ns >= max(o.next_try_ns for o in group.outputs):
+            self._start_group(group)
+
+    def _hold_back(self, group: OutputGroup, differing: list[Output], culprit: Output, why: str) -> None:
+        held = [o for o in differing if o is not culprit and o.refused != (o.wanted, o.by)]
+        told = (culprit.tag, why, *((o.tag, o.wanted) for o in held))
+        if told == group.told:
+            return
+        group.told = told
+        for output in held:
+            error = NotAllowed(f"held back: {why}, and the group {group.name!r} is written whole or not at all")
+            self._note(output, output.wanted, Cause.GROUP, error, output.by)
+
+    def _start_group(self, group: OutputGroup) -> None:
+        """Check every member, then record every member, then write them all."""
+        commands, group.told = [], ()
+        wanted = {output.tag: output.wanted for output in group.outputs if output.wanted is not None}
+        for output in group.outputs:
+            try:
+                self._check(output)
+                commands.append(output.driver.command(output.local, wanted[output.tag]))
+            except NotAllowed as e:
+                self._refuse(output, wanted[output.tag], e)
+                return
+        for output in group.outputs:
+            old = self._tags.current(output.tag, self._now_ns).value
+            if not self._on_record(output, output.driver.config.name, old, wanted[output.tag]):
+                return
+        for output in group.outputs:
+            output.pending, output.untouched, output.waits_since_ns = True, False, None
+        group.submit(commands, lambda output, error: self._done(output, wanted[output.tag], error))
+
+    def _wait(self, output: Output, value: float) -> None:
+        """The device takes no write now. What waits for longer than a moment is reported, once."""
+        since_ns = output.waits_since_ns
+        if since_ns is None:
+            output.waits_since_ns = self._now_ns
+        elif since_ns != AWAY_REPORTED and self._now_ns - since_ns >= AWAY_AFTER_NS:
+            output.waits_since_ns = AWAY_REPORTED
+            config, wrong = output.driver.config, output.driver.identity_error
+            if wrong:
+                error: FieldtwinError = NotAllowed(f"writes are blocked: {wrong}", where=config.where)
+                self._note(output, value, Cause.WRONG_DEVICE, error, output.by)
+            else:
+                error = Unreachable("the device takes no write; the value is written when it does", where=config.where)
+                self._note(output, value, Cause.AWAY, error, output.by)
 
     def _waiting_frames(self, now_ns: int) -> set[object]:
         """Frames of which an output has to wait: the others wait with it, so that what a scan commanded goes out whole."""
@@ -232,27 +314,44 @@ class OutputWriter:
             self._check(output)
             command = output.driver.command(output.local, value)
         except NotAllowed as e:
-            output.refused = (value, output.by)
-            self.refusals += 1
-            try:
-                self._audit.note(
-                    "refuse",
-                    name,
-                    by=output.by,
-                    result=str(e),
-                    tag=output.tag,
-                    old=output.shown(old),
-                    new=output.shown(value),
-                )
-            except Unreachable:
-                self.failures += 1  # counted; refused all the same
+            self._refuse(output, value, e)
             output.answer(e)
             return
         if not self._on_record(output, name, old, value):
             output.answer(Unreachable("the write could not be put on record", where=name))
             return
-        output.pending = True
+        output.pending, output.untouched = True, False
         output.submit(command, partial(self._done, output, value))
+
+    def _refuse(self, output: Output, value: float, error: NotAllowed) -> None:
+        """The value may not be written: it is not tried again until another one is wanted."""
+        output.refused = (value, output.by)
+        self.refusals += 1
+        self._note(output, value, self._cause(output), error, output.by)
+
+    def _cause(self, output: Output) -> Cause:
+        """Why a check refused a value of this output."""
+        if not self.allow_writes:
+            return Cause.READ_ONLY
+        if output.local not in output.driver.config.writable:
+            return Cause.NOT_WRITABLE
+        return Cause.WRONG_DEVICE if output.driver.identity_error else Cause.LIMIT
+
+    def _note(
+        self, output: Output, value: object, cause: Cause, error: FieldtwinError, by: str, *, audit: bool = True
+    ) -> None:
+        name, old = output.driver.config.name, self._tags.current(output.tag, self._now_ns).value
+        self.journal.note(
+            name,
+            output.tag,
+            output.shown(value),
+            cause,
+            str(error),
+            by,
+            self._now_ns,
+            old=output.shown(old),
+            audit=audit,
+        )
 
     def _on_record(self, output: Output, name: str, old: object, value: float) -> bool:
         """Note the write before it happens. Without a record only a safe value is written; the rest is tried again."""
@@ -266,20 +365,26 @@ class OutputWriter:
                 old=output.shown(old),
                 new=output.shown(value),
             )
-        except Unreachable:
+        except Unreachable as e:
             self.failures += 1
             output.next_try_ns = self._now_ns + RETRY_NS
+            self._note(output, value, Cause.FAILED, e, output.by, audit=False)
             return self.safe_active and output.asked is None
         return True
 
     def _check(self, output: Output) -> None:
+        self._check_allowed(output)
+        if output.driver.identity_error:
+            where = output.driver.config.where
+            raise NotAllowed(f"writes are blocked: {output.driver.identity_error}", where=where)
+
+    def _check_allowed(self, output: Output) -> None:
+        """Raise `NotAllowed` for what the configuration forbids, whatever device answers."""
         where = output.driver.config.where
         if not self.allow_writes:
             raise NotAllowed("this plant is read-only", where=where, hint="start with --allow-writes")
         if output.local not in output.driver.config.writable:
             raise NotAllowed(f"{output.tag} is not marked writable in the system file", where=where)
-        if output.driver.identity_error:
-            raise NotAllowed(f"writes are blocked: {output.driver.identity_error}", where=where)
 
     def _done(self, output: Output, value: float, error: FieldtwinError | None) -> None:
         output.pending = False
@@ -287,8 +392,12 @@ class OutputWriter:
         if error is None:
             self.writes += 1
             output.held, output.held_since_ns = value, self._now_ns
+            if not output.read_back and output.tag in self._tags:
+                self._tags.put_bad([output.tag], Reason.STALE)  # what was read before the write, and never again
+            self.journal.settle(output.tag)
         else:
             self.failures += 1
+            self._note(output, value, cause_of(error), error, output.by, audit=False)
             output.driver.consumer.queue.clear()  # the command that failed must not go out ahead of a newer one
         result = "done" if error is None else f"failed: {error}"
         try:

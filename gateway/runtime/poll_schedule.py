@@ -138,6 +138,13 @@ class PollSchedule:
         self.due_ns[group] -= step_ns
         self._rates[group] = Rate(rate.period_ns, (rate.phase_ns - step_ns) % rate.period_ns)
 
+    def free_until_ns(self) -> int | None:
+        """Until when something else may have the bus without a period being missed: the middle of the period of the group
+        that is due first. None where nothing is read again and again."""
+        return min(
+            (due + self._rates[g].period_ns // 2 for g, due in self.due_ns.items() if g in self._rates), default=None
+        )
+
     def defer(self, group: str, until_ns: int) -> None:
         """`group` is wanted again at `until_ns`, whatever its grid says: the device asked for time."""
         self.due_ns[group] = until_ns

@@ -53,6 +53,7 @@ class _Taking:
         if driver.profile != self._before[name]:
             self._understand(driver, self._before[name])
         gateway.outputs.restated(driver, self._sent[name])
+        gateway.complete_outputs(driver)
 
     def _understand(self, driver: AnyDriver, before: DeviceProfile) -> None:
         """What the device said last, by the new profile. Its age stays what it is, and so does what is wrong with it."""

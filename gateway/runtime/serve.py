@@ -32,6 +32,8 @@ from gateway.protocols.modbus.server import (
     examine,
     exception_pdu,
 )
+from gateway.runtime.audit import AuditLog
+from gateway.runtime.bridge_audit import WriteRecord
 from gateway.runtime.bridge_policy import EVERYONE, Network, within
 from gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
 from gateway.runtime.serve_codec import REGISTERS, not_a_number, pack, unpack
@@ -40,6 +42,9 @@ from gateway.runtime.tags import TagTable
 BIT_TABLES = ("coil", "discrete")
 DIRECT_UNITS = (0, 255)
 """What a client that knows no unit ids says to a device that stands directly on TCP (TG 4.4.1.2, case MB-057)."""
+
+WRITING = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16, 0x17})
+"""Function codes of requests that write."""
 
 QUALITY_TABLE: Mapping[ServedTable, ServedTable] = {
     "input": "input",
@@ -127,9 +132,12 @@ class TagServer:
         writer: Writer,
         clock: Clock,
         listen: Listen = TcpListener.open,
+        audit: AuditLog | None = None,
     ) -> None:
+        """`audit` takes the writes that are refused before they get to `writer`, which records those that it refuses itself."""
         self.config = config
         self.counters = ServeCounters()
+        self._record = WriteRecord(audit, clock) if audit is not None else None
         self._tags = tags
         self._writer = writer
         self._clock = clock
@@ -168,6 +176,8 @@ class TagServer:
         except ModbusExceptionReply as e:
             self.counters.bad += e.code == SERVER_FAILURE
             self.counters.refused += e.code != SERVER_FAILURE
+            if self._record is not None and pdu[0] in WRITING:
+                self._record.refused(caller.on_record, self.config.name, unit, pdu, e.code)
             return exception_pdu(e)
 
     def _answer(self, caller: Caller, pdu: bytes) -> Answer:

@@ -16,7 +16,13 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
         "buses": {name: _bus(bus) for name, bus in gateway.buses.items()},
         "tags": _tags(gateway, now_ns),
         "outputs": [
-            {"tag": o.tag, "wanted": o.wanted, "held": o.held, "by": o.by, "refused": o.refused == (o.wanted, o.by)}
+            {
+                "tag": o.tag,
+                "wanted": o.wanted,
+                "held": o.held,
+                "by": o.by,
+                "refused": o.refused == (o.wanted, o.by) or gateway.outputs.held_back(o),
+            }
             for o in gateway.outputs.outputs
         ],
         "writes": {
@@ -25,8 +31,10 @@ def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:
             "failed": gateway.outputs.failures,
             "refused": gateway.outputs.refusals,
             "repeated": gateway.outputs.rewrites,
+            "superseded": gateway.outputs.superseded,
             "safe": gateway.outputs.safe_active,
         },
+        "refusals": gateway.outputs.journal.describe(),
         "mailboxes": {
             pump.driver.config.name: {
                 "received": pump.driver.received,
@@ -75,7 +83,9 @@ def _devices(gateway: Gateway, now_ns: int) -> dict[str, Any]:
                     "bus": bus.config.name,
                     "address": driver.node,
                     "online": status.online,
-                    "error": status.error,
+                    "error": status.error or status.conflict,
+                    "conflicts": status.conflicts,
+                    "conflict": status.conflict,
                     "identity_error": driver.identity_error,
                     "boots": status.boots,
                     "bring_ups": status.bring_ups,
@@ -112,10 +122,15 @@ def _bus(bus: Any) -> dict[str, Any]:
         "endpoint": str(bus.config.endpoint),
         "connected": bus.connected,
         "opens": bus.opens,
+        "local": sorted({address for address in bus.locals if address}),
         "error": bus.error,
         "counters": dict(bus.totals()),
         "latency": bus.latency.describe(),
-        **({"not_produced": bus.not_produced} if isinstance(bus, CanopenBus) else {}),
+        **(
+            {"not_produced": bus.not_produced, "sync_producers": bus.sync_watch.verdict}
+            if isinstance(bus, CanopenBus)
+            else {}
+        ),
     }
 
 

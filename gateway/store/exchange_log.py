@@ -8,21 +8,31 @@ only queues, `flush` writes, and the queue has a bound whose overflow is counted
 from __future__ import annotations
 
 import sqlite3
-from collections import deque
+from collections import Counter, deque
 from pathlib import Path
 
 from gateway.core.errors import FileInvalid, Unreachable
 from gateway.store.schema import migrate, refuse_newer
 
 QUEUE = 10_000
+KNOWN = 1_000
+"""Rows at the end of the store that are not taken again: more than a PLC can have under way."""
 
 
 class ExchangeLog:
-    """One database file. `dropped` counts rows that did not fit the queue."""
+    """One database file. `dropped` counts rows that did not fit the queue.
+
+    A gateway that is killed leaves neither holes nor doubles: it tells the PLC only of rows that are stored (`pending`), and its
+    successor, which gets the others again, leaves out those that were stored and not told.
+    """
 
     def __init__(self, path: Path, *, system: str, prototype: bool) -> None:
         self._path = path
         self._queue: deque[tuple[str, int, int, bytes]] = deque()
+        self._known: set[tuple[str, int, int]] = set()
+        self._pending: Counter[str] = Counter()
+        self._refused = False
+        self._volatile = str(path) == ":memory:"
         self.stored = 0
         self.dropped = 0
         try:
@@ -32,6 +42,8 @@ class ExchangeLog:
             except BaseException:
                 self._db.close()
                 raise
+        except sqlite3.OperationalError as e:  # the disk, not what is in the file
+            raise Unreachable(f"cannot open the exchange log: {e}", where=str(path)) from e
         except sqlite3.DatabaseError as e:
             raise FileInvalid(
                 f"not a store of ours: {e}", path=str(path), hint="move it away; a new one is made"
@@ -43,20 +55,40 @@ class ExchangeLog:
         migrate(self._db, self._path)
         self._db.execute("INSERT INTO run (system, prototype) VALUES (?, ?)", (system, prototype))
         self._run = self._db.execute("SELECT max(id) FROM run").fetchone()[0]
+        last = "SELECT tag, sequence, t_ns FROM exchange ORDER BY id DESC LIMIT ?"
+        self._known.update(self._db.execute(last, (KNOWN,)))
 
     def append(self, rows: list[tuple[str, int, int, bytes]]) -> None:
-        """Queue rows of (tag, sequence, monotonic ns, payload)."""
+        """Queue rows of (tag, sequence, monotonic ns, payload). What a predecessor stored is left out."""
         for row in rows:
+            if self._known and row[:3] in self._known:
+                continue
             if len(self._queue) >= QUEUE:
                 self._queue.popleft()
                 self.dropped += 1
             self._queue.append(row)
 
+    @property
+    def waiting(self) -> int:
+        """Rows that are queued."""
+        return len(self._queue)
+
+    def pending(self, tag: str) -> int:
+        """Rows of `tag` that are lost if this process is killed now, so that the PLC has to keep them.
+
+        0 while the disk refuses: up to `QUEUE` rows are kept here then, so that the PLC can go on.
+        """
+        if self._refused or self._volatile:
+            return 0
+        return self._pending[tag] + sum(row[0] == tag for row in tuple(self._queue))
+
     def flush(self) -> int:
         """Write what is queued in one transaction; how many rows. Raises `Unreachable` when the disk refuses, keeping them."""
-        rows = [self._queue.popleft() for _ in range(len(self._queue))]
-        if not rows:
+        count = len(self._queue)
+        if not count:
             return 0
+        self._pending = Counter(row[0] for row in tuple(self._queue))  # before they leave the queue: never too few
+        rows = [self._queue.popleft() for _ in range(count)]
         try:
             with self._db:
                 self._db.execute("BEGIN")
@@ -65,8 +97,12 @@ class ExchangeLog:
                     [(self._run, *row) for row in rows],
                 )
         except sqlite3.OperationalError as e:
+            self._refused = True
             self._queue.extendleft(reversed(rows))
+            self._pending = Counter()
             raise Unreachable(f"cannot write the exchange log: {e}", where=str(self._path)) from e
+        self._refused = False
+        self._pending = Counter()
         self.stored += len(rows)
         return len(rows)
 

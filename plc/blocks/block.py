@@ -12,7 +12,7 @@ tag or the program that it is in.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import Any, ClassVar
 
 MS = 1_000_000
 """One millisecond in ns: ``PT=500 * MS``."""
@@ -29,3 +29,23 @@ class FunctionBlock(ABC):
     @abstractmethod
     def execute(self, now_ns: int) -> None:
         """One call at `now_ns`: outputs from inputs and from what was before."""
+
+    def state(self, now_ns: int) -> tuple[Any, ...]:
+        """Return all that the next calls depend on, hashable; moments count from `now_ns`, since only differences matter."""
+        return tuple([_state(name, getattr(self, name), now_ns) for name in _slots(type(self))])
+
+
+def _slots(block: type[object]) -> tuple[str, ...]:
+    return tuple(str(name) for kind in block.__mro__ for name in getattr(kind, "__slots__", ()))
+
+
+def _state(name: str, value: Any, now_ns: int) -> Any:
+    if value is not None and name.startswith("_") and name.endswith("_ns"):
+        return now_ns - value
+    if isinstance(value, list):
+        return tuple([_state(name, each, now_ns) for each in value])
+    if isinstance(value, float):
+        return repr(value)  # so that 0.0, -0.0 and NaN are what they are
+    if hasattr(value, "__slots__"):
+        return tuple([_state(slot, getattr(value, slot), now_ns) for slot in _slots(type(value))])
+    return value

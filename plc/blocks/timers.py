@@ -8,10 +8,31 @@ IN in the very scan that ends the pulse is none.
 
 from __future__ import annotations
 
+from typing import Any
+
 from plc.blocks.block import FunctionBlock
 
 
-class TON(FunctionBlock):
+class _Timer(FunctionBlock):
+    __slots__ = ()
+    IN: bool
+    Q: bool
+    PT: int
+    ET: int
+    _since_ns: int | None
+
+    def _runs(self) -> bool:
+        """Whether the moment at which the timer started still matters."""
+        raise NotImplementedError
+
+    def state(self, now_ns: int) -> tuple[Any, ...]:
+        """As for every block, without the start of a timer that has run out: two of those behave the same."""
+        since_ns = self._since_ns if self._runs() else None
+        phase_ns = None if since_ns is None else now_ns - since_ns
+        return self.IN, self.Q, self.PT, self.ET, phase_ns
+
+
+class TON(_Timer):
     """On-delay: Q follows IN's rise PT later, and its fall at once. ET: how long IN has been true, at most PT."""
 
     __slots__ = ("ET", "IN", "PT", "Q", "_since_ns")
@@ -33,13 +54,16 @@ class TON(FunctionBlock):
             self.ET = min(now_ns - self._since_ns, preset)
             self.Q = self.ET >= preset
 
+    def _runs(self) -> bool:
+        return self.IN and not self.Q
+
     def __call__(self, now_ns: int, *, IN: bool, PT: int) -> TON:
         self.IN, self.PT = IN, PT
         self.execute(now_ns)
         return self
 
 
-class TOF(FunctionBlock):
+class TOF(_Timer):
     """Off-delay: Q follows IN's rise at once, and its fall PT later. ET: how long IN has been false, at most PT."""
 
     __slots__ = ("ET", "IN", "PT", "Q", "_since_ns")
@@ -61,13 +85,16 @@ class TOF(FunctionBlock):
             self.ET = min(now_ns - self._since_ns, preset)
             self.Q = self.ET < preset
 
+    def _runs(self) -> bool:
+        return self.Q and not self.IN
+
     def __call__(self, now_ns: int, *, IN: bool, PT: int) -> TOF:
         self.IN, self.PT = IN, PT
         self.execute(now_ns)
         return self
 
 
-class TP(FunctionBlock):
+class TP(_Timer):
     """Pulse: a rise of IN makes Q true for PT, whatever IN does meanwhile. ET stays at PT until IN is false."""
 
     __slots__ = ("ET", "IN", "PT", "Q", "_before", "_since_ns")
@@ -77,7 +104,7 @@ class TP(FunctionBlock):
     def __init__(self) -> None:
         self.IN = self.Q = self._before = False
         self.PT = self.ET = 0
-        self._since_ns = 0
+        self._since_ns: int = 0
 
     def execute(self, now_ns: int) -> None:
         preset = max(0, self.PT)
@@ -89,6 +116,9 @@ class TP(FunctionBlock):
         if not self.Q and not self.IN:
             self.ET = 0
         self._before = self.IN
+
+    def _runs(self) -> bool:
+        return self.Q
 
     def __call__(self, now_ns: int, *, IN: bool, PT: int) -> TP:
         self.IN, self.PT = IN, PT

@@ -1,19 +1,20 @@
 """A unit of Structured Text to Python, once: classes for structures and function blocks, functions, a class a PROGRAM.
 
 The Python's lines carry the line numbers of the source, so that whatever goes wrong in a scan names the line that an
-engineer wrote. What is compiled is code without state: each `plc.st.program.StProgram` runs it in a namespace of its own.
+engineer wrote. What is compiled is code without state: each `plc.st.resource.Resource` runs it in a namespace of its own.
 """
 
 from __future__ import annotations
 
 import ast
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import CodeType
 
 from gateway.core.errors import FileInvalid
 from plc.program import Program
 from plc.st import tree as t
 from plc.st import types as ty
+from plc.st.assignments import Assignments
 from plc.st.declarations import Declarations
 from plc.st.located import without_addresses
 from plc.st.parse import parse
@@ -68,6 +69,8 @@ class _Unit:
         self.env = Environment(path)
         self.out = Writer()
         self.unit = unit
+        self._outputs: dict[str, frozenset[str]] = {}
+        """By class of a PROGRAM: its outputs, as attributes."""
         self._check_names()
         self.declarations = Declarations(self.env, unit, self.out)
         self._declare_global_constants()
@@ -111,6 +114,10 @@ class _Unit:
                 if isinstance(node, ast.stmt | ast.expr | ast.arg | ast.keyword):
                     node.lineno = node.end_lineno = lines[min(node.lineno, len(lines)) - 1]
                     node.col_offset = node.end_col_offset = 0
+            for statement in tree.body:
+                if isinstance(statement, ast.ClassDef) and statement.name in self._outputs:
+                    Assignments(self._outputs[statement.name]).visit(statement)
+            ast.fix_missing_locations(tree)
             return compile(tree, self.env.path or "<st>", "exec")
         except (SyntaxError, MemoryError, RecursionError) as e:  # Python's limits; those of this compiler are narrower
             at = e.lineno if isinstance(e, SyntaxError) and e.lineno else 1
@@ -144,7 +151,8 @@ class _Unit:
 
     def _write_globals(self) -> None:
         """Behind everything that they may be made of, and before any program is made."""
-        self.out.line("class _G: pass")
+        self.out.line("class _Globals: pass")
+        self.out.line("_G = _Globals()")
         for block in self.unit.globals:
             for v in block.variables:
                 symbol = self.env.globals[v.name.lower()]
@@ -182,7 +190,10 @@ class _Unit:
                 if block.kind == "VAR_EXTERNAL":
                     symbols[key] = self._external(v)
                     continue
-                symbols[key] = self._symbol(v, block, f"{'' if block.kind == 'VAR_TEMP' else prefix}v_{key}")
+                code = f"{'' if block.kind == 'VAR_TEMP' else prefix}v_{key}"
+                symbols[key] = self._symbol(v, block, code)
+                if block.kind == "VAR_IN_OUT" and not by_reference(symbols[key].type):
+                    symbols[key] = replace(symbols[key], code=f"{code}.v", reference=code)
         own = (symbols[v.name.lower()].type for b in pou.blocks if b.kind != "VAR_EXTERNAL" for v in b.variables)
         self.declarations.bounded(pou.pos, own)
         return symbols
@@ -233,9 +244,10 @@ class _Unit:
         symbols.setdefault(key, Symbol(pou.name, signature.returns, f"v_{key}"))
         arguments = ", ".join(f"v_{p.name.lower()}" for p in signature.inputs + signature.in_outs)
         body = Statements(self.env, symbols, self.out, pou.name.lower())
-        results = [f"v_{key}", *(f"v_{p.name.lower()}" for p in signature.more)]
+        results = [f"v_{key}", *(f"v_{p.name.lower()}" for p in signature.outputs)]
         body.leave = f"return {results[0]}" if len(results) == 1 else f"return ({', '.join(results)})"
         with self.out.block(f"def f_{key}({arguments}):", pou.pos):
+            self.out.step(pou.pos)
             self.out.line(f"v_{key} = {self.declarations.initial(signature.returns, None, pou.returns)}", pou.pos)
             self._initialise(pou, symbols, ("VAR", "VAR_OUTPUT", "VAR_TEMP"))
             body.body(pou.body)
@@ -246,7 +258,7 @@ class _Unit:
     def _write_block(self, pou: t.Pou) -> None:
         symbols = self._symbols(pou, "self.")
         self._note_parts(pou, symbols)
-        kept = [s.code.removeprefix("self.") for s in symbols.values() if s.code.startswith("self.")]
+        kept = [s.code.split(".")[1] for s in symbols.values() if s.code.startswith("self.")]
         with self.out.block(f"class B_{pou.name.lower()}:", pou.pos):
             self.out.line(f"__slots__ = ({''.join(repr(name) + ', ' for name in kept)})")
             in_outs = [f"v_{v.name.lower()}" for b in pou.blocks if b.kind == "VAR_IN_OUT" for v in b.variables]
@@ -258,6 +270,7 @@ class _Unit:
                         for v in block.variables:
                             self.out.line(f"self.v_{v.name.lower()} = None")
             with self.out.block("def execute(self, now_ns):"):
+                self.out.step(pou.pos)
                 self._initialise(pou, symbols, ("VAR_TEMP",))
                 Statements(self.env, symbols, self.out, pou.name.lower()).body(pou.body)
 
@@ -281,6 +294,8 @@ class _Unit:
                     if retain and isinstance(kind, ty.MessagesIn | ty.MessagesOut):
                         self.env.fail(v.pos, "MESSAGES cannot be RETAIN")
                     variables.append(ProgramVariable(v.name, role or "", kind, retain))
+        outputs = frozenset(f"v_{v.name.lower()}" for v in variables if v.role == "output")
+        self._outputs[f"P_{pou.name.lower()}"] = outputs
         with self.out.block(f"class P_{pou.name.lower()}:", pou.pos):
             with self.out.block("def __init__(self):"):
                 self._initialise_program(pou, symbols)

@@ -13,14 +13,18 @@ from plc.st import tree as t
 from plc.st import types as ty
 from plc.st.scope import Compiling, Value
 
+Write = Callable[[Compiling, t.Call, list[t.Expr]], Value]
+"""Writes a call. Its arguments are given in the order of the function's parameters."""
 _NAMES: dict[str, ty.Type] = {**ty.ELEMENTARY, "STRING": ty.String(254), "WSTRING": ty.String(254, wide=True)}
 _DIGITS = {32: 7, 64: 15}
 
 
-def conversion(name: str) -> Callable[[Compiling, t.Call], Value] | None:
+def conversion(name: str) -> Write | None:
     """The conversion of that name (in capitals), None if there is none."""
     if name == "TRUNC":
-        return lambda x, call: _convert(x, call, None, ty.DINT, cut=True)
+        return lambda x, call, given: _convert(x, call, given[0], None, ty.DINT, cut=True)
+    if "BCD_" in name and (found := _BCD.get(name)) is not None:
+        return found
     source, word, target = name.rpartition("_TRUNC_")
     if word and target in _NAMES:
         return _made(_NAMES.get(source), _NAMES[target], cut=True) if source in _NAMES else None
@@ -32,12 +36,11 @@ def conversion(name: str) -> Callable[[Compiling, t.Call], Value] | None:
     return None
 
 
-def _made(source: ty.Type | None, target: ty.Type, cut: bool) -> Callable[[Compiling, t.Call], Value]:
-    return lambda x, call: _convert(x, call, source, target, cut)
+def _made(source: ty.Type | None, target: ty.Type, cut: bool) -> Write:
+    return lambda x, call, given: _convert(x, call, given[0], source, target, cut)
 
 
-def _convert(x: Compiling, call: t.Call, source: ty.Type | None, target: ty.Type, cut: bool) -> Value:
-    (expr,) = x.positional(call, 1)
+def _convert(x: Compiling, call: t.Call, expr: t.Expr, source: ty.Type | None, target: ty.Type, cut: bool) -> Value:
     value = x.value(expr)
     kind = ty.plain(value.type)
     if source is not None and not isinstance(source, ty.String):
@@ -89,8 +92,7 @@ def _of_value(code: str, kind: ty.Type, target: ty.Type, cut: bool) -> str | Non
     if kind.kind == "duration" or target.kind == "duration":
         return _of_time(code, kind, target)
     if kind.kind == "dt" and target.kind in ("date", "tod"):
-        day = 86_400_000_000_000
-        return f"({code} // {day} * {day})" if target.kind == "date" else f"({code} % {day})"
+        return f"({code} // {ty.DAY_NS} * {ty.DAY_NS})" if target.kind == "date" else f"({code} % {ty.DAY_NS})"
     return code if kind.kind == target.kind or (kind.kind == "date" and target.kind == "dt") else None
 
 
@@ -141,3 +143,41 @@ def _text(code: str, kind: ty.Elementary) -> str | None:
         return f"_v.duration_text({code}, {chr(39)}{'LT' if kind.name == 'LTIME' else 'T'}{chr(39)})"
     name = {"date": "date_text", "tod": "tod_text", "dt": "moment_text"}.get(kind.kind)
     return f"_v.{name}({code})" if name else f"str({code})"
+
+
+# -- binary coded decimals (Table 22): a digit in four bits ---------------------------------------------------------------
+
+_UNSIGNED, _BITS = ("USINT", "UINT", "UDINT", "ULINT"), ("BYTE", "WORD", "DWORD", "LWORD")
+
+
+def _from_bcd(source: str, target: ty.Elementary) -> Write:
+    def write(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
+        value = x.value(given[0])
+        wanted = ty.ELEMENTARY[source] if source else None
+        if wanted is not None:
+            code = x.coerced(value, wanted, given[0].pos, f"the argument of {call.ref.name}")
+        elif ty.is_kind(value.type, "bits"):
+            code = value.code
+        else:
+            x.env.fail(given[0].pos, f"the argument of {call.ref.name}", expected="a bit string", got=str(value.type))
+        return Value(f"_v.of_bcd({code}, {target.high})", target)
+
+    return write
+
+
+def _to_bcd(source: str, target: ty.Elementary) -> Write:
+    def write(x: Compiling, call: t.Call, given: list[t.Expr]) -> Value:
+        value = x.value(given[0])
+        kind = ty.ELEMENTARY[source] if source else ty.ULINT
+        code = x.coerced(value, kind, given[0].pos, f"the argument of {call.ref.name}")
+        return Value(f"_v.to_bcd({code}, {target.bits})", target)
+
+    return write
+
+
+_BCD: dict[str, Write] = {
+    **{f"{bits}_BCD_TO_{number}": _from_bcd(bits, ty.ELEMENTARY[number]) for bits in _BITS for number in _UNSIGNED},
+    **{f"BCD_TO_{number}": _from_bcd("", ty.ELEMENTARY[number]) for number in _UNSIGNED},
+    **{f"{number}_TO_BCD_{bits}": _to_bcd(number, ty.ELEMENTARY[bits]) for number in _UNSIGNED for bits in _BITS},
+    **{f"TO_BCD_{bits}": _to_bcd("", ty.ELEMENTARY[bits]) for bits in _BITS},
+}

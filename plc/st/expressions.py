@@ -10,15 +10,15 @@ from typing import NoReturn
 from plc.st import tree as t
 from plc.st import types as ty
 from plc.st import values
+from plc.st.arguments import bind
 from plc.st.literals import Malformed, constant
-from plc.st.scope import Environment, Parameter, Signature, Symbol, Value, Writer, by_reference, wrapped
+from plc.st.scope import COMPARISONS, Environment, Parameter, Signature, Symbol, Value, Writer, by_reference, wrapped
 from plc.st.standard import FUNCTIONS
 
 MAX_DEEP = 80
 """Calls, parentheses and indices inside each other."""
 MAX_OPEN = 40
 """Brackets inside each other in the Python of one line: what is deeper is worked out on a line before."""
-_COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 _LOGIC = {"AND": "&", "&": "&", "OR": "|", "XOR": "^", "AND_THEN": "and", "OR_ELSE": "or"}
 
 
@@ -33,6 +33,8 @@ class Expressions:
         self.only_constants = False
         """Whether variables and a user's functions are refused: in initial values and limits of types."""
         self._deep = 0
+        self.controls: list[str] = []
+        """The control variables of the FOR loops around the statement."""
         self.program_inputs: set[str] = set()
         """Where a PROGRAM is compiled: the inputs whose quality can be asked for."""
 
@@ -177,7 +179,7 @@ class Expressions:
             left, right = self._only_if_needed(expr, left, right, self.out.since(mark))
         if expr.op in _LOGIC:
             return self._logic(expr, left, right)
-        if expr.op in _COMPARISONS:
+        if expr.op in COMPARISONS:
             return self._comparison(expr, left, right)
         timed = self._with_time(expr.op, left, right)
         if timed is not None:
@@ -215,13 +217,17 @@ class Expressions:
         return known, Value(name, right.type)
 
     def _logic(self, expr: t.Binary, left: Value, right: Value) -> Value:
+        a, b = left.constant, right.constant
+        untyped = isinstance(left.type, ty.AnyInt) and isinstance(right.type, ty.AnyInt)
+        if untyped and expr.op in ("AND", "&", "OR", "XOR") and min(a, b) >= 0:  # the context gives the width
+            return self.known(expr, a & b if expr.op in ("AND", "&") else a | b if expr.op == "OR" else a ^ b)
         kind = ty.common(left.type, right.type)
         if kind is None or not ty.is_kind(kind, "bool", "bits"):
             self._mismatch(expr, left, right, "BOOL, or bit strings of types that meet")
-        a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
+        x, y = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
         if expr.op in ("AND_THEN", "OR_ELSE") and not ty.is_kind(kind, "bool"):
             self._mismatch(expr, left, right, "BOOL")
-        return Value(f"({a} {_LOGIC[expr.op]} {b})", kind)
+        return Value(f"({x} {_LOGIC[expr.op]} {y})", kind)
 
     def _comparison(self, expr: t.Binary, left: Value, right: Value) -> Value:
         kind = ty.common(left.type, right.type)
@@ -231,7 +237,7 @@ class Expressions:
             a, b = left.code, right.code
         else:
             a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
-        return Value(f"({a} {_COMPARISONS[expr.op]} {b})", ty.BOOL)
+        return Value(f"({a} {COMPARISONS[expr.op]} {b})", ty.BOOL)
 
     def _with_time(self, op: str, left: Value, right: Value) -> Value | None:
         """Durations, dates and times of day (IEC 61131-3, Table 35); None where neither side is one."""
@@ -259,6 +265,8 @@ class Expressions:
         if result is None:
             return None
         assert isinstance(result, ty.Elementary)
+        if result.kind == "tod":  # a day ends at midnight
+            return Value(f"(({code}) % {ty.DAY_NS})", result)
         return Value(wrapped(code, result), result)
 
     def _folded(self, expr: t.Binary, left: Value, right: Value) -> Value:
@@ -294,7 +302,9 @@ class Expressions:
             return self._enum_value(ref)
         if self.only_constants and symbol.constant is None:
             self.env.fail(ref.pos, f"{ref.name} is no constant", expected="a constant expression")
-        value = Value(symbol.code, symbol.type, symbol.constant, place=True, writable=symbol.writable)
+        owner, _, own = symbol.code.rpartition(".")
+        reference = symbol.reference or (f"_v.Member({owner}, {own!r})" if owner else "")
+        value = Value(symbol.code, symbol.type, symbol.constant, True, symbol.writable, reference)
         for selector in ref.selectors:
             if isinstance(selector, t.Member):
                 value = self._member(value, selector)
@@ -318,12 +328,14 @@ class Expressions:
     def _member(self, value: Value, member: t.Member) -> Value:
         kind, name = value.type, member.name.lower()
         if isinstance(kind, ty.Struct) and name in kind.fields:
-            return Value(f"{value.code}.m_{name}", kind.fields[name][1], place=True, writable=value.writable)
+            reference = f"_v.Member({value.code}, {f'm_{name}'!r})"
+            return Value(f"{value.code}.m_{name}", kind.fields[name][1], None, True, value.writable, reference)
         if isinstance(kind, ty.Block):
             for members, writable in ((kind.inputs, True), (kind.outputs, False)):
                 if name in members:
                     attribute = members[name][0] if kind.standard else f"v_{name}"
-                    return Value(f"{value.code}.{attribute}", members[name][1], place=True, writable=writable)
+                    reference = f"_v.Member({value.code}, {attribute!r})"
+                    return Value(f"{value.code}.{attribute}", members[name][1], None, True, writable, reference)
         known: list[str] = []
         if isinstance(kind, ty.Struct):
             known = [f for f, _ in kind.fields.values()]
@@ -339,7 +351,7 @@ class Expressions:
             self.env.fail(
                 selector.pos, "indices", expected=f"{len(kind.ranges)} for {kind}", got=str(len(selector.indices))
             )
-        code = value.code
+        code, owner, at = value.code, "", ""
         for expr, (low, high) in zip(selector.indices, kind.ranges, strict=True):
             index = self._flat(self.value(expr), expr.pos)
             if not ty.is_kind(index.type, "int", "bits"):
@@ -347,10 +359,11 @@ class Expressions:
             if isinstance(index.constant, int):
                 if not low <= index.constant <= high:
                     self.env.fail(expr.pos, "an index outside its array", expected=f"{low} to {high}", got=index.code)
-                code += f"[{index.constant - low}]"
+                at = str(index.constant - low)
             else:
-                code += f"[_v.index({index.code}, {low}, {high})]"
-        return Value(code, kind.of, place=True, writable=value.writable)
+                at = f"_v.index({index.code}, {low}, {high})"
+            owner, code = code, f"{code}[{at}]"
+        return Value(code, kind.of, None, True, value.writable, f"_v.Element({owner}, {at})")
 
     def _bit(self, value: Value, selector: t.Bit) -> Value:
         kind = ty.plain(value.type)
@@ -381,39 +394,28 @@ class Expressions:
             self.env.unknown(call.pos, "a function", call.ref.name, known)
         raise self.env.error(call.pos, "a function block is called in a statement of its own", got=call.ref.name)
 
-    def positional(self, call: t.Call, least: int, most: int | None = None) -> list[t.Expr]:
-        """The arguments of a standard function, which has no names for them here."""
-        found = [a.value for a in call.arguments if a.value is not None]
-        limit = least if most is None else most
-        if len(found) != len(call.arguments) or not least <= len(found) <= limit:
-            number = str(least) if limit == least else f"{least} or more" if limit > 99 else f"{least} to {limit}"
-            self.env.fail(call.pos, f"arguments of {call.ref.name}", expected=number, got=str(len(call.arguments)))
-        return found
-
     def _user_function(self, call: t.Call, signature: Signature) -> Value:
         self.env.calls.setdefault(self.pou, {}).setdefault(signature.name.lower(), call.pos)
-        given = self._named(call, [*signature.inputs, *signature.in_outs], signature)
-        codes, write_back = [], []
+        given = bind(self.env, call, [p.name for p in (*signature.inputs, *signature.in_outs)], signature.name)
+        codes = []
         for p in signature.inputs:
-            expr = given.pop(p.name.lower(), None)
+            expr = _value_of(given.get(p.name.lower()))
             codes.append(
                 p.initial if expr is None else self.coerced(self.value(expr), p.type, expr.pos, _into(p, signature))
             )
+        cells: dict[str, str] = {}
         for p in signature.in_outs:
-            expr = given.pop(p.name.lower(), None)
-            target = self._in_out(expr, p, call, signature.name)
-            codes.append(target.code)
-            if not by_reference(p.type):
-                write_back.append((p, target.code))
+            expr = _value_of(given.get(p.name.lower()))
+            codes.append(self.in_out(expr, p.name, p.type, call, signature.name, cells))
         code = f"f_{signature.name.lower()}({', '.join(codes)})"
         outputs = [a for a in call.arguments if a.target is not None]
-        if not outputs and not write_back:
-            return Value(f"{code}[0]" if signature.more else code, signature.returns)
+        more = bool(signature.outputs)
+        if not outputs and all(by_reference(p.type) for p in signature.in_outs):
+            return Value(f"{code}[0]" if more else code, signature.returns)
         result = self.out.temporary()
         self.out.line(f"{result} = {code}", call.pos)
-        places = {p.name.lower(): n for n, p in enumerate(signature.more, 1)}
-        for p, target_code in write_back:
-            self.out.line(f"{target_code} = {result}[{places[p.name.lower()]}]", call.pos)
+        self.take_back(cells, call.pos)
+        places = {p.name.lower(): n for n, p in enumerate(signature.outputs, 1)}
         types = {p.name.lower(): p.type for p in signature.outputs}
         for argument in outputs:
             key = argument.name.lower()
@@ -422,7 +424,7 @@ class Expressions:
                     argument.pos, f"in {signature.name}, an output", argument.name, [p.name for p in signature.outputs]
                 )
             self.take(argument, Value(f"{result}[{places[key]}]", types[key]))
-        return Value(f"{result}[0]", signature.returns)
+        return Value(f"{result}[0]" if more else result, signature.returns)
 
     def take(self, argument: t.Argument, value: Value) -> None:
         """``name => target``."""
@@ -447,7 +449,7 @@ class Expressions:
         target = self.writable(ref)
         code = self.coerced(value, target.type, pos, f"assigned to {ref.name}")
         if isinstance(target.type, ty.Array):  # in place: a VAR_IN_OUT may stand for it
-            self.out.line(f"{target.code}[:] = {code}", pos)
+            self.out.line(f"_v.fill({target.code}, {code})", pos)
         elif isinstance(target.type, ty.Struct):
             self.out.line(f"_v.put({target.code}, {code})", pos)
         else:
@@ -459,41 +461,40 @@ class Expressions:
             self.env.fail(
                 ref.pos, f"{ref.name} cannot be assigned to", hint="it is a constant, an input, or a block's output"
             )
+        if any(control == target.code or control.startswith(f"{target.code}.") for control in self.controls):
+            self.env.fail(
+                ref.pos,
+                f"{ref.name} is the control variable of the FOR around this statement and cannot be altered here",
+                hint="leave the loop with EXIT, or use WHILE",
+            )
         return target
 
-    def _in_out(self, expr: t.Expr | None, p: Parameter, call: t.Call, of: str) -> Value:
+    def in_out(
+        self, expr: t.Expr | None, name: str, kind: ty.Type, call: t.Call, of: str, cells: dict[str, str]
+    ) -> str:
+        """Python expression of what is handed over for VAR_IN_OUT `name` of `of`. `cells` gets the variables of the
+        function itself that are handed over, with the object that stands for each until `take_back`."""
         if not isinstance(expr, t.Ref):
-            self.env.fail(call.pos, f"VAR_IN_OUT {p.name} of {of} needs a variable")
+            self.env.fail(call.pos, f"VAR_IN_OUT {name} of {of} needs a variable")
         target = self.writable(expr)
-        if ty.plain(target.type) != ty.plain(p.type) and not (
-            isinstance(p.type, ty.String) and isinstance(target.type, ty.String)
-        ):
-            self.env.fail(expr.pos, f"VAR_IN_OUT {p.name} of {of}", expected=str(p.type), got=str(target.type))
-        return target
+        if target.type != kind and not (isinstance(kind, ty.String) and ty.fits(target.type, kind)):
+            self.env.fail(expr.pos, f"VAR_IN_OUT {name} of {of}", expected=str(kind), got=str(target.type))
+        if by_reference(kind):
+            return target.code
+        reference = target.reference
+        if not reference:
+            if target.code not in cells:
+                cells[target.code] = self.out.temporary()
+                self.out.line(f"{cells[target.code]} = _v.Cell({target.code})", expr.pos)
+            reference = cells[target.code]
+        if isinstance(kind, ty.String) and isinstance(target.type, ty.String) and target.type.length < kind.length:
+            return f"_v.Cut({reference}, {target.type.length})"
+        return reference
 
-    def _named(self, call: t.Call, parameters: list[Parameter], signature: Signature) -> dict[str, t.Expr]:
-        """Arguments by parameter in lower case, whether given by name or in order."""
-        given: dict[str, t.Expr] = {}
-        order = [p.name.lower() for p in parameters]
-        position = 0
-        for argument in call.arguments:
-            if argument.value is None:
-                continue
-            if argument.name:
-                key = argument.name.lower()
-                if key not in order:
-                    self.env.unknown(
-                        argument.pos, f"in {signature.name}, a parameter", argument.name, [p.name for p in parameters]
-                    )
-            elif position < len(order):
-                key = order[position]
-                position += 1
-            else:
-                self.env.fail(argument.pos, f"too many arguments for {signature.name}", expected=str(len(order)))
-            if key in given:
-                self.env.fail(argument.pos, f"{key} of {signature.name} is given twice")
-            given[key] = argument.value
-        return given
+    def take_back(self, cells: dict[str, str], pos: t.Pos) -> None:
+        """After the call: the variables that were handed over in cells take their values."""
+        for code, cell in cells.items():
+            self.out.line(f"{code} = {cell}.v", pos)
 
 
 def _open(code: str) -> int:
@@ -506,6 +507,10 @@ def _open(code: str) -> int:
         elif char in ")]":
             open_ -= 1
     return most
+
+
+def _value_of(argument: t.Argument | None) -> t.Expr | None:
+    return None if argument is None else argument.value
 
 
 def _kind(kind: ty.Type) -> str:

@@ -304,6 +304,9 @@ class _Build(Transformer_NonRecursive[Token, Any]):
     def call(self, meta: Meta, items: list[Any]) -> t.Call:
         return t.Call(_pos(meta), items[0], tuple(items[1:]))
 
+    def operator(self, meta: Meta, items: list[Any]) -> t.Ref:
+        return t.Ref(_pos(meta), str(items[0]))
+
     def positional(self, meta: Meta, items: list[Any]) -> t.Argument:
         return t.Argument(_pos(meta), "", items[0])
 

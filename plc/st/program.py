@@ -13,36 +13,20 @@ from pathlib import Path
 from typing import Any
 
 from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.image import Message, TagKind
-from gateway.core.values import Quality, Scalar, TagValue
-from plc.blocks import BLOCKS
-from plc.program import Program, Role, ScanInfo, Variable, message_input, message_output
+from gateway.core.image import TagKind
+from gateway.core.input_file import read_input
+from gateway.core.values import Scalar
+from plc.program import Place, Program, Role, ScanInfo, Variable, message_input, message_output
 from plc.st import types as ty
 from plc.st import values
+from plc.st.assignments import is_line, line_of
 from plc.st.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
 from plc.st.plcopen import is_plcopen, to_st
+from plc.st.resource import Resource, Together, state_of
 
+MAX_SOURCE_BYTES = 8 * 1024 * 1024
+"""A source file that is larger is a mistake."""
 _ROLES = {"input": Role.INPUT, "output": Role.OUTPUT, "local": Role.LOCAL}
-
-
-class Context:
-    """What compiled code knows of the scan that runs."""
-
-    __slots__ = ("_lookup", "first_scan", "now_ns")
-
-    def __init__(self, lookup: Callable[[str], TagValue]) -> None:
-        self.now_ns = 0
-        self.first_scan = False
-        self._lookup = lookup
-
-    def is_good(self, name: str) -> bool:
-        """A forced value too: whoever forces it wants it to be taken for one."""
-        return self._lookup(name).quality in (Quality.GOOD, Quality.SIMULATED)
-
-    @staticmethod
-    def message(messages: tuple[Message, ...], number: int) -> Message:
-        """`number` counts from 1."""
-        return messages[values.index(number, 1, len(messages))]
 
 
 class StProgram(Program):
@@ -51,11 +35,10 @@ class StProgram(Program):
     st_unit: CompiledUnit
     st_declared: CompiledProgram
 
-    def __init__(self) -> None:
-        self.st_context = Context(lambda name: self.tag(name))
-        space: dict[str, Any] = {"_v": values, "_c": self.st_context, "_blocks": BLOCKS}
-        exec(self.st_unit.code, space)
-        self.st_body: Any = space[f"P_{self.st_declared.name.lower()}"]()
+    def __init__(self, together: Together | None = None) -> None:
+        """`together` holds what the programs of one PLC share: those of one file have their global variables in common."""
+        self.st_resource = Resource.of(self.st_unit, together)
+        self.st_body: Any = self.st_resource.space[f"P_{self.st_declared.name.lower()}"]()
         """The instance of the compiled program, its variables as ``v_<name>`` in lower case."""
         self.st_inputs = [_Input(v) for v in self.st_declared.variables if v.role == "input"]
         self.st_variables = {v.name: v for v in self.st_declared.variables}
@@ -68,7 +51,7 @@ class StProgram(Program):
         self.st_show()
 
     def execute(self, scan: ScanInfo) -> None:
-        self.st_context.now_ns, self.st_context.first_scan = scan.now_ns, scan.first_scan
+        self.st_resource.begin(scan, self.tag)
         body, namespace = self.st_body, self.__dict__
         for item in self.st_inputs:
             value = namespace[item.name]
@@ -76,6 +59,14 @@ class StProgram(Program):
                 setattr(body, item.attribute, item.taken(value) if item.convert else value)
         body.execute()
         self.st_show()
+
+    def _whole_state(self, now_ns: int) -> Any:
+        """All that the next scans depend on, hashable: variables, blocks with the phase of their timers, global variables."""
+        resource = self.st_resource
+        body = {name: value for name, value in vars(self.st_body).items() if not is_line(name)}
+        held = [body, vars(resource.globals)]
+        own = tuple([tuple([state_of(v, now_ns) for v in variables.values()]) for variables in held])
+        return (own, now_ns) if resource.absolute else own
 
     def st_show(self) -> None:
         body, namespace = self.st_body, self.__dict__
@@ -89,6 +80,14 @@ class StProgram(Program):
         if found is not None:
             convert = _from_tag(found.kind)
             setattr(self.st_body, _attribute(found), convert(value) if convert else value)
+            if found.role == "output":
+                setattr(self.st_body, line_of(_attribute(found)), 0)
+
+    def place(self, name: str) -> Place | None:
+        """Of an output that still has its initial value: the line of its declaration."""
+        found = self.st_variables.get(name)
+        line = getattr(self.st_body, line_of(_attribute(found)), 0) if found is not None else 0
+        return Place(self.source_path, line) if line else None
 
     def check(self, name: str, value: Scalar) -> None:
         found = self.st_variables.get(name)
@@ -179,7 +178,7 @@ def program_class(unit: CompiledUnit, name: str = "") -> type[StProgram]:
 def load_file(path: Path, name: str = "") -> type[StProgram]:
     """Read and compile a file: Structured Text, or a PLCopen XML export. Raises `FileInvalid`."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_input(path, MAX_SOURCE_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as e:
         raise FileInvalid("not UTF-8 text", path=str(path), got=f"byte {e.start}: {e.object[e.start]:02x}h") from e
     except OSError as e:

@@ -11,29 +11,38 @@ from typing import Any, NoReturn, Protocol
 from gateway.core.errors import FileInvalid
 from plc.st import types as ty
 from plc.st.source import shortened
-from plc.st.tree import Call, Expr, Pos
+from plc.st.tree import Expr, Pos
+
+COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
+"""Operators of Structured Text as Python writes them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A variable: its Python expression, and its value if it is a constant."""
+    """A variable: its Python expression, and its value if it is a constant. `reference`: the expression of the object that
+    stands for a variable of the caller, where it is a VAR_IN_OUT of an elementary type (`plc.st.references`)."""
 
     name: str
     type: ty.Type
     code: str
     writable: bool = True
     constant: Any = None
+    reference: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A compiled expression. `place`: it is a variable or a part of one; `constant`: its value where that is known."""
+    """A compiled expression. `place`: it is a variable or a part of one; `constant`: its value where that is known.
+
+    `reference`: Python expression of an object that stands for the variable; empty for a variable of a function's own.
+    """
 
     code: str
     type: ty.Type
     constant: Any = None
     place: bool = False
     writable: bool = False
+    reference: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +55,7 @@ class Parameter:
 
 @dataclass(frozen=True, slots=True)
 class Signature:
-    """How a user's function is called. It returns a tuple if `more` (outputs and in-outs that are no references)."""
+    """How a user's function is called. It returns a tuple if it has outputs."""
 
     name: str
     returns: ty.Type
@@ -54,13 +63,9 @@ class Signature:
     in_outs: tuple[Parameter, ...]
     outputs: tuple[Parameter, ...]
 
-    @property
-    def more(self) -> tuple[Parameter, ...]:
-        return self.outputs + tuple(p for p in self.in_outs if not by_reference(p.type))
-
 
 def by_reference(kind: ty.Type) -> bool:
-    """Whether a VAR_IN_OUT of this type is handed over as the object itself."""
+    """Whether a VAR_IN_OUT of this type is handed over as the object itself; others need an object that stands for them."""
     return isinstance(kind, ty.Array | ty.Struct | ty.Block)
 
 
@@ -106,8 +111,6 @@ class Compiling(Protocol):
 
     def condition(self, expr: Expr, what: str) -> str: ...
 
-    def positional(self, call: Call, least: int, most: int | None = None) -> list[Expr]: ...
-
 
 def wrapped(code: str, kind: ty.Elementary) -> str:
     """`code` brought back into the width of `kind`."""
@@ -139,6 +142,11 @@ class Writer:
         if len(self.lines) == before:
             self.line("pass", pos)
         self._depth -= 1
+
+    def step(self, pos: Pos | None = None) -> None:
+        """Count one loop iteration or call against the limit of the scan (`plc.st.resource.MAX_STEPS`)."""
+        self.line("_c.left -= 1", pos)
+        self.line("if _c.left < 0: _c.too_long()", pos)
 
     @property
     def depth(self) -> int:

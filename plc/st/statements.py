@@ -7,8 +7,9 @@ from contextlib import ExitStack, contextmanager
 
 from plc.st import tree as t
 from plc.st import types as ty
+from plc.st.arguments import bind
 from plc.st.expressions import Expressions
-from plc.st.scope import Environment, Symbol, Value, Writer, by_reference
+from plc.st.scope import Environment, Symbol, Value, Writer, wrapped
 
 MAX_DEEP = 60
 """Statements inside each other."""
@@ -62,34 +63,25 @@ class Statements(Expressions):
             place = self.out.temporary()
             self.out.line(f"{place} = {code}", call.pos)
             code = place
-        order, outputs, write_back = list(block.inputs), [], []
-        for argument in call.arguments:
-            if argument.target is not None:
-                outputs.append(argument)
-                continue
+        cells: dict[str, str] = {}
+        names = [member for member, _ in (*block.inputs.values(), *block.in_outs.values())]
+        given = bind(self.env, call, names, str(block))
+        for name, argument in given.items():
             assert argument.value is not None
-            name = argument.name.lower() if argument.name else order.pop(0) if order else ""
             if name in block.inputs:
                 member, kind = block.inputs[name]
                 value = self.coerced(self.value(argument.value), kind, argument.pos, f"{member} of {block}")
                 self.out.line(f"{code}.{_attribute(block, name, member)} = {value}", call.pos)
-            elif name in block.in_outs:
-                member, kind = block.in_outs[name]
-                target = self._in_out_of(argument, member, kind, block)
-                self.out.line(f"{code}.v_{name} = {target}", call.pos)
-                if not by_reference(kind):
-                    write_back.append(f"{target} = {code}.v_{name}")
             else:
-                known = [m for m, _ in (*block.inputs.values(), *block.in_outs.values())]
-                self.env.unknown(argument.pos, f"in {block}, an input", argument.name or "(one more)", known)
-        given = {a.name.lower() for a in call.arguments if a.name}
+                member, kind = block.in_outs[name]
+                handed = self.in_out(argument.value, member, kind, call, str(block), cells)
+                self.out.line(f"{code}.v_{name} = {handed}", call.pos)
         for name, (member, _) in block.in_outs.items():
             if name not in given:
                 self.env.fail(call.pos, f"VAR_IN_OUT {member} of {block} needs a variable")
         self.out.line(f"{code}.execute(_c.now_ns)", call.pos)
-        for line in write_back:
-            self.out.line(line, call.pos)
-        for argument in outputs:
+        self.take_back(cells, call.pos)
+        for argument in (a for a in call.arguments if a.target is not None):
             name = argument.name.lower()
             if name not in block.outputs:
                 self.env.unknown(
@@ -97,14 +89,6 @@ class Statements(Expressions):
                 )
             member, kind = block.outputs[name]
             self.take(argument, Value(f"{code}.{_attribute(block, name, member)}", kind))
-
-    def _in_out_of(self, argument: t.Argument, member: str, kind: ty.Type, block: ty.Block) -> str:
-        if not isinstance(argument.value, t.Ref):
-            self.env.fail(argument.pos, f"VAR_IN_OUT {member} of {block} needs a variable")
-        target = self.writable(argument.value)
-        if ty.plain(target.type) != ty.plain(kind):
-            self.env.fail(argument.pos, f"VAR_IN_OUT {member} of {block}", expected=str(kind), got=str(target.type))
-        return target.code
 
     # -- selection ----------------------------------------------------------------------------------------------------
 
@@ -227,21 +211,31 @@ class Statements(Expressions):
             self.env.fail(pos, "loops nested too deep", expected=f"at most {MAX_LOOPS}")
         self._loops.append(until)
         with self.out.block(head, pos):
+            self.out.step(pos)
             yield
         self._loops.pop()
 
     def _for(self, s: t.For) -> None:
+        """Limits and step are worked out once. Afterwards the variable is the first value past the limit, as in C."""
         target = self.writable(s.variable)
         kind = target.type
-        if not ty.is_kind(kind, "int") or isinstance(kind, ty.Subrange):
+        if not isinstance(kind, ty.Elementary) or kind.kind != "int":
             self.env.fail(s.variable.pos, "the variable of FOR", expected="an integer", got=str(kind))
+        if target.code.count(".m_") != len(s.variable.selectors):
+            self.env.fail(s.variable.pos, "the variable of FOR", expected="a variable, or a member of a structure")
         first, last = (self.coerced(self.value(e), kind, e.pos, "a limit of FOR") for e in (s.first, s.last))
-        if s.step is None:
-            head = f"range({first}, {last} + 1)"
-        else:
-            head = f"_v.steps({first}, {last}, {self.coerced(self.value(s.step), kind, s.step.pos, 'the step of FOR')})"
+        taken, code = self.out.temporary(), f"range({first}, {last} + 1)"
+        if s.step is not None:
+            code = f"_v.steps({first}, {last}, {self.coerced(self.value(s.step), kind, s.step.pos, 'the step of FOR')})"
+        self.out.line(f"{taken} = {code}", s.pos)
+        own = target.code in (f"v_{s.variable.name.lower()}", f"self.v_{s.variable.name.lower()}")
+        head = taken if own else f"_v.unaltered({taken}, lambda: {target.code})"
+        self.controls.append(target.code)
         with self._loop(f"for {target.code} in {head}:", s.pos):
             self.body(s.body)
+        self.controls.pop()
+        with self.out.block("else:", s.pos):
+            self.out.line(f"{target.code} = {wrapped(f'_v.beyond({taken})', kind)}", s.pos)
 
     def _while(self, s: t.While) -> None:
         with self._loop("while True:", s.pos):

@@ -15,6 +15,7 @@ from math import prod
 from plc.blocks import FunctionBlock
 
 DEFAULT_STRING = 80
+DAY_NS = 86_400_000_000_000
 MAX_STRING = 65_535
 MAX_ELEMENTS = 1_000_000
 """Of an array over all its dimensions, and of all that a structure, a block or a program holds."""

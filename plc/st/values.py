@@ -11,13 +11,18 @@ import math
 import re
 import struct
 from bisect import bisect_right
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from gateway.core.errors import Blame, FieldtwinError
+from plc.st.references import Cell, Cut, Element, Member
+
+__all__ = ["Cell", "Cut", "Element", "LogicError", "Member"]  # and all that compiled code calls by its name
 
 _FLOAT = struct.Struct("<f")
 _WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)
+_BASED = re.compile(r"(2|8|16)#([0-9a-f][0-9a-f_]{0,79})", re.ASCII | re.IGNORECASE)
 _REAL = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[+-]?[0-9]+)?", re.ASCII | re.IGNORECASE)
 _NS = 1_000_000_000
 MS = 1_000_000
@@ -93,6 +98,21 @@ def steps(first: int, last: int, by: int) -> range:
     return range(first, last + (1 if by > 0 else -1), by)
 
 
+def beyond(taken: range) -> int:
+    """What the control variable of a FOR is after the loop: the first value past the limit, the initial value if none was in."""
+    return taken[-1] + taken.step if taken else taken.start
+
+
+def unaltered(taken: range, control: Callable[[], int]) -> Iterator[int]:
+    """The values of a control variable that POUs called in the loop can reach. Raises `LogicError` where one altered it."""
+    for value in taken:
+        yield value
+        if control() != value:
+            raise LogicError(
+                "the control variable of a FOR was altered in the loop", expected=str(value), got=str(control())
+            )
+
+
 def copied(x: list[Any]) -> list[Any]:
     """An array of its own: elements that are objects or arrays are copied too."""
     return [copied(e) if isinstance(e, list) else e.copy() if hasattr(e, "copy") else e for e in x]
@@ -106,9 +126,28 @@ def shaped(x: list[Any], sizes: tuple[int, ...]) -> list[Any]:
 
 
 def put(target: Any, source: Any) -> None:
-    """Assign a structure: `target` stays the object that it is, since a VAR_IN_OUT may stand for it."""
+    """Assign a structure: `target` and what is inside it stay the objects that they are, since a VAR_IN_OUT may stand for
+    them. `source` is a copy."""
     for name in target.__slots__:
-        setattr(target, name, getattr(source, name))
+        held = getattr(target, name)
+        if isinstance(held, list):
+            fill(held, getattr(source, name))
+        elif hasattr(held, "copy"):
+            put(held, getattr(source, name))
+        else:
+            setattr(target, name, getattr(source, name))
+
+
+def fill(target: list[Any], source: list[Any]) -> None:
+    """Assign an array, likewise."""
+    if target and not isinstance(target[0], list) and not hasattr(target[0], "copy"):
+        target[:] = source
+        return
+    for held, new in zip(target, source, strict=True):
+        if isinstance(held, list):
+            fill(held, new)
+        else:
+            put(held, new)
 
 
 def with_members(made: Any, **members: Any) -> Any:
@@ -124,16 +163,46 @@ def set_bit(x: int, bit: int, on: bool) -> int:
     return x | 1 << bit if on else x & ~(1 << bit)
 
 
-def shift(x: int, n: int, bits: int) -> int:
-    """To the left by `n`, to the right if negative; zeros come in."""
-    if n < 0:
-        return x >> -n
-    return (x << n) & ((1 << bits) - 1) if n < bits else 0
+def shift_left(x: int, n: int, bits: int) -> int:
+    """SHL: zeros come in from the right. A negative count is an error (IEC 61131-3, Table 30)."""
+    return (x << _count(n)) & ((1 << bits) - 1) if n < bits else 0
 
 
-def rotate(x: int, n: int, bits: int) -> int:
-    n %= bits
+def shift_right(x: int, n: int, bits: int) -> int:
+    """SHR: zeros come in from the left."""
+    return x >> _count(n) if n < bits else 0
+
+
+def rotate_left(x: int, n: int, bits: int) -> int:
+    n = _count(n) % bits
     return (x << n | x >> (bits - n)) & ((1 << bits) - 1)
+
+
+def rotate_right(x: int, n: int, bits: int) -> int:
+    return rotate_left(x, bits - _count(n) % bits, bits)
+
+
+def _count(n: int) -> int:
+    if n < 0:
+        raise LogicError("a negative count of a shift or a rotation", expected="0 or more", got=str(n))
+    return n
+
+
+def of_bcd(x: int, high: int) -> int:
+    """The number whose decimal digits are the hexadecimal digits of `x`. Raises `LogicError` for A to F, or above `high`."""
+    digits = f"{x:x}"
+    if not digits.isdecimal():
+        raise LogicError("a bit string that is not binary coded decimal", got=f"16#{digits.upper()}")
+    if (number := int(digits)) > high:
+        raise LogicError("a value that does not fit its type", expected=f"0 to {high}", got=digits)
+    return number
+
+
+def to_bcd(x: int, bits: int) -> int:
+    """The decimal digits of `x`, four bits each. Raises `LogicError` where `bits` do not hold them."""
+    if not 0 <= x < 10 ** (bits // 4):
+        raise LogicError("a value that does not fit its type", expected=f"0 to {10 ** (bits // 4) - 1}", got=str(x))
+    return int(str(x), 16)
 
 
 # -- functions ----------------------------------------------------------------------------------------------------------
@@ -260,11 +329,17 @@ def _moment(ns: int) -> datetime:
 
 
 def number_of(text: str, low: int, high: int) -> int:
-    """STRING_TO_integer: spaces around are ignored; what is no number is a `LogicError`."""
+    """Return the number that a string holds, as a literal: ``-12``, ``1_000``, ``16#FF``, ``2#1010``; spaces around it are
+    ignored. Raises `LogicError` for what is no number or does not fit."""
     digits = text.strip()
-    if not _WHOLE.fullmatch(digits):
-        raise LogicError("a string that is no whole number", got=repr(text[:MAX_SHOWN]))
-    value = int(digits.replace("_", ""))
+    based = _BASED.fullmatch(digits)
+    try:
+        if based is None and not _WHOLE.fullmatch(digits):
+            raise ValueError(digits)
+        base = int(based.group(1)) if based else 10
+        value = int((based.group(2) if based else digits).replace("_", ""), base)
+    except ValueError:
+        raise LogicError("a string that is no whole number", got=repr(text[:MAX_SHOWN])) from None
     if low <= value <= high:
         return value
     raise LogicError("a value that does not fit its type", expected=f"{low} to {high}", got=str(value))

@@ -74,7 +74,7 @@ def test_files_and_exit_code(device: str, tmp_path: Path) -> None:
     html, junit, out, log = (tmp_path / name for name in ("c.html", "c.xml", "c.json", "c.jsonl"))
     result = check(device, "--html", html, "--junit", junit, "-o", out, "--log", log, "--by", "A. Fitter")
     assert result.return_value == 1, result.exception
-    assert "failed       MB-036a read     count 0: exception 04 (device failure) instead of 03" in result.stdout
+    assert "failed        MB-036a read     count 0: exception 04 (device failure) instead of 03" in result.stdout
     data = json.loads(out.read_text())
     assert data["about"]["identity"]["product code"] == "FT-1"
     assert data["about"]["by"] == "A. Fitter"

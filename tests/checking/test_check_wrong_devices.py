@@ -45,12 +45,19 @@ TWISTS: dict[str, wrong.Twist] = {
     "MB-036a": wrong.instead(0x03, b"\x03\x00", where=lambda pdu: count(pdu) == 0),
     "MB-036b": wrong.instead(0x03, b"\x83\x02", where=lambda pdu: count(pdu) == 126 and pdu[1] == 0),
     "MB-036c": wrong.instead(0x01, b"\x81\x04", where=lambda pdu: count(pdu) == 2001),
-    "MB-036d": wrong.instead(0x10, b"\x10\x00\xbe\x00\x00", where=lambda pdu: count(pdu) == 0),
+    "MB-036d": wrong.instead(0x10, b"\x10\x00\xbe\x00\x00", where=lambda pdu: len(pdu) == 6),
     "MB-037": wrong.instead(0x03, b"\x83\x03", where=lambda pdu: pdu[1:] == b"\xff\xff\x00\x02"),
     "MB-038": wrong.instead(0x03, b"\x83\x02", where=lambda pdu: pdu[1:] == b"\xff\xff\x00\x7e"),
     "MB-039a": wrong.written("coil", lambda pdu: 1, 0x05, lambda pdu: pdu[3:] == b"\x00\x01"),
     "MB-039b": wrong.instead(0x05, b"\x05\x00\x03\xff\x01", where=lambda pdu: pdu[3:] == b"\xff\x01"),
-    "MB-040a": wrong.written("holding", lambda pdu: int.from_bytes(pdu[6:8]), 0x10, lambda pdu: pdu[5] == 4),
+    "MB-040a": wrong.written(
+        "holding", lambda pdu: int.from_bytes(pdu[6:8]), 0x10, lambda pdu: pdu[5] == 4 and len(pdu) == 10
+    ),
+    "MB-040c": wrong.written(
+        "holding", lambda pdu: int.from_bytes(pdu[6:8]), 0x10, lambda pdu: pdu[4:6] == b"\x01\x02"
+    ),
+    "MB-040d": wrong.instead(0x10, b"\x10\x00\xbe\x00\x01", where=lambda pdu: pdu[5] == 4 and len(pdu) == 8),
+    "MB-040e": wrong.instead(0x10, b"\x10\x00\xbe\x00\x00", where=lambda pdu: count(pdu) == 0 and len(pdu) == 8),
     "MB-040b": wrong.written("coil", lambda pdu: pdu[6] & 1, 0x0F, lambda pdu: True),
     "MB-041": wrong.written("holding", lambda pdu: int.from_bytes(pdu[6:8]), 0x10, lambda pdu: count(pdu) == 11),
     "MB-042a": wrong.old_value_of_fc23,

@@ -6,14 +6,16 @@ printed, so that `--probe output` sees it. What a library throws is caught, and 
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import os
 import sys
-import time
 from collections.abc import Callable
 from typing import Any
 
 TIMEOUT_S, PAUSE_S = 0.15, 0.02
-Master = tuple[Callable[[], "int | None"], Callable[[], object]]
+Master = tuple[Callable[[], Any], Callable[[], object]]
+"""Reads the value (None: there is none) and connects again; either may return an awaitable."""
 
 
 def _tcp() -> tuple[str, int]:
@@ -42,6 +44,30 @@ def pymodbus_rtu(framer: str = "rtu") -> Master:
 
     tty, framing = os.environ["FIELDTWIN_TTY"], FramerType(framer)
     return _pymodbus(ModbusSerialClient(tty, framer=framing, baudrate=19200, parity="N", timeout=TIMEOUT_S, retries=0))
+
+
+def _pymodbus_async(client: Any) -> Master:
+    async def read() -> int | None:
+        if not client.connected:
+            await client.connect()
+        reply = await client.read_holding_registers(0, count=2, device_id=1)
+        return None if reply.isError() else reply.registers[0]
+
+    return read, client.connect
+
+
+def pymodbus_async_tcp() -> Master:
+    from pymodbus.client import AsyncModbusTcpClient
+
+    host, port = _tcp()
+    return _pymodbus_async(AsyncModbusTcpClient(host, port=port, timeout=TIMEOUT_S, retries=0))
+
+
+def pymodbus_async_rtu() -> Master:
+    from pymodbus.client import AsyncModbusSerialClient
+
+    tty = os.environ["FIELDTWIN_TTY"]
+    return _pymodbus_async(AsyncModbusSerialClient(tty, baudrate=19200, parity="N", timeout=TIMEOUT_S, retries=0))
 
 
 def pymodbus_ascii() -> Master:
@@ -124,24 +150,28 @@ def canopen_block_download() -> Master:
 MASTERS: dict[str, Callable[[], Master]] = {
     made.__name__: made
     for made in (
-        pymodbus_tcp, pymodbus_rtu, pymodbus_ascii, minimalmodbus_rtu, minimalmodbus_ascii, pymodbustcp, umodbus_tcp,
-        canopen, canopen_block_upload, canopen_block_download,
+        pymodbus_tcp, pymodbus_rtu, pymodbus_ascii, pymodbus_async_tcp, pymodbus_async_rtu, minimalmodbus_rtu,
+        minimalmodbus_ascii, pymodbustcp, umodbus_tcp, canopen, canopen_block_upload, canopen_block_download,
     )
 }  # fmt: skip
 
 
-def main() -> None:
+async def main() -> None:
     read, again = MASTERS[sys.argv[1]]()
     while True:
         try:
-            value = read()
+            value = await _result(read())
             if value is not None:
                 print(value, flush=True)
         except Exception as e:  # whatever a library throws: that it goes on is what is judged
             print(type(e).__name__, flush=True)
-            again()
-        time.sleep(PAUSE_S)
+            await _result(again())
+        await asyncio.sleep(PAUSE_S)
+
+
+async def _result(value: Any) -> Any:
+    return await value if inspect.isawaitable(value) else value
 
 
 if __name__ == "__main__":
-    main()
+    asyncio.run(main())

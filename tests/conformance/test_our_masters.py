@@ -116,10 +116,12 @@ def test_our_block_downloads_bear_what_nodes_make_of_them() -> None:
 
 
 def test_without_a_probe_what_only_values_tell_is_skipped_and_says_so() -> None:
-    results = judge(ours, LINE, "MB-002", "MB-020", "MB-013", probed=False)
+    results = judge(ours, LINE, "MB-002", "MB-020", "MB-022", "MB-013", probed=False)
     assert results["MB-002"].verdict is Verdict.SKIPPED
     assert "--probe" in results["MB-002"].reason
-    assert results["MB-020"].verdict is Verdict.PASSED
+    assert results["MB-020"].verdict is Verdict.SKIPPED
+    assert results["MB-022"].verdict is Verdict.PASSED
+    assert "what it published was not seen" in results["MB-022"].reason
     assert results["MB-013"].verdict is Verdict.PASSED, "that it quarantines shows on the wire"
 
 

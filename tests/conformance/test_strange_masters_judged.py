@@ -51,6 +51,8 @@ while True:
 
 ENDS = """
 import os, socket
+
+pytestmark = pytest.mark.long
 link = socket.create_connection((os.environ["FIELDTWIN_HOST"], int(os.environ["FIELDTWIN_PORT"])))
 for i in range(30):
     link.sendall(bytes((0, i, 0, 0, 0, 6, 1, 3, 0, 0, 0, 1)))
@@ -59,7 +61,14 @@ raise SystemExit("I was told to")
 """
 
 
-def _check(tmp_path: Path, *args: str, program: str) -> tuple[int, dict[str, tuple[str, str]], str]:
+def environment() -> dict[str, str]:
+    """Where programs under test find this project's modules."""
+    return {**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1"}
+
+
+def run_check(
+    tmp_path: Path, *args: str, program: str, probe: str = "output"
+) -> tuple[int, dict[str, tuple[str, str]], str]:
     """Exit code, id -> (verdict, reason), talk."""
     script = tmp_path / "master.py"
     script.write_text(program)
@@ -71,7 +80,7 @@ def _check(tmp_path: Path, *args: str, program: str) -> tuple[int, dict[str, tup
             "check",
             *args,
             "--probe",
-            "output",
+            probe,
             "--json",
             "--patience",
             "4s",
@@ -82,7 +91,7 @@ def _check(tmp_path: Path, *args: str, program: str) -> tuple[int, dict[str, tup
         capture_output=True,
         text=True,
         timeout=60,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "NO_COLOR": "1"},
+        env=environment(),
         cwd=tmp_path,
         check=False,
     )
@@ -91,7 +100,7 @@ def _check(tmp_path: Path, *args: str, program: str) -> tuple[int, dict[str, tup
 
 
 def test_pymodbus_hands_a_late_rtu_reply_to_the_next_request(tmp_path: Path) -> None:
-    code, found, said = _check(
+    code, found, said = run_check(
         tmp_path, "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "13,14,16",
         "--junit", str(tmp_path / "j.xml"), program=PYMODBUS,
     )  # fmt: skip
@@ -105,7 +114,7 @@ def test_pymodbus_hands_a_late_rtu_reply_to_the_next_request(tmp_path: Path) -> 
 
 
 def test_canopens_client_takes_a_29_bit_frame_for_an_answer(tmp_path: Path) -> None:
-    code, found, said = _check(
+    code, found, said = run_check(
         tmp_path, "canopen-master", "--listen", "can:fieldtwin/127.0.0.1:0", "--timeout", "150ms", "--only", "5,60",
         program=CANOPEN,
     )  # fmt: skip
@@ -114,7 +123,7 @@ def test_canopens_client_takes_a_29_bit_frame_for_an_answer(tmp_path: Path) -> N
 
 
 def test_a_program_that_never_asks_is_told_with_its_last_words(tmp_path: Path) -> None:
-    code, found, said = _check(
+    code, found, said = run_check(
         tmp_path,
         "modbus-master",
         "--listen",
@@ -192,7 +201,7 @@ while True:
 
 @pytest.mark.parametrize(("again", "verdict"), [(True, "passed"), (False, "failed")])
 def test_a_port_that_is_unplugged_comes_back_under_its_name(tmp_path: Path, again: bool, verdict: str) -> None:
-    code, found, said = _check(
+    code, found, said = run_check(
         tmp_path, "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66",
         program=OPENS_AGAIN % again,
     )  # fmt: skip

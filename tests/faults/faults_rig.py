@@ -50,6 +50,7 @@ plc:
   programs:
     watch:
       source: "python: faults_rig:Watch"
+      start: {timeout_ms: 200, at_timeout: start_anyway}  # its outputs make the sensors measure
       inputs:
         line: {tag: ctd.pressure}
         lan: {tag: probe.pressure}
@@ -218,13 +219,14 @@ class _Run(VirtualRun):
 
 
 def _said_by_driver(bench: VirtualBench, device: str) -> set[str]:
-    """The kind of error that the gateway's status shows for a device now."""
+    """Return the errors that the gateway's status shows for a device now. A conflict of node ids is shown until the end."""
     bus: Any = bench.run.gateway.buses[bench.system.devices[device].bus]
     if isinstance(bus, CanopenBus):
         state: Any = next(s for s in bus.nodes.values() if s.driver.config.name == device)
     else:
         state = next(s for s in bus.devices if s.driver.config.name == device)
-    return {text for text in (state.error, "" if state.online else "offline") if text}
+    conflict = state.conflict if isinstance(bus, CanopenBus) else ""
+    return {text for text in (state.error, conflict, "" if state.online else "offline") if text}
 
 
 def through(

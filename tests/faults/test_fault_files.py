@@ -25,7 +25,7 @@ from twin.system import load_system
     [
         ("faults:\n  - {name: silence, device: ctd, untl: 12s}\n", ":2:34: unknown key 'untl' in fault silence"),
         ("faults:\n  - {name: silence, device: ctd, untl: 12s}\n", "did you mean 'until'?"),
-        ("faults:\n  - name: delay\n    by_ms: -4\n", ":3:5: by_ms: Input should be greater than 0; got -4"),
+        ("faults:\n  - name: delay\n    by_ms: -4\n", ":3:5: by_ms; expected more than 0; got -4"),
         ("faults:\n  - {name: slience}\n", ":2:6: no fault 'slience'"),
         ("faults:\n  - {name: slience}\n", "did you mean 'silence'?"),
         ("faults:\n  - {nam: slience}\n", ":2:5: a fault without a name"),
@@ -145,7 +145,15 @@ def test_the_schema_knows_each_fault_as_it_is_read() -> None:
     assert "function" not in one["properties"]
     for described in fault_defs()["Fault"]["oneOf"]:
         for key in described["properties"]:
-            values = {"name": described["title"], "from": 1, "until": 2, "direction": "both", "bus": "b", "device": "d"}
+            values = {
+                "name": described["title"],
+                "from": 1,
+                "until": 2,
+                "direction": "both",
+                "bus": "b",
+                "device": "d",
+                "optional": True,
+            }
             value = values.get(key, described["properties"][key].get("default", 1))
             if key in ("id", "register", "device", "bus"):
                 value = "x"

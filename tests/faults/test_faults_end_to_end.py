@@ -55,6 +55,8 @@ ROWS = [
     Row("lan", "wrong-function", "wire_error", 2.0, {"code": 3}),
     Row("line", "wrong-transaction", "", 0.1),
     Row("lan", "wrong-transaction", "timeout", 2.0),
+    Row("line", "fewer-registers", "wire_error timeout", 2.0),
+    Row("lan", "fewer-registers", "wire_error", 2.0),
     Row("line", "truncate", "timeout", 2.0),
     Row("lan", "truncate", "timeout", 2.0),
     Row("line", "garbage", "", 0.1),
@@ -115,7 +117,7 @@ DRIVER_SAYS = {
     "refused": "refused with exception 04h",
     "busy": "refused with exception 06h",
     "heartbeat_lost": "heartbeat lost",
-    "duplicate-node": "two nodes answer",
+    "duplicate-node": "two nodes seem to have the id",
 }
 """What the driver's status shows, by why the tag is not good, or by the fault."""
 NOT_A_DRIVERS = {"nan", "short-frame", "boot-storm"}

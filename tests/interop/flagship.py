@@ -150,10 +150,13 @@ class Script:
         await self._until(lambda: heard(self.tap, 0x705) >= 4 and heard(self.tap, 0x185) >= 25)
 
     async def all_up(self) -> None:
-        """Identified, configured, started, and the output brought to the PLC's first value."""
+        """Wait until all devices are identified, configured and started, and the output holds the PLC's first value.
+
+        The ctd holds that value already, so nothing is written.
+        """
         names = ["ctd.status", "modem.link_state", "inclinometer.slope_long"]
         await self._until(lambda: all(self._value(n) is not None for n in names))
-        await self._until(lambda: self.gateway.outputs.writes == 1 and self.gateway.outputs.settled)
+        await self._until(lambda: self.period.held == 0 and self.gateway.outputs.settled)
 
     async def commanded(self, period_s: int) -> None:
         before = self.modem.received

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.running.fault_schedule import RandomFaults
 from fieldtwin.running.many_seeds import run_seeds
 from fieldtwin.running.virtual_run import VirtualOptions
 
@@ -45,7 +46,9 @@ def slow_scan(folder: Path) -> Path:
 
 
 def run_hours(path: Path, hours: int, *, random_faults: bool) -> None:
-    options = VirtualOptions(str(path), RUN_HOURS * 3600.0, commands=(1, 2, 0, -1), random_faults=random_faults)
+    options = VirtualOptions(
+        str(path), RUN_HOURS * 3600.0, commands=(1, 2, 0, -1), random_faults=RandomFaults() if random_faults else None
+    )
     results = run_seeds(options, range(1, max(1, hours // RUN_HOURS) + 1), jobs=2)
     failed = {r.seed: r.errors for r in results if not r.ok}
     assert not failed

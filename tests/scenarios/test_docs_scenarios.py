@@ -16,10 +16,18 @@ BLOCKS = re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL)
 
 
 def test_the_probe_is_one(tmp_path: Path) -> None:
-    assert len(BLOCKS) == 2
+    assert len(BLOCKS) == 3
     path = tmp_path / "x.scenario.yaml"
     path.write_text(f"scenario: x\nsystem: observatory\n{BLOCKS[1]}steps: [{{expect: {{that: 'crane.height > 0'}}}}]\n")
     assert load_scenario(path).probes[0].names == ["crane.height", "crane.moving"]
+
+
+def test_the_scenario_for_a_controller_of_the_user_looks_through_probes_only(tmp_path: Path) -> None:
+    path = tmp_path / "x.scenario.yaml"
+    path.write_text(f"scenario: x\nsystem: observatory\n{BLOCKS[2]}")
+    scenario = load_scenario(path)
+    assert scenario.used == {"mine.alarm"}
+    assert scenario.probes[0].at({"FIELDTWIN_LAN_URL": "tcp://127.0.0.1:1502"}).endpoint is not None
 
 
 def test_the_example_passes(tmp_path: Path) -> None:

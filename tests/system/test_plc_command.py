@@ -24,6 +24,7 @@ def plc(*args: str) -> str:
     return done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))

@@ -34,6 +34,7 @@ def edit(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1), encoding="utf-8")
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_a_run_under_systemd(tmp_path: Path) -> None:
     run_dir = tmp_path / "r"

@@ -11,7 +11,7 @@ import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-from gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import ConnectionLost
 
@@ -63,8 +63,13 @@ def run_virtually(coro: Coroutine[Any, Any, T]) -> T:
 class VirtualWire(ByteConnection):
     """The near end of a wire whose far end is a script: `on_write` is told what is written, and `feed`s what arrives."""
 
-    def __init__(self, endpoint: Endpoint, on_write: Callable[[bytes], None]) -> None:
-        super().__init__(RS232Connection(), endpoint)
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        on_write: Callable[[bytes], None],
+        kind: type[RS232Connection | TCPConnection] = RS232Connection,
+    ) -> None:
+        super().__init__(kind(), endpoint)
         self._on_write = on_write
 
     async def write(self, data: bytes) -> None:

@@ -8,8 +8,9 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,44 +23,64 @@ def programs() -> Path | None:
     return found[0].parent if found else None
 
 
+class Cluster:
+    """A cluster whose data directory is below `data`; its socket and log are in `place`."""
+
+    def __init__(self, folder: Path, user: pwd.struct_passwd, place: Path, data: Path) -> None:
+        self.url = f"postgresql://{USER}@/postgres?host={place}"
+        self.log = place / "log"
+        as_root = os.getuid() == 0
+        self._as_user: dict[str, Any] = (
+            {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []} if as_root else {}
+        )
+        self._folder, self._place, self._data = folder, place, data / "db"
+        if as_root:
+            for owned in (place, data):
+                os.chown(owned, user.pw_uid, user.pw_gid)
+        self._run(
+            "initdb", "-D", self._data, "-U", USER, "-A", "trust", "--no-sync", "-E", "UTF8", "--wal-segsize", "1"
+        )
+
+    def _run(self, program: str, *words: str | Path) -> None:
+        environment = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", "HOME": str(self._place)}
+        subprocess.run(
+            [self._folder / program, *words],
+            env=environment, cwd=self._place, check=True, capture_output=True, timeout=60, **self._as_user,
+        )  # fmt: skip
+
+    def start(self) -> None:
+        options = f"-k {self._place} -c listen_addresses='' -c fsync=off -c shared_buffers=16MB -c max_connections=20"
+        self._run("pg_ctl", "-D", self._data, "-w", "-t", "30", "-l", self.log, "-o", options, "start")
+
+    def stop(self) -> None:
+        self._run("pg_ctl", "-D", self._data, "-w", "-t", "30", "-m", "immediate", "stop")
+
+
 @contextmanager
-def server() -> Iterator[str]:
-    """Start a server; the URL of its database. Skips the test where there is none to start."""
+def cluster(data: Path | None = None) -> Iterator[Cluster]:
+    """A cluster that runs. Skips the test where there is none to start."""
     folder = programs()
-    as_root = os.getuid() == 0
     if folder is None:
         pytest.skip("no PostgreSQL here (Debian: postgresql)")
     try:
-        user = pwd.getpwnam(USER) if as_root else pwd.getpwuid(os.getuid())
+        user = pwd.getpwnam(USER) if os.getuid() == 0 else pwd.getpwuid(os.getuid())
     except KeyError:
         pytest.skip("PostgreSQL does not run as root, and there is no user postgres")
     place = Path(tempfile.mkdtemp(prefix="ftpg.", dir="/tmp"))
-    if as_root:
-        os.chown(place, user.pw_uid, user.pw_gid)
-    run = {"user": user.pw_uid, "group": user.pw_gid, "extra_groups": []} if as_root else {}
-    environment = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", "HOME": str(place)}
     try:
-        subprocess.run(
-            [folder / "initdb", "-D", place / "db", "-U", USER, "-A", "trust", "--no-sync", "-E", "UTF8"],
-            env=environment, cwd=place, check=True, capture_output=True, timeout=60, **run,
-        )  # fmt: skip
-        options = f"-k {place} -c listen_addresses='' -c fsync=off -c shared_buffers=16MB -c max_connections=20"
-        control = [folder / "pg_ctl", "-D", place / "db", "-w", "-t", "30"]
-        log = ["-l", place / "log", "-o", options]
-        subprocess.run(
-            [*control, *log, "start"], env=environment, cwd=place, check=True, capture_output=True, timeout=60, **run
-        )
+        made = Cluster(folder, user, place, data or place)
+        made.start()
         try:
-            yield f"postgresql://{USER}@/postgres?host={place}"
+            yield made
         finally:
-            subprocess.run(
-                [*control, "-m", "immediate", "stop"],
-                env=environment,
-                cwd=place,
-                check=True,
-                capture_output=True,
-                timeout=60,
-                **run,
-            )
+            with suppress(subprocess.CalledProcessError):  # it may have ended by itself
+                made.stop()
     finally:
         shutil.rmtree(place, ignore_errors=True)
+
+
+@contextmanager
+def server() -> Iterator[str]:
+    """Start a server; the URL of its database. Skips the test where there is none to start."""
+    with cluster() as made:
+        yield made.url

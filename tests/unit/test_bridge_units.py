@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import struct
 from pathlib import Path
 
 import pytest
@@ -78,9 +80,10 @@ def test_mb_059_a_unit_that_comes_back_is_asked_again(tmp_path: Path) -> None:
 def test_mb_060_a_client_gone_mid_request(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, latency_s=0.1) as r, r.client() as stays:
-            async with r.raw() as goes:
-                await goes.write(read_adu(1, 1, 0, 1) + read_adu(2, 1, 1, 1) + read_adu(3, 1, 2, 1))
+            with socket.create_connection(("127.0.0.1", r.port)) as goes:
+                goes.sendall(read_adu(1, 1, 0, 1) + read_adu(2, 1, 1, 1) + read_adu(3, 1, 2, 1))
                 await eventually(lambda: len(r.heard) == 1)
+                goes.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # it ends by a reset
             await eventually(lambda: r.bridge.counters.unread == 1)  # the reply that was under way is dropped
             assert (await stays.read_registers(2, "holding", 5, 1)).registers == (205,)
             assert [frame[0] for frame in r.heard] == [1, 2]  # what still waited in line for it never went out

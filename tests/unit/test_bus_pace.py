@@ -64,22 +64,21 @@ def observed(
 def test_mb_062_dead_units_cost_the_others_no_more_than_the_share_of_their_probes(
     dead: list[int], share: float
 ) -> None:
-    """Three units that answer get nine tenths of their polls at least, however many do not; and between two probes all."""
+    """Units that answer lose no more polls than the share of the bus that probes may take, however many units are silent."""
     living = [a for a in range(1, 5) if a not in dead][:3]
     config = BusConfig("line", LINE, 0.5, 1, probe_share=share)
     end_s, rate = 240.0, 5
     alone = observed(living, living, end_s, config, every_ms=1000 // rate)
     beside = observed(living, sorted({*living, *dead}), end_s, config, every_ms=1000 // rate)
-    settled_s = 5.0 * len(dead)  # every dead unit's own timeouts, once: two attempts, each with its quarantine
+    settled_s = 5.0
     for address in living:
         without, with_dead = len(alone.line.times(address, settled_s)), len(beside.line.times(address, settled_s))
         assert without == pytest.approx((end_s - settled_s) * rate, abs=2)
         assert with_dead >= (1 - share) * without - 1.2 * rate  # a probe may just have ended
     probes = sorted(t for a in dead for t in beside.line.times(a, settled_s))
     assert len(probes) >= 0.8 * share * (end_s - settled_s) - 2  # they are asked again: the share is used
-    before, after = probes[0] + 1.1, probes[1]
-    between = [t for t in beside.line.times(living[0], before) if t < after]
-    assert len(between) == pytest.approx((after - before) * rate, abs=1)
+    shortened_s = 0.05 + 0.013  # the timeout while the latency seen is 5 ms, and what the request itself takes
+    assert len(probes) * shortened_s <= share * (end_s - settled_s) + 3.0 + len(dead) * shortened_s
     assert {d.driver.config.address for d in beside.bus.devices if d.online} == set(living)
 
 
@@ -98,8 +97,8 @@ def test_mb_062_a_unit_that_comes_and_goes_has_no_larger_share() -> None:
         return await run_bus(make, {1: unit(), 2: unit()}, scenario, config=config)
 
     v = run_virtually(main())
-    assert len(v.line.times(2)) > 10
-    assert len(v.line.times(1, 10)) >= 0.9 * 1100 - 25
+    assert len(v.line.times(2)) > 2
+    assert len(v.line.times(1, 10)) >= 0.95 * 1100 - 25
 
 
 def test_a_dead_unit_that_is_plugged_in_is_back_within_its_back_off() -> None:
@@ -125,6 +124,8 @@ def test_a_dead_unit_that_is_plugged_in_is_back_within_its_back_off() -> None:
 
 
 def test_a_unit_has_its_own_timeout_and_retries() -> None:
+    """Once a unit was heard. Before that, where other units wait for the line, it is asked with shortened timeouts."""
+
     async def main() -> None:
         def make(tags: TagTable) -> list[RegisterDriver]:
             return [
@@ -135,15 +136,22 @@ def test_a_unit_has_its_own_timeout_and_retries() -> None:
 
         async def scenario(v: VirtualBus) -> None:
             v.line.slow[1] = 1.5
-            await wait(5)
+            await wait(12)
             assert v.bus.devices[2].online  # slower than the bus allows, and granted it
-            assert not v.bus.devices[0].online
+            assert v.bus.devices[0].online
             assert not v.bus.devices[1].online
-            first = v.line.times(2)[:4]
-            assert all(b - a < 0.15 for a, b in pairwise(first))  # asked four times, 50 ms each
-            assert len([t for t in v.line.times(3) if t < v.line.times(1)[0]]) == 1  # the bus's retries: none
+            del v.line.units[2]
+            await wait(5)
+            while v.bus.devices[0].online:
+                await wait(0.1)
+            assert len(v.line.times(2, 12)) == 4  # its own retries: three
+            asked = len(v.line.times(1))
+            v.line.units.pop(1)
+            while v.bus.devices[2].online:
+                await wait(0.1)
+            assert len(v.line.times(1)) == asked + 1  # the bus's retries: none
 
-        await run_bus(make, {1: unit()}, scenario, config=BusConfig("line", LINE, 0.3, 0))
+        await run_bus(make, {1: unit(), 2: unit()}, scenario, config=BusConfig("line", LINE, 0.3, 0))
 
     run_virtually(main())
 
@@ -277,13 +285,17 @@ def test_a_missed_period_is_skipped_and_counted_and_never_made_up_for() -> None:
 
         async def scenario(v: VirtualBus) -> None:
             v.line.slow[2] = 0.95
-            await wait(25)  # unit 2 has the line at 0 and then at 10 and 20 s, each for 0.97 s
-            times = v.line.times(1)
+            await wait(9)
+            missed = v.bus.devices[0].schedule.missed["values"]
+            await wait(20)  # unit 2 has the line at 10 and 20 s, each for 0.97 s
+            times = v.line.times(1, 9)
             gaps = [b - a for a, b in pairwise(times)]
-            assert [round(g, 1) for g in gaps if g > 0.15] == [1.0] * 3
+            assert [round(g, 1) for g in gaps if g > 0.15] == [1.0] * 2
             assert min(gaps[1:]) > 0.02  # no burst: at once behind the gap, and then on the grid again
             assert all(t % 0.1 < 0.03 or t % 0.1 > 0.099 for t in times if not 0 < t % 10 < 1.1)
-            assert v.bus.devices[0].schedule.missed == {"values": 24}  # the one that was late each time is none of them
+            assert (
+                v.bus.devices[0].schedule.missed["values"] - missed == 16
+            )  # the one that was late each time is none of them
 
         await run_bus(make, {1: unit(), 2: unit()}, scenario)
 

@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-import can
 import pytest
 from canopen_rows import parse_frame
 from canopen_slave_rig import RICH
@@ -25,11 +24,11 @@ from emulators.faults.frames import Framing
 from emulators.wires.can_bus import CanBus
 from emulators.wires.can_events import Delivery
 from emulators.wires.can_faults import Disturbance, spoil
-from gateway.connections.soft_bus import SoftBus
 from gateway.core.can_error import CanErrorState
 from gateway.core.canframe import CanFrame, pack_record, unpack_record
 from gateway.core.connection import CanConnection
 from gateway.core.endpoint import Endpoint
+from gateway.core.errors import Desync, UsageError
 
 BIT_NS = 8000
 END = 10**11
@@ -99,9 +98,13 @@ def test_co_064_raw_length_codes_mean_eight_bytes(length_code: int) -> None:
     assert unpack_record(bytes(record))[0] == CanFrame(0x123, remote=True, dlc=8)
 
 
-def test_co_064_can_fd_is_refused() -> None:
-    with pytest.raises(can.CanInitializationError, match="no CAN FD"):
-        SoftBus("127.0.0.1:1", fd=True)
+def test_co_064_a_classic_record_cannot_carry_can_fd() -> None:
+    with pytest.raises(UsageError, match="classic CAN frames only"):
+        pack_record(CanFrame(0x123, bytes(12), fd=True))
+    record = bytearray(pack_record(CanFrame(0x123, bytes(8))))
+    record[0] |= 0x10
+    with pytest.raises(Desync):
+        unpack_record(bytes(record))
 
 
 # -- CANopen nodes on a bus with errors -----------------------------------------------------------------------------

@@ -93,7 +93,7 @@ def test_what_the_keys_of_outputs_polls_and_pace_become(tmp_path: Path) -> None:
         (RPDO1 + "{map: [statusword]}", "tags of this device's `writable`"),
         (RPDO1 + "{map: [mode, mode]}", "each once"),
         (RPDO1 + "{map: [mode], transmission: sync}", "nobody says when its values count"),
-        (RPDO1 + "{map: [controlword, target_velocity, mode], event_ms: 0}", "greater than or equal to 1"),
+        (RPDO1 + "{map: [controlword, target_velocity, mode], event_ms: 0}", "at least 1"),
         ("writable: [target_velocity, target_position, mode], rpdo1: {map: [target_velocity, target_position, mode]}",
          "64 bits; got 72"),
         ("rpdos: dcf", "`dcf`, a DCF file"),

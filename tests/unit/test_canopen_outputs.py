@@ -35,7 +35,8 @@ from gateway.protocols.canopen.configure import PdoConfig
 from gateway.protocols.canopen.pdo import PdoMapping
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.outputs import Output, OutputWriter
+from gateway.runtime.output import Output
+from gateway.runtime.outputs import OutputWriter
 from gateway.runtime.tags import TagTable
 
 DEVICES = Path(__file__).parents[2] / "profiles" / "devices"

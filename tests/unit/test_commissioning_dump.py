@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from emulators.canopen.dictionary import parse_eds
 from emulators.canopen.node import CanopenNode, NodeContext
 from emulators.modbus.bank import Span
+from fieldtwin.commissioning.coverage import NOT_ASKED, READABLE, REFUSED
 from fieldtwin.commissioning.dump import Job
 from fieldtwin.commissioning.dump_file import load_dump
 from fieldtwin.commissioning.dump_objects import ListedObjects
@@ -45,6 +46,10 @@ def sweep(readable: set[int], limit: int, *, pairs: bool = False, end: int = 400
         return made, requests
 
 
+def in_state(made: Sweep, state: int) -> set[int]:
+    return {a for a in range(made.span.address, made.span.end) if made.coverage.states[a] == state}
+
+
 def cells(spans: list[tuple[int, int]]) -> set[int]:
     return {a for start, end in spans for a in range(start, end)}
 
@@ -55,8 +60,8 @@ def test_asking_every_address_finds_exactly_what_is_there(islands: list[tuple[in
     readable = {a for start, count in islands for a in range(start, min(400, start + count))}
     made, _ = sweep(readable, limit, stride=1)
     assert cells(made.found.readable) == readable
-    assert cells(made.found.holes) == set(range(400)) - readable
-    assert not made.found.voids
+    assert in_state(made, REFUSED) == set(range(400)) - readable
+    assert not in_state(made, NOT_ASKED)
     assert made.found.max_read <= limit
     planned = made.found.reads()
     assert [a for r in planned for a in range(r.address, r.end)] == sorted(readable)
@@ -71,8 +76,7 @@ def test_striding_finds_every_island_of_its_stride_and_invents_none(
     readable = {a for start, count in islands for a in range(8 * start, min(400, 8 * start + 8 * count))}
     made, requests = sweep(readable, limit, pairs=pairs)
     assert cells(made.found.readable) == readable
-    unknown = cells(made.found.holes) | cells(made.found.voids)
-    assert unknown == set(range(400)) - readable
+    assert in_state(made, READABLE) == readable
     assert requests < 200
 
 
@@ -88,19 +92,18 @@ def test_the_fewest_requests_that_the_limits_allow() -> None:
     assert (made.found.grain, made.found.max_read) == (2, 40)
 
 
-def test_a_table_without_its_function_or_without_an_answer_is_given_up_soon() -> None:
-    for outcome, says, most in ((Refused(1), "no such function", 1), (Silent("no reply"), "no reply", 10)):
+def test_a_table_without_its_function_or_in_silence_is_left_soon() -> None:
+    for outcome, most in ((Refused(1), 2), (Silent("no reply"), 10)):
         made = Sweep(RegisterRange("coil", 0, 65536))
         asking, requests = made.asking(), 1
         next(asking)
-        try:
+        with suppress(StopIteration):
             while requests <= most:
                 asking.send(outcome)
                 requests += 1
-        except StopIteration:
-            pass
-        assert says in made.found.given_up
         assert requests <= most
+        assert made.halted
+        assert ("refuses the function" in made.found.stopped) == isinstance(outcome, Refused)
 
 
 def test_a_value_of_two_registers_that_may_not_be_cut_is_a_border_and_no_hole() -> None:
@@ -221,8 +224,9 @@ def test_a_lost_reply_is_asked_for_again_and_a_hole_is_not_invented(tmp_path: Pa
     async def main() -> None:
         noisy = wired(mute=lambda adu, before: before % 3 == 2)
         await dump(job(functions=False), tmp_path / "d.jsonl", words="", connector=noisy, clock=loop())
-        assert "silent" not in (tmp_path / "d.jsonl").read_text()
-        found = load_dump(tmp_path / "d.jsonl").passes[0].cells
+        first = load_dump(tmp_path / "d.jsonl").passes[0]
+        assert not first.silent
+        found = first.cells
         assert {a for t, a in found if t == "holding"} == {*range(30), *range(40, 100)}
 
     run_virtually(main())

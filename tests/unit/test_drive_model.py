@@ -354,9 +354,9 @@ def test_limits_are_kept_and_told() -> None:
 def test_a_mode_that_the_drive_has_not_is_refused_by_sdo_and_ignored_by_pdo() -> None:
     rig = Rig()
     assert rig.write(0x6060, 3) == 0
-    assert rig.write(0x6060, 8) == 0x06090030
-    rig.node.feed(CanFrame(0x300 + NODE, b"\0\0\x08"), rig.now_ns)
-    assert rig.read(0x6060) == 8
+    assert rig.write(0x6060, 7) == 0x06090030
+    rig.node.feed(CanFrame(0x300 + NODE, b"\0\0\x07"), rig.now_ns)
+    assert rig.read(0x6060) == 7
     assert rig.read(0x6061) == 3
 
 

@@ -40,7 +40,8 @@ def test_exactly_what_it_takes_is_left(needed: set[int], count: int) -> None:
         asked += 1
         return needed <= set(part)
 
-    assert set(smallest(range(count), fails, 2_000)) == needed
+    left, minimal = smallest(range(count), fails, 2_000)
+    assert (set(left), minimal) == (needed, True)
     assert asked <= 2_000
 
 
@@ -51,14 +52,14 @@ def test_it_ends_after_so_many_runs() -> None:
         asked.append(len(part))
         return False
 
-    assert smallest(range(1000), fails, 50) == list(range(1000))
+    assert smallest(range(1000), fails, 50) == (list(range(1000)), False)
     assert len(asked) == 50
 
 
 def test_a_schedule_reads_as_a_scenario_again() -> None:
     fault = {"id": "f1", "name": "silence", "device": "ctd", "from": 1.5, "until": 3.0, "probability": 0.5}
-    commands = [(6.0, 1), (45.0, -1)]
-    file = parse(as_scenario('it "fails"', "observatory.yaml", 7, 60.0, [fault], ["a wrong value"], commands), "x.yaml")
+    acts = [(6.0, {"send": {"period_s": 1}}), (45.0, {"send": {"period_s": -1}})]
+    file = parse(as_scenario('it "fails"', "observatory.yaml", 7, 60.0, [fault], ["a wrong value"], acts), "x.yaml")
     assert file.data["scenario"] == 'it "fails"'
     assert file.data["judge"] == "run"
     sent = [{"pause": "6s"}, {"send": {"period_s": 1}}, {"pause": "39s"}, {"send": {"period_s": -1}}, {"pause": "15s"}]

@@ -27,7 +27,7 @@ from gateway.core.nursery import Nursery
 from gateway.core.profile import load_profile
 from gateway.core.recording import SignalRow
 from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
+from gateway.devices.config import BusConfig, CanopenBusConfig, DeviceConfig, Heartbeat, Tpdo
 from gateway.runtime.audit import AuditLog
 from gateway.runtime.canopen_bus import CanopenBus
 from gateway.runtime.tags import TagTable
@@ -35,6 +35,7 @@ from gateway.wallclock import WallClock
 
 PROFILE = load_profile(PROFILES / "inclinometer-cia410.yaml")
 NODE = 5
+HEARTBEAT = Heartbeat(40, 150)
 SDO_TO_NODE, TPDO1 = 0x600 + NODE, 0x180 + NODE
 
 
@@ -92,21 +93,27 @@ class Rig:
 
 
 @asynccontextmanager
-async def rig(tmp_path: Path, *, allow_writes: bool = True, serial: str = "1005") -> AsyncIterator[Rig]:
+async def rig(
+    tmp_path: Path,
+    *,
+    allow_writes: bool = True,
+    serial: str = "1005",
+    canopen: CanopenBusConfig | None = None,
+    heartbeat: Heartbeat = HEARTBEAT,
+) -> AsyncIterator[Rig]:
     clock = WallClock()
     server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 125_000, paced=False)
     tags = TagTable(clock)
     config = DeviceConfig(
         "incl", PROFILE, "can0", NODE, expect={"serial": serial} if serial else {}, stale_after_ms=400,
-        heartbeat=Heartbeat(40, 150), tpdo1=Tpdo(("slope_long", "slope_lateral"), 20), start=True,
+        heartbeat=heartbeat, tpdo1=Tpdo(("slope_long", "slope_lateral"), 20), start=True,
     )  # fmt: skip
     driver = CanopenDriver(config, tags, clock)
     tags.declare(driver.pdo_tags, 400)
     tags.declare(["incl.serial"], None)
     audit = AuditLog(tmp_path / "audit", clock)
-    bus = CanopenBus(
-        BusConfig("can0", server.bound, 0.15, 1), [driver], OsConnector(), clock, tags, audit, allow_writes
-    )  # fmt: skip
+    wanted = BusConfig("can0", server.bound, 0.15, 1, canopen=canopen or CanopenBusConfig())
+    bus = CanopenBus(wanted, [driver], OsConnector(), clock, tags, audit, allow_writes)
     try:
         async with Nursery() as nursery:
             r = Rig(server, bus, tags, nursery, tmp_path / "audit")
@@ -131,6 +138,42 @@ def test_a_node_is_identified_configured_and_started_and_its_values_come(tmp_pat
             first_write = next(f for f in r.frames if f.can_id == SDO_TO_NODE and f.data[0] >> 5 == 1)
             serial_read = next(f for f in r.frames if f.can_id == SDO_TO_NODE and f.data[1:4] == b"\x18\x10\x04")
             assert r.frames.index(serial_read) < r.frames.index(first_write)  # who it is, before anything is written
+
+    run(main())
+
+
+def test_a_second_node_with_the_id_stays_an_error_of_the_device(tmp_path: Path) -> None:
+    """The error was forgotten with the next bring-up, and a second reply after the next request was not noticed."""
+
+    async def main() -> None:
+        async with rig(tmp_path) as r:
+            other = r.server.attach("another node 5")
+            r.plug_node()
+            serial = bytes.fromhex("43181004")
+            answered = False
+            while not answered:
+                frame = await other.recv()
+                if frame.can_id == SDO_TO_NODE and frame.data[:4] == b"\x40" + serial[1:]:
+                    answered = True
+                    await other.send(CanFrame(0x580 + NODE, serial + (4711).to_bytes(4, "little")))
+            await eventually(lambda: r.status.conflicts == 1)
+            await eventually(lambda: r.status.online)
+            assert "two replies to one request for 1018h:04" in r.status.conflict
+            await other.aclose()
+
+    run(main())
+
+
+def test_a_second_sync_producer_is_noticed(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with rig(tmp_path, canopen=CanopenBusConfig(sync_ms=50)) as r:
+            other = r.server.attach("another producer")
+            r.plug_node()
+            await eventually(lambda: r.status.online)
+            assert r.bus.sync_watch.verdict == ""
+            await other.send(CanFrame(0x80))
+            await eventually(lambda: "two producers" in r.bus.sync_watch.verdict)
+            await other.aclose()
 
     run(main())
 

@@ -23,7 +23,8 @@ from gateway.devices.codec import decode, encode
 from gateway.devices.config import DeviceConfig
 from gateway.devices.register_device import RegisterDriver, SensorDriver
 from gateway.runtime.audit import AuditLog
-from gateway.runtime.outputs import Output, OutputWriter
+from gateway.runtime.output import Output
+from gateway.runtime.outputs import OutputWriter
 from gateway.runtime.tags import TagTable
 from gateway.wallclock import WallClock
 
@@ -74,6 +75,7 @@ async def rig(
     expect: dict[str, str] | None = None,
     text: str = PROFILE,
     bank: type[MapBank] = MapBank,
+    groups: dict[str, tuple[str, ...]] | None = None,
 ) -> AsyncIterator[Rig]:
     p = profile(text)
     cells = bank([Span("holding", 0, 200), Span("coil", 0, 8)])
@@ -88,6 +90,7 @@ async def rig(
         safe=safe or {},
         expect=expect or {},
         stale_after_ms=500,
+        write_groups=groups or {},
     )
     clock = WallClock()
     log = AuditLog(audit, clock)
@@ -247,7 +250,10 @@ def test_another_device_than_expected_is_not_written(tmp_path: Path) -> None:
             await r.polls(1)
             assert r.writes == []
             r.cells.poke("holding", 100, 0x7879, 0x7A00)
-            await eventually(lambda: len(r.writes) == 1)
+            r.cells.poke("holding", 0, 7)  # differs from the safe value: a device that already holds it is not written
+            await eventually(
+                lambda: len(r.writes) == 1, within_s=15
+            )  # the pause before the next identity request grows
             assert r.holding(0) == 0
 
     run(main())

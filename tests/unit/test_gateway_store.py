@@ -124,17 +124,35 @@ def test_rows_are_kept_in_order_with_their_run(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     for run in (1, 2):
         log = ExchangeLog(path, system="obs", prototype=run == 1)
-        log.append([("relay.log", 1, 10, b"a"), ("relay.log", 2, 10, b"a")])  # duplicates are two exchanges
+        t_ns = 100 * run
+        log.append([("relay.log", 1, t_ns, b"a"), ("relay.log", 2, t_ns, b"a")])  # duplicates are two exchanges
         assert log.flush() == 2
         assert log.flush() == 0
-        log.append([("relay.log", 3, 12, b"\0c")])
+        log.append([("relay.log", 3, t_ns + 2, b"\0c")])
         log.close()  # flushes what is left
         assert log.stored == 3
     assert rows_of(path) == [
-        (run, "relay.log", n, t, p) for run in (1, 2) for n, t, p in ((1, 10, b"a"), (2, 10, b"a"), (3, 12, b"\0c"))
+        (run, "relay.log", n, 100 * run + t, p)
+        for run in (1, 2)
+        for n, t, p in ((1, 0, b"a"), (2, 0, b"a"), (3, 2, b"\0c"))
     ]
     with closing(sqlite3.connect(path)) as db:
         assert db.execute("SELECT system, prototype FROM run").fetchall() == [("obs", 1), ("obs", 0)]
+
+
+def test_what_a_predecessor_stored_and_did_not_tell_the_plc_is_stored_once(tmp_path: Path) -> None:
+    rows = [("relay.log", n, n, b"x") for n in range(1, 6)]
+    log = ExchangeLog(tmp_path / "s", system="obs", prototype=True)
+    log.append(rows[:3])
+    assert (log.pending("relay.log"), log.pending("other.log")) == (3, 0)
+    log.flush()
+    assert log.pending("relay.log") == 0
+    log.close()
+    log = ExchangeLog(tmp_path / "s", system="obs", prototype=True)
+    log.append(rows)  # the PLC was told of none of them
+    assert log.pending("relay.log") == 2
+    log.close()
+    assert [row[2] for row in rows_of(tmp_path / "s")] == [1, 2, 3, 4, 5]
 
 
 def test_a_store_of_a_newer_version_and_one_that_is_none_are_refused(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from emulators.modbus.identification import Identification
 from emulators.modbus.unit import ModbusUnit, UnitParts
 from emulators.recorded_device import load_replay
 from emulators.replay.unit import ReplayUnit
+from fieldtwin.cli.identify_command import command
 from fieldtwin.commissioning.identify_modbus import ModbusIdentity, identify_modbus
 from fieldtwin.commissioning.matching import Candidate, ModbusClues, Sureness, judge_modbus, summary
 from fieldtwin.commissioning.sunspec import next_model
@@ -47,7 +48,7 @@ def levels(found: ModbusIdentity) -> dict[str, Sureness]:
 
 @pytest.mark.parametrize("name", RECORDED)
 def test_a_shipped_device_is_matched_with_its_own_profile_first(name: str) -> None:
-    """A replayed device tells no identity of its own, so nothing may be certain."""
+    """A replayed device tells no identity of its own, so nothing may be certain, except where a SunSpec map says what it is."""
 
     async def main() -> None:
         profile = next(p for p in SHIPPED if Path(p.path).stem == name)
@@ -58,7 +59,7 @@ def test_a_shipped_device_is_matched_with_its_own_profile_first(name: str) -> No
         assert found.answers
         assert told[profile.name] is best.sureness, (best, found.candidates)
         assert told[profile.name] is not Sureness.RULED_OUT
-        assert found.certain is None
+        assert found.certain == (profile.name if name.startswith("sunspec") else None)
         assert best.reasons
 
     run_virtually(main())
@@ -90,7 +91,7 @@ def test_what_a_unit_says_of_itself_is_certain_and_another_ones_words_rule_out(t
 
 def test_sunspec_is_read_model_by_model() -> None:
     async def main() -> None:
-        words = {40000: [0x5375, 0x6E53, 1, 66], 40070: [103, 50], 40122: [0xFFFF, 0]}
+        words = {40000: [0x5375, 0x6E53, 1, 66], 40070: [103, 50], 40108: [4], 40122: [0xFFFF, 0]}
         name = [int.from_bytes(b"Sunny\0"[i : i + 2], "big") for i in range(0, 6, 2)]
         device = unit(bank([Span("holding", 40000, 200)], {"holding": {**words, 40004: name}}))
         found = await identify(device, 1, SHIPPED)
@@ -148,3 +149,16 @@ def test_nothing_read_is_nothing_known() -> None:
     for profile in SHIPPED:
         if profile.protocol == "modbus":
             assert judge_modbus(profile, ModbusClues(), {}).sureness is Sureness.RULED_OUT
+
+
+def test_an_exception_that_takes_600_ms_is_an_answer() -> None:
+    """Defect: `identify` waited 500 ms, so a device that thinks longer before it refuses seemed not to answer."""
+
+    async def main() -> None:
+        wire = Wired(unit(bank([Span("holding", 0, 4)]), functions=frozenset({3})), 1, latency_s=0.6)
+        found = await identify_modbus(URL, 1, [], connector=wire, clock=loop())
+        assert found.answers
+        assert (found.clues.silence["11"], found.clues.silence["2B"]) == ("exception 01h", "exception 01h")
+
+    run_virtually(main())
+    assert next(option.default for option in command.params if option.name == "timeout_s") == "1s"

@@ -50,3 +50,22 @@ def test_what_is_no_line_is_named(tmp_path: Path) -> None:
 
 def test_texts_are_not_mixed_up() -> None:
     assert fingerprint("ab", "c") != fingerprint("a", "bc")
+
+
+def test_a_campaign_that_the_ledger_knows_as_failed_does_not_end_ok(tmp_path: Path) -> None:
+    """Observed before: with --ledger a seed that had failed was not run again, and the campaign ended with ok."""
+    from click.testing import CliRunner
+
+    from fieldtwin.cli.run_command import command
+
+    path = tmp_path / "ledger.jsonl"
+    words = ["observatory", "--prototype", "--virtual", "--for", "2s", "--seeds", "1..2", "--jobs", "1"]
+    words += ["--ledger", str(path)]
+    assert CliRunner().invoke(command, words, standalone_mode=False).return_value == 0
+    first, second = path.read_text().splitlines()
+    assert '"seed":2' in second
+    path.write_text(first + "\n" + second.replace('"ok":true', '"ok":false') + "\n")
+    ended = CliRunner().invoke(command, words, standalone_mode=False)
+    assert ended.return_value == 1, ended.output
+    assert "seed 2 failed before" in ended.output
+    assert ended.output.rstrip().endswith("not ok")

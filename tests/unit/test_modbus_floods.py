@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 import resource
+import sys
 from collections.abc import Callable
 
 import pytest
@@ -18,7 +19,7 @@ from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.unit import ModbusUnit
 from gateway.core.clock import NS_PER_S
-from gateway.protocols.modbus.server_line import RtuRequests
+from gateway.protocols.modbus.server_line import LOST_AFTER, LineRequest, RtuRequests
 from gateway.protocols.modbus.server_mbap import MbapRequests
 
 CHUNK = 1 << 20
@@ -86,6 +87,26 @@ def test_the_gateways_own_tcp_server(kind: str) -> None:
     flood(lambda data, now_ns: stream.feed(data), lambda: len(stream._buffer), kind)
     assert bool(stream.desync) == (kind != "another protocol")
     assert len(stream.feed(READ_ADU)) == (kind == "another protocol")
+
+
+@pytest.mark.parametrize("kind", ["zeros", "ones", "random"])
+def test_the_reverse_bridge_clears_a_flood_with_little_work_and_finds_the_request_after_it(kind: str) -> None:
+    """Observed before: each byte of a flood was tried as the beginning of a frame of any unit, at 0.9 MB a second."""
+    line, calls = RtuRequests(86_000, units=[1]), 0
+
+    def count(frame: object, event: str, argument: object) -> None:
+        nonlocal calls
+        calls += event == "call"
+
+    data = GARBAGE[kind] * 10
+    sys.setprofile(count)
+    try:
+        for at in range(0, len(data), 1000):
+            line.feed(data[at : at + 1000])
+    finally:
+        sys.setprofile(None)
+    assert calls < 2 * LOST_AFTER * 8 + len(data) / 100
+    assert line.feed(READ_FRAME)[-1:] == [LineRequest(1, READ_FRAME[1:-2])]
 
 
 @pytest.mark.parametrize("kind", ["zeros", "ones", "random"])

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 import pytest
 
-from gateway.core.errors import CrcError, Desync, FieldtwinError, ReplyTimeout, UsageError
+from gateway.core.errors import CrcError, Desync, FieldtwinError, ReplyTimeout, UsageError, WrongSize
 from gateway.protocols.modbus.crc import crc16, with_crc
 from gateway.protocols.modbus.diagnostics import Diagnostics
 from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
@@ -149,7 +149,7 @@ def test_mb_012_a_late_reply_of_another_shape_is_never_data() -> None:
     framer = RtuFramer()
     assert outcome(framer, []) is ReplyTimeout
     late = with_crc(bytes.fromhex("11 03 02 00 07"))
-    assert outcome(framer, [(1, late), (5, REPLY)]) is Desync
+    assert outcome(framer, [(1, late), (5, REPLY)]) is WrongSize
     assert registers(exchange(framer, [(1, REPLY)])) == REGISTERS
 
 

@@ -73,7 +73,7 @@ def test_no_system_of_it_mentions_another() -> None:
         ("at_m: [-2000, 500, 0], ", "at_m: [0], ", "[0]", "at least 2 items"),
         ("ocean_middle.yaml, modem", "ocean_west.yaml, modem", "middle", "its modem has the address 1, as west's has"),
         ("  west:  ", "  ship:  ", "  ship:  ", "'ship' is no name"),
-        ("says: 3", "says: 0", "says: 0", "greater than or equal to 1"),
+        ("says: 3", "says: 0", "says: 0", "at least 1"),
         ("seed: 5", "seed: 5\nseed: 6", "seed: 6", "stands twice"),
     ],
 )  # fmt: skip

@@ -236,6 +236,7 @@ def test_logic_that_raises_stops_with_outputs_safe_and_can_be_asked_why(tmp_path
     async def main() -> None:
         program = ProgramConfig("f", "python: faulty_program:Faulty", {"n": InputBinding("ctd.sample_period_s")})
         async with plc_running(config_in(tmp_path, program)) as (child, gateway, client):
+            gateway.publish()
             status = await got(client, lambda s: s["state"] == "stopped")
             assert status["stop_reason"] == "failed"
             assert f"program f, {tmp_path}/faulty_program.py:{line}: ValueError: five" in status["error"]
@@ -334,8 +335,8 @@ def test_forces_pause_steps_and_reasons_over_the_control_channel(tmp_path: Path)
 
     run(main())
     noted = [json.loads(line) for line in (tmp_path / "audit").read_text().splitlines()]
-    assert [n["action"] for n in noted] == ["force", "unforce", "pause", "step", "go", "restart"]
-    assert (noted[0]["by"], noted[0]["old"], noted[0]["new"], noted[1]["old"]) == ("test", 4, 9, 9)
+    assert [n["action"] for n in noted] == ["force", "refuse", "refuse", "unforce", "pause", "step", "go", "restart"]
+    assert (noted[0]["by"], noted[0]["old"], noted[0]["new"], noted[3]["old"]) == ("test", 4, 9, 9)
 
 
 def test_the_configuration_survives_json_and_a_wrong_one_is_refused(tmp_path: Path) -> None:

@@ -42,6 +42,8 @@ class HandClock:
 class Logic:
     """Takes `takes_ms` of the clock's time a scan; raises when told."""
 
+    waiting = False
+
     def __init__(self, clock: HandClock) -> None:
         self.clock = clock
         self.takes_ms: list[float] = []

@@ -180,3 +180,13 @@ def test_a_virtual_run_becomes_a_scenario_that_passes_and_sees_a_change(tmp_path
     assert result.verdict.value == "passed", [c for c in result.checks if c.verdict.value != "passed"]
     made.write_text(text.replace("period_s: 1", "period_s: 0", 1))
     assert run_virtual(load_scenario(made)).verdict.value == "failed"
+
+
+def test_runs_without_anything_in_common_are_not_the_same() -> None:
+    """Observed before: an empty trace was "the same" as any older one, with all fields of that counted as compared."""
+    old = story_of(SYSTEM, [*RELAY, *asked(5.0), tag(6.0, "ctd.pressure", 1.0)])
+    for new in ([], [Event(0, Kind.NOTE, "start", {"text": "x"})]):
+        verdict = compare(old, story_of(SYSTEM, new))
+        assert not verdict.same
+        assert verdict.compared == 0
+    assert (verdict.common_s, verdict.old_s) == (0.0, 50.0)

@@ -253,7 +253,7 @@ def test_on_tcp_an_answer_ends_what_was_asked_before() -> None:
     assert (first.t_ns, first.problem) == (0, "no reply")
     assert (second.t_ns, second.ok) == (50 * MS, True)
     late = decoder.decode(chunk(70, False, adu(1, "03 02 0009"), "lan"))
-    assert late.text == "modem: an answer that comes too late"
+    assert late.text == "modem: an answer that comes too late: transaction 1, unit 1, 00 01 00 00 00 05 01 03 02 00 09"
     assert [e.problem for e in late.exchanges] == ["stray"]
     assert decoder.finish() == []
 

@@ -158,7 +158,7 @@ def test_damaged_answers_are_asked_for_again_and_reported() -> None:
         line = UartLine({1: meter(), 2: meter()}, damage=damage)
         found = await scan(line, f"{PORT}?baudrate=9600&frame=8N1", units=(1, 2, 3), listen_s=0)
         assert [f.answer.unit for f in found.units] == [1]
-        assert [u for _, u in found.damaged] == [2]
+        assert [o.units for o in found.damaged] == [(2,)]
 
     run_virtually(main())
 

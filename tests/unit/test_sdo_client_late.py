@@ -19,6 +19,12 @@ from gateway.protocols.canopen.master import CanopenMaster
 M, N = (0x2000, 0), (0x2000, 1)
 
 
+def drained(end: MemoryEnd) -> list[CanFrame]:
+    frames = list(end.inbound.data_stream)
+    end.inbound.data_stream.clear()
+    return frames
+
+
 def test_what_nothing_is_outstanding_for_is_asked_at_once() -> None:
     late = LateReplies()
     late.unanswered(M)
@@ -192,6 +198,27 @@ def test_co023_a_late_reply_that_comes_while_nothing_is_asked_makes_the_probe_ne
             assert await master.sdo_upload(5, 0x2000, 0) == b"\x07\0\0\0"
             await answering
             assert master.counters.sdo_probes == 0
+
+    run_virtual(main())
+
+
+def test_replies_that_come_all_at_once_after_a_stall_are_not_those_of_two_nodes() -> None:
+    """A node that stood still answers every request that it got meanwhile, also the one that is under way: CO-042 is not that."""
+
+    async def main() -> None:
+        ours, theirs = bus()
+        master = CanopenMaster(ours, LoopClock())
+        async with running(master):
+            for _ in range(12):
+                await asyncio.gather(master.sdo_upload(5, 0x2000, 0), return_exceptions=True)
+            again = asyncio.ensure_future(master.sdo_upload(5, 0x2000, 0))
+            await asyncio.sleep(0)
+            await asyncio.sleep(0)
+            for request in drained(theirs):
+                if request.data[0] == 0x40:
+                    ours.feed(CanFrame(0x585, b"\x43" + request.data[1:4] + bytes(4)))
+            await asyncio.gather(again, return_exceptions=True)
+            assert master.conflicts == {}
 
     run_virtual(main())
 

@@ -21,7 +21,8 @@ from gateway.devices.config import DeviceConfig
 from gateway.devices.register_device import RegisterDriver, SensorDriver
 from gateway.protocols.modbus.client import ModbusClient
 from gateway.runtime.audit import AuditLog
-from gateway.runtime.outputs import Output, OutputWriter
+from gateway.runtime.output import Output
+from gateway.runtime.outputs import OutputWriter
 from gateway.runtime.serve import ServeConfig, ServedTag, TagServer
 from gateway.runtime.tags import TagTable
 from gateway.wallclock import WallClock
@@ -64,7 +65,9 @@ async def rig(path: Path, *, allow_writes: bool = True, safe: float | None = Non
         outputs = [Output(f"d.{name}", name, driver, r.bus, safe) for name in ("level", "other")]
         writer = OutputWriter(outputs, r.tags, audit, allow_writes)
         served = tuple(ServedTag(f"d.{n}", "holding", i, "int16", write=True) for i, n in enumerate(("level", "other")))
-        server = TagServer(ServeConfig("hmi", Endpoint.parse("tcp://127.0.0.1:0"), 1, served), r.tags, writer, CLOCK)
+        server = TagServer(
+            ServeConfig("hmi", Endpoint.parse("tcp://127.0.0.1:0"), 1, served), r.tags, writer, CLOCK, audit=audit
+        )
 
         async def tick() -> None:
             while True:
@@ -112,7 +115,7 @@ def test_limits_leave_and_spacing_are_kept(tmp_path: Path) -> None:
             await r.client.write_register(1, 0, 1)
             assert await r.refused(0, 2) == 6  # at most ten a second
             assert r.cells.peek("holding", 0) == 1
-            assert [e["action"] for e in r.audit] == ["refuse", "refuse", "write", "write"]
+            assert [e["action"] for e in r.audit] == ["refuse", "refuse", "write", "write", "refuse"]
         async with rig(tmp_path / "b", allow_writes=False) as r:
             assert await r.refused(0, 1) == 3
             assert "read-only" in r.audit[0]["result"]

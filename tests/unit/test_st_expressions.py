@@ -157,7 +157,7 @@ def test_types_widen_and_never_narrow_unasked() -> None:
         ("INT", "nothing", "'nothing' is not declared"),
         ("INT", "lenght", "did you mean length?"),
         ("INT", "LENN('a')", "a function 'LENN' is not declared (did you mean LEN?)"),
-        ("INT", "LEN('a', 'b')", "arguments of LEN; expected 1; got 2"),
+        ("INT", "LEN('a', 'b')", "arguments of LEN; expected 1 (IN); got 2"),
         ("INT", "1 / 0", "division by zero"),
         ("INT", "INT_TO_NOTHING(1)", "not declared"),
     ],

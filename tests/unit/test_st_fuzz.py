@@ -214,14 +214,20 @@ HUGE = {
     "indices": (P + "i := " + "q[" * 70 + "1" + "]" * 70 + ";", "ran"),
     "IF in IF": (P + "IF b THEN " * 100 + "i := 1;" + "END_IF;" * 100, "refused"),
     "ELSIF": (P + "IF b THEN i := 1; " + "ELSIF b THEN i := 2; " * 300 + "ELSE i := 3; END_IF", "ran"),
-    "FOR in FOR": (P + "FOR i := 1 TO 1 DO " * 25 + "l := 1;" + "END_FOR;" * 25, "refused"),
+    "FOR in FOR": (
+        P.replace("b :", ", ".join(f"i{n}" for n in range(25)) + " : INT; b :")
+        + "".join(f"FOR i{n} := 1 TO 1 DO " for n in range(25))
+        + "l := 1;"
+        + "END_FOR;" * 25,
+        "refused",
+    ),
     "an array of arrays": ("PROGRAM p VAR a : ARRAY[1..1000000] OF ARRAY[1..1000000] OF INT; END_VAR", "refused"),
     "ARRAY OF ARRAY OF": (f"PROGRAM p VAR a : {'ARRAY[1..1] OF ' * 200} INT; END_VAR", "refused"),
     "a structure that doubles": (f"{BY_COUNT} PROGRAM p VAR a : s29; END_VAR", "refused"),
     "repeated values": ("PROGRAM p VAR a : ARRAY[1..9] OF INT := [999999999(1)]; END_VAR", "refused"),
     "labels": (P + "CASE i OF " + " ".join(f"{n}: i := {n};" for n in range(1, 400)) + " END_CASE", "ran"),
     "labels with names": (P + "CASE i OF " + ", ".join(["x"] * 3000) + ": i := 1; END_CASE", "refused"),
-    "shifts": (P.replace("b :", "w : DWORD; b :") + "w := SHL(w, 1000000000) OR ROL(w, -1000000000);", "ran"),
+    "shifts": (P.replace("b :", "w : DWORD; b :") + "w := SHL(w, 1000000000) OR ROL(w, 1000000000);", "ran"),
     "too long a file": (P + " " * 4_000_000, "refused"),
 }
 

@@ -13,7 +13,7 @@ from gateway.core.values import Quality, Reason, TagValue
 from plc.binding import BoundProgram
 from plc.blocks import BLOCKS as STANDARD_BLOCKS
 from plc.program import ProgramFailed, Role
-from plc.scan import _failed
+from plc.scan import failed
 
 
 def test_if_takes_the_first_branch_that_holds() -> None:
@@ -164,10 +164,10 @@ def test_an_error_in_a_scan_names_the_line_of_the_source() -> None:
     made = program("PROGRAM p\nVAR a : ARRAY[1..3] OF INT; i : INT := 4; END_VAR\n  i := i;\n  a[i] := 1;\nEND_PROGRAM")
     with pytest.raises(Exception) as e:
         scan(made)
-    failed = _failed(BoundProgram("main", made), e.value)
-    assert isinstance(failed, ProgramFailed)
-    assert "test.st:4" in str(failed)
-    assert "an index outside its array" in str(failed)
+    error = failed(BoundProgram("main", made), e.value)
+    assert isinstance(error, ProgramFailed)
+    assert "test.st:4" in str(error)
+    assert "an index outside its array" in str(error)
 
 
 def test_retained_variables_survive_as_plain_data() -> None:

@@ -18,9 +18,9 @@ from gateway.core.errors import FileInvalid, Unreachable, UsageError
 from twin import software
 from twin.software import modules_hash, wheel_hash
 from twin.template import MANIFEST
-from twin.template_check import differences, examine
+from twin.template_check import differences, examine, software_difference
 from twin.template_pack import Extras
-from twin.template_package import FolderPackage, ZipPackage
+from twin.template_package import Content, FolderPackage, ZipPackage, open_package
 
 
 @pytest.fixture
@@ -154,11 +154,60 @@ def test_two_templates_are_compared_file_by_file(dam: Path, tmp_path: Path) -> N
     prototype = dam.with_name("dam.prototype.yaml")
     prototype.write_text(prototype.read_text().replace("tilt.jsonl", "other.jsonl"))
     after = packed(dam, tmp_path / "b.zip")
-    assert [(d.what, d.path) for d in differences(before, after)] == [
+    a, b = contents(tmp_path / "a.zip"), contents(tmp_path / "b.zip")
+    assert [(d.what, d.path) for d in differences(a, b)] == [
         ("changed", "systems/dam.prototype.yaml"), ("changed", "systems/dam.yaml"), ("added", "systems/other.jsonl"),
         ("removed", "systems/tilt.jsonl"),
     ]  # fmt: skip
-    assert differences(before, before) == []
+    assert differences(a, a) == []
+    assert software_difference(before.software, after.software) == []
+
+
+def contents(path: Path) -> dict[str, Content]:
+    with open_package(path, edited=True) as package:
+        return package.contents()
+
+
+@pytest.mark.long
+def test_diff_compares_an_edited_folder_with_the_template_that_it_was_unpacked_from(good: Path, tmp_path: Path) -> None:
+    """`template diff` refused a folder as soon as one of its files was edited, which is what a user wants to compare."""
+    folder = tmp_path / "work"
+    unpack_zip(good, folder)
+    assert fieldtwin(tmp_path, "template", "diff", str(good), str(folder)).returncode == 0
+    system = folder / "systems/dam.yaml"
+    system.write_text(system.read_text() + "# edited on site\n")
+    (folder / "systems/tilt.jsonl").unlink()
+    (folder / "notes.txt").write_text("read me\n")
+    (folder / "systems/logic/__pycache__").mkdir()
+    (folder / "systems/logic/__pycache__/count.pyc").write_bytes(b"cache")
+    done = fieldtwin(tmp_path, "template", "diff", str(good), str(folder), "--json")
+    assert [(d["what"], d["path"], d["kind"]) for d in json.loads(done.stdout)] == [
+        ("added", "notes.txt", ""), ("changed", "systems/dam.yaml", "system"), ("removed", "systems/tilt.jsonl", "recording"),
+    ]  # fmt: skip
+    assert done.returncode == 1
+    shown = fieldtwin(tmp_path, "template", "diff", str(good), str(folder))
+    assert "+# edited on site" in shown.stdout
+    assert "+read me" in shown.stdout
+
+
+def test_an_edited_folder_is_still_refused_where_a_template_runs(good: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "work"
+    unpack_zip(good, folder)
+    system = folder / "systems/dam.yaml"
+    system.write_text(system.read_text() + "# edited on site\n")
+    done = fieldtwin(tmp_path, "template", "check", str(folder))
+    assert done.returncode == 3
+    assert "`fieldtwin template diff` shows what was edited; pack the template again" in " ".join(done.stderr.split())
+
+
+def test_diff_does_not_follow_links_out_of_a_folder(good: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "work"
+    unpack_zip(good, folder)
+    (tmp_path / "secret.txt").write_text("secret")
+    (folder / "link.txt").symlink_to(tmp_path / "secret.txt")
+    done = fieldtwin(tmp_path, "template", "diff", str(good), str(folder))
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "a template has no links" in done.stderr
 
 
 def test_the_zip_says_what_it_is_made_of(good: Path) -> None:

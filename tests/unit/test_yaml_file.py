@@ -74,9 +74,9 @@ def test_what_is_wrong_is_pointed_at(text: str, line: int, column: int, told: st
         ("title: x\ninner:\n  a:\n    cuont: 1\n", 4, 5, "did you mean 'count'?"),
         ("inner: {}\n", 1, 1, "'title' is missing"),
         ("title: x\ninner:\n  a: {names: []}\n", 3, 3, "'count' is missing in 'inner.a'"),
-        ("title: 5\n", 1, 1, "title: Input should be a valid string; got 5"),
+        ("title: 5\n", 1, 1, "title; expected text; got 5"),
         ("title: x\ninner:\n  a: {count: 1, names: [b, 5]}\n", 3, 28, "inner.a.names.1"),
-        ("title: x\ninner:\n  a: {count: true}\n", 3, 7, "integer"),
+        ("title: x\ninner:\n  a: {count: true}\n", 3, 7, "inner.a.count; expected a whole number; got true"),
         ("title: x\ninner: [1]\n", 2, 1, "inner"),
     ],
 )

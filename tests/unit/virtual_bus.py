@@ -8,9 +8,10 @@ from typing import NamedTuple
 
 from modbus_virtual import VirtualLoop, VirtualWire
 
+from emulators.modbus.mbap import MbapSlave
 from emulators.modbus.rtu import RtuSlave
 from emulators.modbus.unit import ModbusUnit
-from gateway.core.connection import ByteConnection, CanConnection
+from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import Unreachable
 from gateway.devices.config import BusConfig
@@ -31,13 +32,18 @@ class Heard(NamedTuple):
 
 
 class VirtualLine:
-    """A Connector to one line. `units` may change while it runs; a unit answers `latency_s` behind its request."""
+    """A Connector to one line, or to one TCP server with all units behind it, as the endpoint says.
+
+    `units` may change while it runs; a unit answers `latency_s` after its request.
+    """
 
     def __init__(self, loop: VirtualLoop, units: dict[int, ModbusUnit], latency_s: float = 0.005) -> None:
         self.units = units
         self.latency_s = latency_s
         self.slow: dict[int, float] = {}
         """Units that take longer, in seconds."""
+        self.no_answer: dict[int, float] = {}
+        """On TCP: units for which the server, a gateway, replies with exception 0B after so many seconds."""
         self.silent: Callable[[bytes], bool] = lambda frame: False
         """Requests to which nobody answers."""
         self.heard: list[Heard] = []
@@ -47,19 +53,36 @@ class VirtualLine:
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
         self.opened_s = self._loop.time()
-        self._wire = VirtualWire(endpoint, self._on_write)
+        kind = RS232Connection if endpoint.is_serial else TCPConnection
+        self._wire = VirtualWire(endpoint, self._on_write, kind)
         return self._wire
 
     async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
         raise Unreachable("no CAN here", where=str(endpoint))
 
     def _on_write(self, data: bytes) -> None:
+        assert self._wire is not None
+        if not self._wire.endpoint.is_serial:
+            self._on_adu(data)
+            return
         self.heard.append(Heard(self._loop.time(), data[0], data[1:-2]))
         if self.silent(data):
             return
         thinks_s = self.slow.get(data[0], self.latency_s)
         for reply in RtuSlave(self.units).feed(data, self._loop.monotonic_ns()):
             self._loop.call_later((len(data) + len(reply)) * CHAR_S + thinks_s, self._deliver, reply)
+
+    def _on_adu(self, adu: bytes) -> None:
+        unit = adu[6]
+        self.heard.append(Heard(self._loop.time(), unit, adu[7:]))
+        if self.silent(adu):
+            return
+        if unit in self.no_answer:
+            refusal = adu[:4] + bytes([0, 3, unit, adu[7] | 0x80, 0x0B])
+            self._loop.call_later(self.no_answer[unit], self._deliver, refusal)
+        elif unit in self.units:
+            for reply in MbapSlave(self.units).feed(adu, self._loop.monotonic_ns()):
+                self._loop.call_later(self.slow.get(unit, self.latency_s), self._deliver, reply)
 
     def _deliver(self, reply: bytes) -> None:
         assert self._wire is not None

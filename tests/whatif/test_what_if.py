@@ -233,6 +233,29 @@ def test_several_plans_by_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["--command", "60@10min", "--command", "2@5s"], "command 2 s at 5 s, command 60 s at 10 min"),
+        (["--command", "0"], "command 0 s at 0 s"),
+        (["--faults", "silent.yaml"], "fault silence on ctd, fault drop on line1"),
+        (
+            [f"--command={n}@{n}s" for n in range(1, 10)],
+            ", ".join(f"command {n} s at {n} s" for n in range(1, 7)) + " and 3 more",
+        ),
+        ([], "no commands"),
+    ],
+)  # fmt: skip
+def test_a_plan_of_the_command_line_is_named_by_what_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], name: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("silent.yaml").write_text("faults: [{name: silence, device: ctd}, {name: drop, bus: line1}]\n")
+    line = ["observatory", *words, "--require", "relay.dropped == 0", "--horizon", "2s", "--jobs", "1"]
+    shown = CliRunner().invoke(command, line, standalone_mode=False)
+    assert f"\n{name}: " in shown.stdout
+
+
+@pytest.mark.parametrize(
     ("old", "new", "message"),
     [
         ("name: stop", "name: keep", r"two plans of one name"),

@@ -14,7 +14,8 @@ from emulators.can_link import CanLink, node_of
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.faults.frames import Framing, Way
 from emulators.faults.on_link import check_can_link, wire_faults
-from emulators.faults.schema import WrongAim, parse_fault
+from emulators.faults.schema import parse_fault
+from emulators.faults.wrong_aim import WrongAim
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S
 from gateway.core.connection import CanConnection

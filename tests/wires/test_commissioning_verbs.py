@@ -147,6 +147,7 @@ def test_a_node_on_the_software_bus(tmp_path: Path) -> None:
     run(main())
 
 
+@pytest.mark.long
 def test_a_dump_that_was_killed_goes_on(tmp_path: Path) -> None:
     """kill -9 in the middle of a dump by the command line; the last line at most is lost, and nothing is asked twice."""
     out = tmp_path / "d.jsonl"

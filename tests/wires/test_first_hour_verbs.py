@@ -73,7 +73,7 @@ def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
             sent = [json.loads(line) for line in log.read_text().splitlines() if '"sent"' in line]
             assert {bytes.fromhex(line["hex"])[0] for line in sent} <= {4, 5, 6}
             code, report, talk = await fieldtwin(
-                "line", f"{url}?baudrate=19200&frame=8N1", "--listen", "0.2", "--probe", "5"
+                "line", f"{url}?baudrate=19200&frame=8N1", "--listen", "200ms", "--probe", "5"
             )
             assert (code, report["probe"]["answer"]) == (0, "good"), talk
             code, told, talk = await fieldtwin(
@@ -113,7 +113,7 @@ def test_a_drive_on_the_software_bus() -> None:
         node = CanopenNode(parse_eds(DRIVE.read_text()), 7, NodeContext())
         async with Nursery() as nursery:
             nursery.start(serve_node(server.attach("drive"), node, WallClock()), "drive")
-            words = ("--nodes", "7-8", "--listen-for", "0.3", "--timeout", "500ms", "--no-lss")
+            words = ("--nodes", "7-8", "--listen-for", "300ms", "--timeout", "500ms", "--no-lss")
             code, found, talk = await fieldtwin("scan", str(server.bound), *words)
             assert code == 0, talk
             assert (found["bitrate"], [n["node"] for n in found["nodes"]]) == (250_000, [7])

@@ -167,13 +167,13 @@ def test_fieldtwin_emulate_puts_one_device_on_every_wire(tmp_path: Path) -> None
 
 
 async def read_meter(endpoint: Endpoint, *, echo: bool) -> None:
-    """A voltage that is one, and a register that is none: our driver's client, none of the emulator's code."""
+    """Read a voltage, and a table that the meter lacks, with our driver's client and none of the emulator's code."""
     connection = await OsConnector().open_bytes(endpoint)
     master = ModbusClient.at(endpoint, connection, WallClock(), echo=echo)
     try:
         reply = await master.read_registers(1, "input", 0, 2)
         assert 0x4340 <= reply.registers[0] <= 0x4380, f"{endpoint}: no float32 between 192 and 256: {reply}"
         with pytest.raises(ModbusExceptionReply):
-            await master.read_registers(1, "input", 9000, 2)
+            await master.read_bits(1, "coil", 0, 1)
     finally:
         await master.aclose()

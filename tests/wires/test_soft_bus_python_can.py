@@ -212,7 +212,7 @@ def test_refusals_are_python_cans() -> None:
             with pytest.raises(can.CanInitializationError, match="expected 250000 bit/s; got 125000 bit/s"):
                 await join(server, bitrate=250_000)
             with pytest.raises(can.CanInitializationError):
-                await join(server, fd=True)
+                await join(server, data_bitrate=2_000_000)
             a = await join(server)
             for bad in (
                 can.Message(is_error_frame=True),

@@ -11,7 +11,7 @@ from contextlib import asynccontextmanager
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.bus_hello import VERSION, Hello, Status, unpack_hello
+from emulators.endpoints.bus_hello import FD_VERSION, VERSION, Hello, Status, unpack_hello
 from emulators.endpoints.bus_server import SoftBusServer
 from emulators.endpoints.can_end import open_can_end
 from gateway.connections.soft_bus import SoftBusConnection
@@ -380,7 +380,7 @@ def test_another_version_is_told_ours() -> None:
     async def main() -> None:
         async with bus() as server:
             reader, writer = await asyncio.open_connection(*server.bound.address)
-            writer.write(Hello(125_000, version=VERSION + 1).pack())
+            writer.write(Hello(125_000, version=FD_VERSION + 1).pack())
             answer = unpack_hello(await reader.readexactly(RECORD_SIZE))
             assert answer is not None
             assert (answer.status, answer.version) == (Status.UNKNOWN_VERSION, VERSION)

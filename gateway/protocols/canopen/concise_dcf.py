@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gateway.core.errors import Desync, FileInvalid, UsageError
-from gateway.protocols.canopen.datatypes import encode
+from gateway.protocols.canopen.datatypes import DataType, encode
 from gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
 
 _COUNT = struct.Struct("<I")
@@ -139,7 +139,10 @@ def _pdo(index: int, wanted: dict[tuple[int, int], Setting], dictionary: ObjectD
 def _bytes_of(entry: DictionaryEntry, path: str) -> bytes:
     where = f"[{entry.index:04X}sub{entry.subindex:X}] ParameterValue of {entry.name!r}"
     if entry.default is None:
-        raise FileInvalid(f"{where} cannot be read", path=path)
+        kind = DataType(entry.type_code).name
+        raise FileInvalid(
+            f"{where} cannot be read", path=path, expected=f"a value of type {kind}, or the file of a DOMAIN"
+        )
     try:
         return encode(entry.type_code, entry.default)
     except UsageError as e:

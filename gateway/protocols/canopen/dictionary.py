@@ -1,8 +1,8 @@
 """The object dictionary of a node as its EDS or DCF describes it, in our own frozen form.
 
-The one file on this side that imports the `canopen` package, whose reader turns text into objects ($NODEID, limits,
-types of its own making). It forgives little and names no line: `eds_text` mends before, and its errors end here.
-Nothing here talks to a node.
+The one file on this side that imports the `canopen` package, whose reader turns text into objects. It forgives little and
+names no line: `eds_text` mends the text before, `eds_values` reads the values, and errors of the package end here. Nothing here
+talks to a node.
 """
 
 from __future__ import annotations
@@ -19,11 +19,17 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 from canopen.objectdictionary.eds import import_eds
 
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.input_file import read_input
 from gateway.core.values import Scalar
 from gateway.protocols.canopen.cob_id import check_node
 from gateway.protocols.canopen.datatypes import DataType
-from gateway.protocols.canopen.eds_text import EdsText, decode_eds, invalid, read_eds_text
+from gateway.protocols.canopen.eds_text import EdsText, Section, decode_eds, read_eds_text
+from gateway.protocols.canopen.eds_values import read_limit, read_value
 
+MAX_EDS_BYTES = 8 * 1024 * 1024
+"""An EDS or DCF file that is larger is a mistake; the largest one known has 2 MB."""
+MAX_DOMAIN_BYTES = 16 * 1024 * 1024
+"""Of a file that a DOMAIN object names as its content."""
 _TYPE_AREA = range(0x1000)
 """Indices that define data types (7.4.1): no objects of the device."""
 
@@ -35,7 +41,7 @@ class DictionaryEntry:
     `name` is ``Parent.Child`` for a sub-object. `type_code` is that of CiA 301 (see `datatypes.DataType`). `access` is
     ro, wo, rw, rwr, rww or const. `default` is the DCF's ParameterValue where it has one, else the DefaultValue, with
     $NODEID filled in when a node id was given; None when the file has none, or none that can be read. `low` and
-    `high` are limits of integers, None where there is none. `configured` says that a DCF sets it: `default` is then its
+    `high` are inclusive limits of numbers, None where there is none. `configured` says that a DCF sets it: `default` is then its
     ParameterValue, None where that cannot be read.
     """
 
@@ -45,8 +51,8 @@ class DictionaryEntry:
     type_code: int
     access: str
     default: Scalar | None = None
-    low: int | None = None
-    high: int | None = None
+    low: int | float | None = None
+    high: int | float | None = None
     pdo_mappable: bool = False
     configured: bool = False
 
@@ -103,7 +109,7 @@ def load_dictionary(path: Path, node_id: int | None = None) -> ObjectDictionary:
     A DOMAIN's DownloadFile (CiA 306, 4.7.3) is read from the file's own folder: its bytes are what the DCF sets.
     """
     try:
-        raw = path.read_bytes()
+        raw = read_input(path, MAX_EDS_BYTES)
     except OSError as e:
         raise FileInvalid(f"cannot be read: {e.strerror or e}", path=str(path)) from e
     text, assumed = decode_eds(raw, str(path))
@@ -127,9 +133,9 @@ def parse_dictionary(
         theirs = import_eds(io.StringIO(str(eds)), node_id)  # type: ignore[no-untyped-call]
     except (configparser.Error, ValueError, KeyError, OverflowError) as e:
         raise FileInvalid(f"not an EDS that can be used: {e}", path=path) from e
-    entries = _entries(theirs.values(), eds)
-    if folder is not None:
-        entries.update(_downloads(entries, eds, folder, path))
+    values = _Values(eds, theirs.node_id)
+    entries = _entries(theirs.values(), eds, values)
+    entries.update(_downloads(entries, values, folder))
     information = theirs.device_information
     return ObjectDictionary(
         MappingProxyType(entries),
@@ -139,13 +145,13 @@ def parse_dictionary(
         product_number=information.product_number,
         revision_number=information.revision_number,
         node_id=theirs.node_id,
-        mended=mended + eds.mended,
+        mended=mended + eds.mended + tuple(dict.fromkeys(values.mended)),
         path=path,
     )
 
 
 def _entries(
-    objects: Iterable[ODVariable | ODArray | ODRecord], eds: EdsText
+    objects: Iterable[ODVariable | ODArray | ODRecord], eds: EdsText, values: _Values
 ) -> dict[tuple[int, int], DictionaryEntry]:
     """Every variable of theirs as an entry of ours, in order of index and subindex."""
     entries: dict[tuple[int, int], DictionaryEntry] = {}
@@ -153,9 +159,9 @@ def _entries(
         if item.index in _TYPE_AREA:
             continue
         if isinstance(item, ODVariable):
-            members = [_entry(item, item.name)]
+            members = [values.entry(item, item.name)]
         else:
-            members = [_entry(var, f"{item.name}.{var.name}") for var in item.subindices.values()]
+            members = [values.entry(var, f"{item.name}.{var.name}") for var in item.subindices.values()]
         compact = int(eds.sections[f"{item.index:04X}"].values.get("CompactSubObj", "0"), 0)
         if isinstance(item, ODArray) and compact:
             members = _expand(item, members, compact)
@@ -164,21 +170,24 @@ def _entries(
 
 
 def _downloads(
-    entries: Mapping[tuple[int, int], DictionaryEntry], eds: EdsText, folder: Path, path: str
+    entries: Mapping[tuple[int, int], DictionaryEntry], values: _Values, folder: Path | None
 ) -> dict[tuple[int, int], DictionaryEntry]:
-    """The DOMAINs that name a DownloadFile, set to its content."""
+    """The DOMAINs that name a DownloadFile, set to its content; None where it cannot be read, which is noted."""
     found: dict[tuple[int, int], DictionaryEntry] = {}
     for key, entry in entries.items():
-        index, sub = f"{entry.index:04X}", f"{entry.index:04X}sub{entry.subindex:X}"
-        section = eds.sections.get(sub) or eds.sections[index]
+        section = values.section(*key)
         name = section.values.get("DownloadFile", "")
         if not name or entry.type_code != DataType.DOMAIN:
             continue
+        if folder is None:
+            values.mended.append(f"[{section.name}] DownloadFile: not looked for")
+            continue
+        raw: bytes | None = None
         try:
-            raw = (folder / PureWindowsPath(name).name).read_bytes()
+            raw = read_input(folder / PureWindowsPath(name).name, MAX_DOMAIN_BYTES)
         except OSError as e:
-            problem = f"cannot be read: {e.strerror or e}"
-            raise invalid(problem, section, "DownloadFile", path, expected="a file beside this one", got=name) from e
+            line = section.lines.get("DownloadFile", section.line)
+            values.mended.append(f"[{section.name}] DownloadFile: cannot be read: {e.strerror or e} (line {line})")
         found[key] = replace(entry, default=raw, configured=True)
     return found
 
@@ -193,12 +202,48 @@ def _expand(array: ODArray, members: list[DictionaryEntry], count: int) -> list[
     return list(known.values())
 
 
-def _entry(var: ODVariable, name: str) -> DictionaryEntry:
-    configured = bool(getattr(var, "value_raw", ""))
-    default = var.value if configured else var.default
-    if var.data_type == DataType.BOOLEAN and default is not None:
-        default = bool(default)
-    kind = DataType.DOMAIN if var.data_type is None else var.data_type
-    return DictionaryEntry(
-        var.index, var.subindex, name, kind, var.access_type, default, var.min, var.max, var.pdo_mappable, configured
-    )
+class _Values:
+    """What the sections say of each value. `mended` says which could not be read."""
+
+    def __init__(self, eds: EdsText, node_id: int | None) -> None:
+        self._sections = eds.sections
+        self._node_id = node_id
+        self.mended: list[str] = []
+
+    def section(self, index: int, subindex: int) -> Section:
+        """Where a value is described: in its own section, or in that of its object."""
+        return self._sections.get(f"{index:04X}sub{subindex:X}") or self._sections[f"{index:04X}"]
+
+    def entry(self, var: ODVariable, name: str) -> DictionaryEntry:
+        """An entry of ours from a variable of the package."""
+        section, kind = self.section(var.index, var.subindex), int(var.data_type or DataType.DOMAIN)
+        configured = bool(section.values.get("ParameterValue", ""))
+        default = self._value(section, "ParameterValue", kind) if configured else None
+        if not configured:
+            default = self._value(section, "DefaultValue", kind)
+        low, high = self._limit(section, "LowLimit", kind), self._limit(section, "HighLimit", kind)
+        if low is not None and high is not None and low > high:
+            self.mended.append(f"[{section.name}] LowLimit: above HighLimit, both left out")
+            low = high = None
+        mapped = var.pdo_mappable
+        return DictionaryEntry(
+            var.index, var.subindex, name, kind, var.access_type, default, low, high, mapped, configured
+        )
+
+    def _value(self, section: Section, key: str, kind: int) -> Scalar | None:
+        text = section.values.get(key, "")
+        if not text:
+            return None
+        try:
+            return read_value(kind, text, self._node_id)
+        except (ValueError, OverflowError):
+            self.mended.append(f"[{section.name}] {key}: no value of data type {kind:04X}h: {text[:40]}")
+            return None
+
+    def _limit(self, section: Section, key: str, kind: int) -> int | float | None:
+        text = section.values.get(key, "")
+        try:
+            return read_limit(kind, text)
+        except (ValueError, OverflowError):
+            self.mended.append(f"[{section.name}] {key}: no number of its type, left out: {text[:40]}")
+            return None

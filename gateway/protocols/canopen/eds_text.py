@@ -11,25 +11,32 @@ import re
 from dataclasses import dataclass, field
 
 from gateway.core.errors import FileInvalid
+from gateway.protocols.canopen.datatypes import DataType
 
 MAX_BYTES = 16 * 1024 * 1024
 """No EDS comes near; whatever does is another kind of file."""
 
 _OBJECT = re.compile(r"^([0-9A-F]{4})(?:(SUB)([0-9A-F]{1,2})|(NAME|VALUE|DENOTATION))?$", re.IGNORECASE)
-_TYPE_OF_A_TOOL = re.compile(r"^[0-9A-F]{2,3}sub1$")
-"""Where CANFestival's editor says of which basic type a type of its own is; `canopen` looks there."""
+_DOMAIN = "0xF"
+"""CANFestival's editor writes ``[A0sub1]``: of which basic type the type A0h of its own is."""
 _COMMENT = re.compile(r"\s;.*$")
+_HEADING = re.compile(r"\[([^\]]+)\]")
 _OCTAL = re.compile(r"^0[0-7]+$")
 _NUMBER = re.compile(r"^(0x[0-9a-f]+|[0-9]+)$", re.IGNORECASE)
 
 _TEXT_KEYS = ("ParameterName", "AccessType", "DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
 _MORE_TEXT_KEYS = ("Factor", "Description", "Unit", "StorageLocation", "DownloadFile")
+_VALUE_KEYS = frozenset({"DefaultValue", "ParameterValue", "LowLimit", "HighLimit", "DownloadFile"})
+"""Read by `eds_values`; the reader of the text is not given them."""
 _NUMBER_KEYS = {"ObjectType": "0x7", "DataType": "", "PDOMapping": "0", "CompactSubObj": "0", "NrOfEntries": "0"}
 """Keys that hold a number, and what an empty one stands for (CiA 306, 4.6.3.2); nothing for those that must be there."""
 
 _DEVICE_TEXT = ("VendorName", "ProductName", "OrderCode")
 _DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber", "NrOfRXPDO", "NrOfTXPDO")
 _COMMISSIONING_NUMBERS = ("NodeID", "Baudrate")
+_AT_MOST = {"NodeID": 127, "Baudrate": 1000}
+_ACCESS = ("ro", "wo", "rw", "rwr", "rww", "const")
+_MOST_ENTRIES = 254
 _CANONICAL = {
     key.lower(): key
     for key in (
@@ -65,14 +72,17 @@ class EdsText:
         """The mended file, objects before their sub-objects, without what says nothing about objects."""
         blocks = []
         for name, section in self.sections.items():
-            blocks.append("\n".join([f"[{name}]", *(f"{key}={value}" for key, value in section.values.items())]))
+            lines = [f"{key}={value}" for key, value in section.values.items() if key not in _VALUE_KEYS]
+            blocks.append("\n".join([f"[{name}]", *lines]))
         return "\n\n".join(blocks) + "\n"
 
 
 def decode_eds(raw: bytes, path: str = "") -> tuple[str, tuple[str, ...]]:
-    """The text of a file, and what had to be assumed: UTF-8 (with or without mark), else Windows-1252."""
+    """The text of a file, and what had to be assumed: UTF-8 or UTF-16 (by their marks), else Windows-1252."""
     if len(raw) > MAX_BYTES:
         raise FileInvalid("not an EDS", path=path, expected=f"at most {MAX_BYTES} bytes", got=str(len(raw)))
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return raw.decode("utf-16", errors="replace"), ("in UTF-16",)
     try:
         return raw.decode("utf-8-sig"), ()
     except UnicodeDecodeError:
@@ -90,12 +100,13 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
     for name, allowed in (("DeviceInfo", (_DEVICE_TEXT, _DEVICE_NUMBERS)), ("DeviceComissioning", _commissioning())):
         section = sections.get(name, Section(name, 0))
         kept[name] = _mend_information(section, allowed, path, mended)
-    for name in (n for n in sections if _TYPE_OF_A_TOOL.match(n) and sections[n].values.get("DefaultValue")):
-        kept[name] = sections[name]
     for name in sorted((n for n in sections if _OBJECT.match(n) and not n.endswith("Denotation")), key=_order):
         parent = sections.get(name[:4])
         if parent is None:
             mended.append(f"[{name}]: left out, there is no [{name[:4]}]")
+        elif not _holds_values(parent, path):
+            if name == parent.name and _kind(parent, path) not in (0x5, 0x6):  # the definition of a data type
+                mended.append(f"[{name}] ObjectType: unknown, the object is left out")
         elif name != parent.name and _is_variable(parent, path) and "CompactSubObj" not in kept[parent.name].values:
             mended.append(f"[{name}]: left out, [{parent.name}] is a single variable")
         elif name.endswith("Name"):
@@ -103,7 +114,7 @@ def read_eds_text(text: str, path: str = "") -> EdsText:
         elif name.endswith("Value"):
             _spell_out(sections[name], parent, kept, path, mended)
         else:
-            kept[name] = _mend_object(sections[name], path, mended)
+            kept[name] = _mend_object(sections[name], sections, path, mended)
     return EdsText(kept, tuple(mended))
 
 
@@ -144,12 +155,15 @@ def _split(text: str, path: str, mended: list[str]) -> dict[str, Section]:
         if not line or line[0] in ";#":
             continue
         if line[0] == "[":
-            if not line.endswith("]"):
+            heading = _HEADING.match(line)
+            if heading is None:
                 raise FileInvalid("a section without its bracket", path=path, line=number, expected="[...]", got=line)
-            current = Section(_canonical_section(line[1:-1].strip()), number)
+            current = Section(_canonical_section(heading[1].strip()), number)
             if current.name in sections and _OBJECT.match(current.name):
                 before = sections[current.name].line
                 raise FileInvalid(f"[{current.name}] is there twice", path=path, line=number, got=f"also line {before}")
+            if current.name in sections:
+                mended.append(f"[{current.name}]: there twice, the last one counts")
             sections[current.name] = current
             continue
         key, equals, value = line.partition("=")
@@ -199,19 +213,59 @@ def _mend_information(
         if key in texts:
             kept.values[key] = section.values[key]
         elif key in numbers and (section.values[key] or key not in _COMMISSIONING_NUMBERS):
-            kept.values[key] = str(int(_number(section, key, "0", path, mended), 0))
+            _mend_count(section, key, kept, path, mended)
         elif key.lower() == "compactpdo" and section.values[key] not in ("", "0", "0x0", "0x00"):
             mended.append("[DeviceInfo] CompactPDO: PDO parameters that the file leaves out are not made up")
     return kept
 
 
-def _mend_object(section: Section, path: str, mended: list[str]) -> Section:
+def _mend_count(section: Section, key: str, kept: Section, path: str, mended: list[str]) -> None:
+    """A number that describes the device as a whole: one that cannot be is left out, since no object depends on it."""
+    try:
+        number = int(_number(section, key, "0", path, mended), 0)
+    except FileInvalid:
+        mended.append(f"[{section.name}] {key}: no number, left out")
+        return
+    if number > _AT_MOST.get(key, number):
+        mended.append(f"[{section.name}] {key}: not 1 to {_AT_MOST[key]}, left out")
+        return
+    kept.values[key] = str(number)
+
+
+def _kind(section: Section, path: str) -> int:
+    """The ObjectType: 7 (VAR) where the section does not say."""
+    return int(_number(section, "ObjectType", "0x7", path, []), 0) if "ObjectType" in section.values else 7
+
+
+def _holds_values(section: Section, path: str) -> bool:
+    """Whether the object is a DOMAIN, VAR, ARRAY or RECORD (CiA 306-1, 4.6.3.2)."""
+    return _kind(section, path) in (0x2, 0x7, 0x8, 0x9)
+
+
+def _data_type(section: Section, kept: Section, sections: dict[str, Section], path: str, mended: list[str]) -> str:
+    """The basic data type of a value, as the text is to say it; a type that no one describes is taken as DOMAIN."""
+    if _kind(section, path) == 0x2:
+        return _DOMAIN
+    if not kept.values.get("DataType"):
+        raise invalid("is missing", section, "DataType", path, expected="a number")
+    code = int(kept.values["DataType"], 0)
+    known = {int(kind) for kind in DataType}
+    defined = sections.get(f"{code:X}sub1", Section("", 0)).values.get("DefaultValue", "")
+    if code > max(known) and _NUMBER.match(defined):
+        code = int(defined, 16 if defined.lower().startswith("0x") else 10)
+    if code in known:
+        return hex(code)
+    mended.append(f"[{section.name}] DataType: {kept.values['DataType']} is not described, read as DOMAIN")
+    return _DOMAIN
+
+
+def _mend_object(section: Section, sections: dict[str, Section], path: str, mended: list[str]) -> Section:
     """The keys of an object or sub-object, complete enough for a reader that forgives nothing."""
     kept = Section(section.name, section.line, lines=section.lines)
     for key, value in section.values.items():
         if key in _NUMBER_KEYS:
-            if key == "DataType" and not value and not _is_variable(section, path):
-                continue  # a record's own data type means nothing
+            if key == "DataType" and not value and (_kind(section, path) == 0x2 or not _is_variable(section, path)):
+                continue  # a record's own data type means nothing, and a DOMAIN needs none
             kept.values[key] = _number(section, key, _NUMBER_KEYS[key], path, mended)
         elif key in _TEXT_KEYS or key in _MORE_TEXT_KEYS:
             kept.values[key] = value
@@ -219,18 +273,34 @@ def _mend_object(section: Section, path: str, mended: list[str]) -> Section:
             mended.append(f"[{section.name}] UploadFile: nothing is stored there")
     if not int(kept.values.get("CompactSubObj", "0"), 0):
         kept.values.pop("CompactSubObj", None)  # `canopen` takes its mere presence for a compact array
-    required = ("ParameterName", "DataType", "AccessType") if _is_variable(kept, path) else ("ParameterName",)
-    for key in required:
-        if not kept.values.get(key):
-            raise invalid("is missing", section, key, path, expected="a value")
+    if not kept.values.get("ParameterName"):
+        kept.values["ParameterName"] = f"{section.name[:4]}h"
+        mended.append(f"[{section.name}] ParameterName: missing")
+    if _is_variable(kept, path):
+        kept.values["DataType"] = _data_type(section, kept, sections, path, mended)
+        kept.values["AccessType"] = _access(section, path, mended)
+    if "CompactSubObj" in kept.values:
+        if int(kept.values["CompactSubObj"], 0) > _MOST_ENTRIES:
+            raise invalid("cannot be", section, "CompactSubObj", path, expected=f"0 to {_MOST_ENTRIES}")
+        kept.values["ObjectType"] = "0x8"  # `canopen` knows compact arrays, but no compact records
     return kept
+
+
+def _access(section: Section, path: str, mended: list[str]) -> str:
+    access = section.values.get("AccessType", "").lower()
+    if not access:
+        mended.append(f"[{section.name}] AccessType: missing, read as rw")
+        return "rw"
+    if access not in _ACCESS:
+        raise invalid("cannot be read", section, "AccessType", path, expected=", ".join(_ACCESS), got=repr(access))
+    return access
 
 
 def _is_variable(section: Section, path: str) -> bool:
     """Whether the section describes a value, rather than an array or record of others."""
     if "ObjectType" not in section.values:
         return True
-    kind = int(_number(section, "ObjectType", "0x7", path, []), 0)
+    kind = _kind(section, path)
     compact = int(_number(section, "CompactSubObj", "0", path, []) if "CompactSubObj" in section.values else "0", 0)
     return kind in (0x2, 0x7) or "sub" in section.name or bool(compact)
 
@@ -245,7 +315,7 @@ def _spell_out(values: Section, parent: Section, kept: dict[str, Section], path:
     count = min(int(array.values["CompactSubObj"], 0), 254)
     for key in values.values:
         if key != "NrOfEntries" and not (key.isdecimal() and 1 <= int(key) <= count):
-            raise invalid("no such entry", values, key, path, expected=f"1 to {count}")
+            mended.append(f"[{values.name}] {key}: left out, there are {count} entries")
     names = kept.get(f"{parent.name}Name", Section("", 0)).values
     every = {key: value for key, value in array.values.items() if key not in ("CompactSubObj", "ObjectType")}
     for sub in range(1, count + 1):

@@ -55,6 +55,11 @@ class HeartbeatConsumer:
         known = self._nodes.get(node)
         return None if known is None else known.state
 
+    def is_watched(self, node: int) -> bool:
+        """Whether the node has a consumer time and its first heartbeat came (CO-036); a lost node stays watched."""
+        known = self._nodes.get(node)
+        return known is not None and known.consumer_ns > 0 and known.monitored
+
     def is_lost(self, node: int) -> bool:
         """Whether the node's heartbeat is overdue."""
         known = self._nodes.get(node)

@@ -16,7 +16,7 @@ from gateway.core.errors import Bug, ConnectionLost, Desync, FieldtwinError, Rep
 from gateway.core.latency import Latencies
 from gateway.protocols.canopen import abort_codes, cob_id, nmt
 from gateway.protocols.canopen.heartbeat import HeartbeatConsumer
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
 from gateway.protocols.canopen.sdo import SdoDownload, SdoTransfer, SdoUpload
 from gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 from gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
@@ -28,6 +28,10 @@ EventCallback = Callable[[NodeEvent], None]
 
 
 def _nobody(event: NodeEvent) -> None:
+    pass
+
+
+def _no_one(data: bytes, t_ns: int) -> None:
     pass
 
 
@@ -54,6 +58,10 @@ class CanopenMaster:
         self.counters = Counters()
         self.latency = Latencies()  # of SDO transfers that were done
         self.on_event: EventCallback = on_event or _nobody
+        self.on_sync: PdoCallback = _no_one
+        """Called with each SYNC that this master did not send. It may be set at any time, as `on_event`."""
+        self.conflicts: dict[int, str] = {}
+        """By node id, in words: the last two replies to one request."""
         self._connection = connection
         self._clock = clock
         self._sdo_timeout_s = sdo_timeout_s
@@ -95,6 +103,10 @@ class CanopenMaster:
     def node_state(self, node: int) -> NmtState | None:
         """The NMT state that the node last told, None if it never did."""
         return self._heartbeat.state(node)
+
+    def heartbeat_watched(self, node: int) -> bool:
+        """Whether the node's heartbeat has a limit and was heard, so that its loss is an event."""
+        return self._heartbeat.is_watched(node)
 
     def heartbeat_lost(self, node: int) -> bool:
         """Whether the node is watched and its heartbeat is overdue."""
@@ -222,8 +234,16 @@ class CanopenMaster:
         base, node = can_id & 0x780, can_id & 0x7F
         if (service := self._services.get(can_id)) is not None:
             service(frame.data, t_ns)
+        elif can_id == cob_id.SYNC:
+            self.counters.ignored += 1
+            self.counters.foreign_syncs += 1  # our own are not received
+            self.on_sync(frame.data, t_ns)
         elif node == 0:
-            self.counters.ignored += 1  # NMT, SYNC and other broadcasts of somebody else
+            self.counters.ignored += 1  # NMT and other broadcasts of another master
+        elif base == cob_id.SDO_REQUEST_BASE:
+            self.counters.ignored += 1
+            if (asked := self._channels.get(node)) is not None:
+                asked.foreign_request(frame)
         elif base == cob_id.SDO_RESPONSE_BASE:
             self._on_sdo(node, frame, t_ns)
         elif base == cob_id.HEARTBEAT_BASE:
@@ -238,7 +258,11 @@ class CanopenMaster:
         if channel is None:
             self.counters.ignored += 1
         elif channel.deliver(frame):
-            self.on_event(NodeEvent(node, "conflict", self._heartbeat.state(node), frame.data, t_ns))
+            conflict = NodeEvent(
+                node, "conflict", self._heartbeat.state(node), frame.data, t_ns, first=channel.first_reply
+            )
+            self.conflicts[node] = conflict_text(conflict)
+            self.on_event(conflict)
 
     def _on_heartbeat(self, node: int, data: bytes, t_ns: int) -> None:
         if nmt.heartbeat_state(data) is None:
@@ -248,6 +272,8 @@ class CanopenMaster:
         for event in self._heartbeat.observe(node, data, t_ns):
             if event.kind == "boot-up" and node in self._channels:
                 self._channels[node].on_boot_up()
+            if event.kind == "conflict":
+                self.conflicts[node] = conflict_text(event)
             self.on_event(event)
         due_ns = self._heartbeat.deadline_ns(node)  # no other's is another than it was
         if due_ns is not None and (self._timer is None or due_ns < self._timer_due_ns):

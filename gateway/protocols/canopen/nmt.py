@@ -47,7 +47,7 @@ class NodeEvent:
     `state` is what is known after it (None: never heard). `data` is the frame's data where a frame caused it. `t_ns`
     is monotonic. `unexpected` marks a boot-up that this master did not ask for, of a node that it had heard before:
     the node restarted and has lost its configuration (CO-035). A ``conflict`` means that two nodes seem to share this
-    node id, or two masters its SDO channel (CO-042).
+    node id (CO-042): `data` is the second reply to one request, or the second boot-up; `first` the first reply, where known.
     """
 
     node: int
@@ -56,6 +56,20 @@ class NodeEvent:
     data: bytes
     t_ns: int
     unexpected: bool = False
+    first: bytes = b""
+
+
+def conflict_text(event: NodeEvent) -> str:
+    """A conflict in words: what came twice, and what that means."""
+    end = f"two nodes seem to have the id {event.node}"
+    if len(event.data) != 8:
+        return f"two boot-ups in a row: {end}"
+    name = f"{int.from_bytes(event.data[1:3], 'little'):04X}h:{event.data[3]:02X}"
+    if not event.first:
+        return f"a second reply to one request for {name}: {end}"
+    if event.first == event.data:
+        return f"the same reply twice to one request for {name} ({event.data.hex(' ')}): {end}"
+    return f"two replies to one request for {name}, {event.first.hex(' ')} and {event.data.hex(' ')}: {end}"
 
 
 def command_frame(command: NmtCommand, node: int) -> CanFrame:

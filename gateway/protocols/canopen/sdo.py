@@ -23,6 +23,16 @@ from gateway.protocols.canopen import abort_codes, cob_id
 MAX_BYTES = 1 << 20
 """No object that a gateway reads is larger; a node that sends segments for ever is stopped here."""
 
+WHOLE_TIMEOUTS = 10
+WHOLE_NS_PER_BYTE = 50_000_000
+"""A whole transfer takes at most this many of its timeouts, and this long for each byte that was moved. Without this limit
+a node that sends one byte just before each timeout would hold the client for days. A segment of 7 bytes takes 26 ms at
+10 kbit/s.
+"""
+
+KNOWN_MAX_BYTES = 64
+"""Where the caller knows the size of the object: a reply that is too long is still told by its length up to here."""
+
 MAX_STRAYS = 64
 """A node that floods its SDO channel with something else is given up on (CO-025)."""
 
@@ -75,7 +85,8 @@ Step = Send | Wait | Done | Failed | Stray
 class SdoTransfer(ABC):
     """One transfer of one object with one node. Once it is over, everything that is fed is a stray.
 
-    `timeout_ns` is for each reply and starts again with every reply that carries the transfer on (CO-022).
+    `timeout_ns` is for each reply and starts again with every reply that carries the transfer on (CO-022). The whole transfer is
+    limited by `WHOLE_TIMEOUTS` and `WHOLE_NS_PER_BYTE`.
     `answered` tells whether the node has replied to the initiate request (or aborted).
     """
 
@@ -95,6 +106,7 @@ class SdoTransfer(ABC):
         self.subindex = subindex
         self.timeout_ns = timeout_ns
         self.deadline_ns = 0
+        self._started_ns = 0
         self.started = False
         self.answered = False
         self.over = False
@@ -110,6 +122,7 @@ class SdoTransfer(ABC):
     def start(self, now_ns: int) -> CanFrame:
         """The initiate request."""
         self.deadline_ns = now_ns + self.timeout_ns
+        self._started_ns = now_ns
         self.started = True
         return self._frame(self._request())
 
@@ -150,6 +163,8 @@ class SdoTransfer(ABC):
         """What to do when its reply is overdue at `now_ns`: as a rule, to end the transfer. None before that."""
         if self.over or now_ns < self.deadline_ns:
             return None
+        if now_ns >= self._limit_ns:
+            return self._timed_out()
         return self._recover(now_ns) or self._timed_out()
 
     def _recover(self, now_ns: int) -> Send | None:
@@ -158,6 +173,10 @@ class SdoTransfer(ABC):
 
     def _timed_out(self) -> Failed:
         self.over = True
+        if self.deadline_ns >= self._limit_ns:
+            took = f"{(self.deadline_ns - self._started_ns) / 1e9:g} s and {self._moved} bytes"
+            error = ReplyTimeout(f"{self.name}: not complete after {took}", hint="the node sends too little at a time")
+            return Failed(error, self.abort_frame(abort_codes.TIMED_OUT))
         what = "between segments" if self.answered else "to the request"
         error = ReplyTimeout(f"{self.name}: no reply {what} within {self.timeout_ns / 1e9:g} s")
         return Failed(error, self.abort_frame(abort_codes.TIMED_OUT))
@@ -196,12 +215,22 @@ class SdoTransfer(ABC):
         """How long the next frame may take."""
         return self.timeout_ns
 
+    @property
+    def _limit_ns(self) -> int:
+        """When the whole transfer is given up."""
+        return self._started_ns + WHOLE_TIMEOUTS * self.timeout_ns + self._moved * WHOLE_NS_PER_BYTE
+
+    @property
+    @abstractmethod
+    def _moved(self) -> int:
+        """Bytes of the object that were moved so far."""
+
     def _frame(self, data: bytes) -> CanFrame:
         return CanFrame(cob_id.SDO_REQUEST_BASE + self.node, data.ljust(8, b"\0"))
 
     def _go_on(self, step: Step, now_ns: int) -> Step:
         if isinstance(step, Send | Wait):
-            self.deadline_ns = now_ns + self._patience_ns()
+            self.deadline_ns = min(now_ns + self._patience_ns(), self._limit_ns)
         elif not isinstance(step, Stray):
             self.over = True
         return step
@@ -252,9 +281,13 @@ class SdoUpload(SdoTransfer):
     ) -> None:
         super().__init__(node, index, subindex, timeout_ns)
         self._length = length
-        self._max_bytes = max_bytes
+        self._max_bytes = max_bytes if length is None else min(max_bytes, max(length, KNOWN_MAX_BYTES))
         self._indicated: int | None = None
         self._received = bytearray()
+
+    @property
+    def _moved(self) -> int:
+        return len(self._received)
 
     def _request(self) -> bytes:
         return b"\x40" + self._multiplexor
@@ -304,6 +337,10 @@ class SdoDownload(SdoTransfer):
         self._data = bytes(data)
         self._sent = 0
         self._last_sent = False
+
+    @property
+    def _moved(self) -> int:
+        return self._sent
 
     @property
     def _expedited(self) -> bool:

@@ -176,6 +176,10 @@ class SdoBlockDownload(SdoDownload):
         return self.started and not self.over
 
     @property
+    def _moved(self) -> int:
+        return min(self._done * _SEGMENT, len(self._data))
+
+    @property
     def _expedited(self) -> bool:
         return False
 

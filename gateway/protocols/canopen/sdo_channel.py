@@ -20,6 +20,9 @@ from gateway.protocols.canopen import abort_codes
 from gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
 from gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
 
+MAX_ANSWERS = 16
+"""Answered requests of one node that a second reply is compared with."""
+
 MAX_INBOX = 128
 """Frames that wait for the transfer's task; a flood beyond that is dropped and counted."""
 
@@ -36,6 +39,7 @@ class Counters:
     each reply that carried a transfer on or ended it. Aborts that the node sent are in `sdo_aborts` only, aborts that
     the master sent in `frames_out` only. `sdo_timeouts` are requests that got no reply, `sdo_retries` transfers that
     were begun again; `sdo_probes` are the transfers made to get past late replies. `ignored` are frames that were for nobody.
+    `foreign_sdo_requests` are the SDO requests of other clients on the bus, and `foreign_syncs` the SYNCs of other producers.
     """
 
     frames_in: int = 0
@@ -50,6 +54,8 @@ class Counters:
     heartbeats: int = 0
     emcys: int = 0
     ignored: int = 0
+    foreign_sdo_requests: int = 0
+    foreign_syncs: int = 0
 
 
 def is_final(data: bytes) -> bool:
@@ -89,14 +95,22 @@ class SdoChannel:
         self._inbox: deque[CanFrame] = deque()
         self._arrived = asyncio.Event()
         self._lost: ConnectionLost | None = None
-        self._last_answer: Multiplexor | None = None
+        self._answers: dict[Multiplexor, bytes] = {}
+        """The last reply to each of the last requests, oldest first: a second reply to one of them is another node's."""
+        self._foreign: dict[Multiplexor, None] = {}
+        """What other clients asked this node for: the replies are theirs."""
+        self._reply = b""
+        self.first_reply = b""
+        """The reply that the last repeated one was compared with; 8 bytes, or none where it is not known."""
         self._owed: CanFrame | None = None
         self._rebooted = False
+        self._began_ambiguous = False
+        """Whether replies to earlier requests for the same object could still come when the present transfer began."""
 
     def deliver(self, frame: CanFrame) -> bool:
-        """A frame came from the node. True when it answers what was answered before (CO-042).
+        """A frame came from the node. True when it answers what was answered before (CO-042): two nodes share the id.
 
-        Two nodes with one id do that, or two masters on one SDO channel.
+        The reply to another client on the same SDO channel is no such answer, since its request was seen (`foreign_request`).
         """
         active = self._active
         repeated = self._is_foreign(frame, active)
@@ -107,6 +121,14 @@ class SdoChannel:
             self._arrived.set()
         return repeated
 
+    def foreign_request(self, frame: CanFrame) -> None:
+        """Another client asked the node for something: its reply is not a second one to a request of ours."""
+        self._counters.foreign_sdo_requests += 1
+        if len(frame.data) == 8 and frame.data[0] >> 5 in (1, 2, 5, 6):  # not the segments of a transfer
+            if len(self._foreign) >= MAX_ANSWERS:
+                self._foreign.pop(next(iter(self._foreign)))
+            self._foreign[multiplexor_of(frame.data)] = None
+
     def lose(self, error: ConnectionLost | None) -> None:
         """Nobody reads the bus any more (None: again): what waits fails now, what comes later at once."""
         self._lost = error
@@ -115,7 +137,9 @@ class SdoChannel:
     def on_boot_up(self) -> None:
         """The node booted: what it owed, it will never send, and a transfer under way ends now."""
         self._late.settle()
-        self._last_answer = self._owed = None
+        self._answers.clear()
+        self._foreign.clear()
+        self._owed = None
         if self._active is not None:
             self._rebooted = True
             self._arrived.set()
@@ -150,17 +174,20 @@ class SdoChannel:
         if self._lost is not None:
             raise self._again(self._lost)
         request, complete = (transfer.index, transfer.subindex), False
-        self._active, self._last_answer, self._rebooted = transfer, None, False
+        self._active, self._reply, self._rebooted = transfer, b"", False
+        self._began_ambiguous = self._late.is_ambiguous(request)
+        self._answers.pop(request, None)
         try:
             await self._tell_owed(transfer)
             began_ns = self._clock.monotonic_ns()
             data = await self._drive(transfer)
             self._latency.note(self._clock.monotonic_ns() - began_ns)
             complete = True
-            self._last_answer = request
+            self._answered(request)
             return data
         except SdoAborted:
             complete = True
+            self._answered(request)
             raise
         finally:
             self._active = None
@@ -171,6 +198,11 @@ class SdoChannel:
                 if not complete or other_expected:
                     self._late.unanswered(request)
                 self._owe(transfer)
+
+    def _answered(self, request: Multiplexor) -> None:
+        if len(self._answers) >= MAX_ANSWERS:
+            self._answers.pop(next(iter(self._answers)))
+        self._answers[request] = self._reply
 
     def _owe(self, transfer: SdoTransfer) -> None:
         """`transfer` is left as it is (cancelled, or the bus takes no frames): the node has to be told later."""
@@ -216,6 +248,8 @@ class SdoChannel:
             self._counters.sdo_timeouts += 1
             return transfer.expire(transfer.deadline_ns)
         step = transfer.feed(frame, self._clock.monotonic_ns())
+        if not isinstance(step, Stray):
+            self._reply = frame.data
         if isinstance(step, Send | Wait | Done):
             self._counters.sdo_replies += 1
         if isinstance(step, Stray):  # no answer: what was being sent goes on
@@ -277,20 +311,26 @@ class SdoChannel:
         return (transfer.deadline_ns - self._clock.monotonic_ns()) / NS_PER_S
 
     def _is_foreign(self, frame: CanFrame, active: SdoTransfer | None) -> bool:
-        """Put a reply that answers no present request on record; True when it repeats the last answer."""
+        """Put a reply that answers no present request on record; True when it answers once more what was answered."""
         if len(frame.data) != 8 or not has_multiplexor(frame.data) or (active is not None and active.unmarked):
             return False
         request = multiplexor_of(frame.data)
         if active is not None and (active.index, active.subindex) == request:
-            return any(waiting.data[:4] == frame.data[:4] for waiting in self._inbox)
+            if self._began_ambiguous:
+                return False  # after a stall the replies to earlier requests come all at once
+            waiting = next((f for f in self._inbox if f.data[:4] == frame.data[:4]), None)
+            self.first_reply = b"" if waiting is None else waiting.data
+            return waiting is not None
+        if request in self._foreign:
+            del self._foreign[request]
+            return False
         if self._late.is_ambiguous(request):
             if is_final(frame.data):
                 self._late.answered(request)
             return False
-        if request != self._last_answer:
-            return False
-        self._last_answer = None  # told once an answer
-        return True
+        first = self._answers.pop(request, None)  # told once an answer
+        self.first_reply = first or b""
+        return first is not None
 
     def _again(self, lost: ConnectionLost) -> ConnectionLost:
         """A fresh error for each caller: one instance would collect all their tracebacks."""

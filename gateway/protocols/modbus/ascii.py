@@ -50,12 +50,15 @@ class AsciiFramer(Framer):
         self._last_ns = 0
         self._damaged = 0
         self._seen = ""
+        self._late = bytearray()
+        """What came while no reply was awaited, up to one frame."""
 
     def wire_length(self, pdu_length: int) -> int:
         return 1 + 2 * (1 + pdu_length + 1) + 2
 
     def begin(self, unit: int, request: Request[Any]) -> bytes:
         self._skip(len(self._buffer))
+        self._late.clear()
         self._request = request
         self._unit = unit
         frame = bytes([unit]) + request.encode()
@@ -90,6 +93,13 @@ class AsciiFramer(Framer):
             self._echo_due = False
             data = data[len(self._sent) :]
         self.late_bytes += len(data)
+        self._late += data
+        start, end = self._late.rfind(_START), self._late.rfind(_END)
+        frame = _decoded(bytes(self._late[start : end + 1])) if 0 <= start < end else None
+        if frame is not None:
+            self._stray(frame[0], frame[1:], 0)
+            self._late.clear()
+        del self._late[:-MAX_FRAME]
 
     def overdue(self, waited_s: float) -> WireError:
         if self._damaged:
@@ -134,6 +144,7 @@ class AsciiFramer(Framer):
         if frame[0] != self._unit:
             self._seen = f"a frame of unit {frame[0]}"
             self.foreign_frames += 1
+            self._stray(frame[0], frame[1:], self._last_ns)
             self.noise_bytes += len(text)
             return None
         self._end()

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Coroutine, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import ByteConnection, closed_here
@@ -29,6 +29,7 @@ from gateway.core.turn import Turn
 from gateway.protocols.modbus.framings import Framing, framing_of, make_framer
 from gateway.protocols.modbus.identity import ReadDeviceIdentification
 from gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
+from gateway.protocols.modbus.refusals import GatewayRefusal
 from gateway.protocols.modbus.replies import BitsReply, RegistersReply, Reply, WriteReply
 from gateway.protocols.modbus.request import Request
 from gateway.protocols.modbus.requests import (
@@ -65,6 +66,13 @@ class UnitPace:
         _checked_pause(self.spacing_s)
 
 
+class Hold(NamedTuple):
+    """A unit that did not answer within a shortened timeout. Its reply may come until `until_ns`; asked at `sent_ns`."""
+
+    sent_ns: int
+    until_ns: int
+
+
 @dataclass(slots=True)
 class ClientCounters:
     """What happened on this connection since it was opened.
@@ -94,7 +102,8 @@ class ModbusClient:
 
     `serial` gives a line its character time: silences, and deadlines that leave out the time on the wire. Without it
     (RTU inside TCP) frames need no silence. `timeout_s` is how long a unit may take to answer, `turnaround_s` what all
-    units get to execute a broadcast, `spacing_s` a pause behind every exchange. `echo` and `strict` are as in `RtuFramer`,
+    units get to execute a broadcast, `spacing_s` a pause behind every exchange, `silence_s` the silence before a request where it
+    is not the one of SL 2.5.1.1. `echo` and `strict` are as in `RtuFramer`,
     `accepts_zero_id` as in `MbapFramer`; where the framing has no such thing, `UsageError`.
     """
 
@@ -111,6 +120,7 @@ class ModbusClient:
         accepts_zero_id: bool = False,
         turnaround_s: float = TURNAROUND_S,
         spacing_s: float = 0.0,
+        silence_s: float | None = None,
     ) -> None:
         self._connection = connection
         self._clock = clock
@@ -123,7 +133,7 @@ class ModbusClient:
             accepts_zero_id=accepts_zero_id,
         )
         self._line = LineSilence(
-            t35_ns=self._framer.t35_ns,
+            t35_ns=self._framer.t35_ns if silence_s is None else round(_checked_pause(silence_s) * NS_PER_S),
             settle_ns=self._framer.rest_ns,
             quarantines=not self._framer.confirms_transmission,
             turnaround_ns=round(_checked_timeout(turnaround_s) * NS_PER_S),
@@ -136,6 +146,14 @@ class ModbusClient:
         self._timeout_s = _checked_timeout(timeout_s)
         self._timeouts_ns: dict[int, int] = {}
         """By unit, until something else is stated."""
+        self._hurried_ns: dict[int, int] = {}
+        self._held: dict[int, Hold] = {}
+        self.late_ns: dict[int, int] = {}
+        """By unit: how long a reply took that came after its shortened timeout, in ns. Whoever hurries units takes them out."""
+        self.hurried_timeouts = 0
+        """How many of the `timeouts` were of hurried units."""
+        self.not_waited = 0.0
+        """The sum of what those were shorter by than the units' own timeouts, each as a part of the unit's own timeout."""
         self._turn = Turn()
         self._closed = False
         self.counters = ClientCounters()
@@ -169,6 +187,7 @@ class ModbusClient:
             accepts_zero_id=accepts_zero_id,
             turnaround_s=turnaround_s,
             spacing_s=spacing_s,
+            silence_s=endpoint.silence_s if endpoint.is_serial else None,
         )
 
     def restate(self, *, timeout_s: float, turnaround_s: float, spacing_s: float) -> None:
@@ -186,11 +205,31 @@ class ModbusClient:
         self._timeouts_ns.clear()
         self._spaces = self._spaces or bool(pace.spacing_s)
 
+    def hurry(self, unit: int, timeout_s: float) -> None:
+        """Wait for `unit` no longer than `timeout_s`, and leave the line to the other units when it does not answer.
+
+        This ends with its first reply, or with `relax`. Without a reply, `unit` is not asked again before its own timeout
+        is over as well, because a late reply does not say which request it answers (case MB-013).
+        """
+        self._hurried_ns[unit] = round(_checked_timeout(timeout_s) * NS_PER_S)
+
+    def relax(self, unit: int) -> None:
+        """Wait for `unit` as long as its pace says."""
+        self._hurried_ns.pop(unit, None)
+
+    def hurried(self, unit: int) -> bool:
+        """Whether `unit` is hurried, and has not answered since."""
+        return unit in self._hurried_ns
+
     def spaced_ns(self, unit: int) -> int:
-        """From when on `unit` has had its pause; a broadcast (unit 0) waits for all units. 0 where nobody waits."""
+        """The time from which `unit` may be asked: after its pause, and after a late reply can no longer come.
+
+        A broadcast (unit 0) waits for the pauses of all units. 0 if there is nothing to wait for.
+        """
         if unit == 0 and self._framer.has_broadcast:
             return max(self._spaced_ns.values(), default=0)
-        return self._spaced_ns.get(unit, 0)
+        spaced_ns, hold = self._spaced_ns.get(unit, 0), self._held.get(unit)
+        return spaced_ns if hold is None else max(spaced_ns, hold.until_ns)
 
     @property
     def clear_ns(self) -> int:
@@ -290,6 +329,8 @@ class ModbusClient:
             timeout_ns = self._timeouts_ns[unit] = round(self._timeout_of(unit) * NS_PER_S)
         if not 0 <= unit <= 255:
             raise UsageError("unit id out of range", expected="0 to 255", got=str(unit))
+        if self._hurried_ns and (hurried_ns := self._hurried_ns.get(unit)) is not None:
+            timeout_ns = min(timeout_ns, hurried_ns)
         unanswered = not request.expects_reply or (unit == 0 and self._framer.has_broadcast)
         if unanswered:
             request.unanswered(0)  # refuses what cannot be broadcast
@@ -298,8 +339,9 @@ class ModbusClient:
         try:
             if self._closed:
                 raise closed_here(self._connection.endpoint)
-            if self._spaced_ns:
+            if self._spaced_ns or self._held:
                 await self._await_spacing(unit)
+                self._held.pop(unit, None)
             if not self._is_silent():
                 await self._await_silence()
             transaction = Transaction(
@@ -308,7 +350,7 @@ class ModbusClient:
             try:
                 if unanswered:
                     return await self._send_only(transaction, request)
-                return await self._exchange(transaction, timeout_ns)
+                return await self._exchange(unit, transaction, timeout_ns)
             finally:
                 if self._spaces:
                     self._space(unit)
@@ -317,7 +359,7 @@ class ModbusClient:
 
     # -- one exchange --------------------------------------------------------------------------------------------
 
-    async def _exchange(self, transaction: Transaction[R], timeout_ns: int) -> R:
+    async def _exchange(self, unit: int, transaction: Transaction[R], timeout_ns: int) -> R:
         before = (self._framer.late_bytes, self._framer.noise_bytes, self._framer.foreign_frames)
         counters, line = self.counters, self._line
         counters.requests += 1
@@ -328,6 +370,8 @@ class ModbusClient:
             settled = True
             line.answered(reply.t_ns, transaction.sent_ns)
             self.latency.note(reply.t_ns - transaction.sent_ns)
+            if self._hurried_ns:
+                self.relax(unit)
             return reply
         except ModbusExceptionReply as e:
             counters.exceptions += 1
@@ -335,6 +379,8 @@ class ModbusClient:
             now_ns = self._clock.monotonic_ns()
             line.answered(now_ns, transaction.sent_ns)
             self.latency.note(now_ns - transaction.sent_ns)
+            if not isinstance(e, GatewayRefusal):
+                self.relax(unit)
             self._place(e)
             raise
         except CrcError as e:
@@ -346,6 +392,9 @@ class ModbusClient:
             raise
         except (Desync, ReplyTimeout, VerifyFailed) as e:
             self._count(e)
+            if unit in self._hurried_ns and isinstance(e, ReplyTimeout):
+                self._pass_over(unit, transaction.sent_ns, timeout_ns)
+                settled = True
             self._place(e)
             raise
         except BaseException:
@@ -358,6 +407,8 @@ class ModbusClient:
             counters.late_bytes += self._framer.late_bytes - late
             counters.noise_bytes += self._framer.noise_bytes - noise
             counters.foreign_frames += self._framer.foreign_frames - foreign
+            if self._framer.strays:
+                self._note_strays()
 
     async def _send_and_await(self, transaction: Transaction[R]) -> R:
         clock, connection = self._clock, self._connection
@@ -367,7 +418,9 @@ class ModbusClient:
         while True:
             data = await (self._read_pending() if arrived else self._read_until(transaction.wake_ns))
             now_ns = clock.monotonic_ns()
-            reply = transaction.feed(data, now_ns) if data else transaction.poll(now_ns)
+            reply = transaction.feed(data, now_ns) if data else None
+            if reply is None and (not data or now_ns >= transaction.deadline_ns):  # a flood does not prolong it
+                reply = transaction.poll(now_ns)
             if reply is not None:
                 return reply
 
@@ -428,6 +481,26 @@ class ModbusClient:
             raise ConnectionLost(lost.message, where=lost.where)
         self._line.may_go(now_ns)
 
+    def _pass_over(self, unit: int, sent_ns: int, timeout_ns: int) -> None:
+        """Hold a hurried unit that did not answer within `timeout_ns`, instead of the line."""
+        now_ns = self._clock.monotonic_ns()
+        own_ns = round(self._timeout_of(unit) * NS_PER_S)
+        self.hurried_timeouts += 1
+        self.not_waited += max(0.0, 1.0 - timeout_ns / own_ns)
+        # As long as the quarantine of a line after a whole timeout: a late reply must not answer the next request (MB-013).
+        until_ns = max(now_ns, sent_ns + own_ns) + max(own_ns, self._line.longest_latency_ns)
+        self._held[unit] = Hold(sent_ns, until_ns)
+        self._line.passed_over(now_ns)
+
+    def _note_strays(self) -> None:
+        """Late replies of units that were hurried: the unit is there, and its reply is no longer under way."""
+        now_ns = self._clock.monotonic_ns()
+        for unit, t_ns in self._framer.strays.items():
+            hold = self._held.pop(unit, None)
+            if hold is not None:
+                self.late_ns[unit] = (t_ns or now_ns) - hold.sent_ns
+        self._framer.strays.clear()
+
     def _drain(self, data: bytes, now_ns: int, *, live: bool) -> None:
         if data:
             before = self._framer.late_bytes, self._framer.noise_bytes
@@ -435,6 +508,8 @@ class ModbusClient:
             self.counters.late_bytes += self._framer.late_bytes - before[0]
             self.counters.noise_bytes += self._framer.noise_bytes - before[1]
             self._line.heard(now_ns, live=live)
+            if self._framer.strays:
+                self._note_strays()
 
     def _read_until(self, deadline_ns: int) -> Coroutine[Any, Any, bytes]:
         """What arrives next, or nothing at `deadline_ns`."""

@@ -47,6 +47,9 @@ _COUNTED: dict[int, tuple[tuple[int, int], ...]] = {
 }
 """Position of a byte count, and the frame's length without the bytes counted."""
 
+KNOWN_FUNCTIONS = frozenset(_FIXED.keys() | _COUNTED.keys())
+"""Functions whose frames tell their length."""
+
 _EVEN = frozenset({0x03, 0x04, 0x10, 0x17})
 
 _FIFO = 0x18

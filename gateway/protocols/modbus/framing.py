@@ -43,6 +43,13 @@ class Framer(ABC):
         self.late_bytes = 0
         self.noise_bytes = 0
         self.foreign_frames = 0
+        self.strays: dict[int, int] = {}
+        """Units whose reply came while another one was awaited or none at all, and when that was, in ns; 0: just now."""
+
+    def _stray(self, unit: int, pdu: bytes | bytearray, now_ns: int) -> None:
+        """Note a frame of `unit` that nothing awaited. A gateway's 0A or 0B is no sign of life of the unit itself."""
+        if not (len(pdu) >= 2 and pdu[0] & 0x80 and pdu[1] in (0x0A, 0x0B)):
+            self.strays[unit] = now_ns
 
     @abstractmethod
     def wire_length(self, pdu_length: int) -> int:

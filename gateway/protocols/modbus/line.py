@@ -107,6 +107,10 @@ class LineSilence:
             self._end(max(now_ns, sent_ns), max(timeout_ns, self.longest_latency_ns, self._settle_ns))
             self._before_quarantine = self.longest_latency_ns, self._required_ns
 
+    def passed_over(self, now_ns: int) -> None:
+        """Nothing came from a unit that is not asked again before its reply can no longer come: others may use the line."""
+        self._end(now_ns, self._t35_ns)
+
     def broadcast(self, sent_ns: int) -> None:
         """Nobody answers; the units get time to execute."""
         self._end(sent_ns, self._t35_ns)

@@ -64,6 +64,7 @@ class MbapFramer(Framer):
                 self._awaiting = False
                 self._drop_rest()
                 return bytes(adu[_HEADER.size :])
+            self._stray(unit, adu[_HEADER.size :], now_ns)
             self._seen = f"an ADU with transaction {transaction}, protocol {protocol}, unit {unit}"
             self.foreign_frames += 1
             self.late_bytes += len(adu)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Generic, TypeVar
 
-from gateway.core.errors import Desync, UsageError
+from gateway.core.errors import Desync, UsageError, WrongSize
 from gateway.protocols.modbus.refusals import refusal
 from gateway.protocols.modbus.replies import Reply
 
@@ -90,8 +90,18 @@ def parse_reply(request: Request[R], pdu: bytes, t_ns: int) -> R:
         raise Desync("a reply to another function", expected=f"{function:02X}h", got=f"{pdu[0]:02X}h")
     length = request.reply_length(pdu)
     if length != len(pdu):
-        raise Desync("a reply of the wrong size", expected=describe_length(request), got=short_hex(pdu))
+        raise WrongSize(
+            "a reply of the wrong size",
+            expected=describe_length(request),
+            got=short_hex(pdu),
+            got_bytes=counted_bytes(pdu),
+        )
     return request.decode(pdu, t_ns)
+
+
+def counted_bytes(pdu: bytes) -> int:
+    """The byte count of a read reply PDU whose length agrees with it (AP 6.1 to 6.4), else 0."""
+    return pdu[1] if len(pdu) >= 2 and 1 <= pdu[0] <= 4 and len(pdu) == 2 + pdu[1] else 0
 
 
 def describe_length(request: Request[Reply]) -> str:

@@ -13,11 +13,11 @@ from __future__ import annotations
 from typing import Any
 
 from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError
+from gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError, WrongSize
 from gateway.protocols.modbus.crc import crc16, is_whole, with_crc
 from gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request, short_hex
+from gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request, counted_bytes, short_hex
 
 USB_LATENCY_NS = 20 * NS_PER_MS
 """USB adapters hold bytes back for up to 16 ms (case MB-006): a shorter pause says nothing about the line."""
@@ -62,6 +62,8 @@ class RtuFramer(Framer):
         self._hunted = 0
         self._wrong_header = ""
         self._seen = ""
+        self._late = bytearray()
+        """What came while no reply was awaited, up to one frame."""
 
     def wire_length(self, pdu_length: int) -> int:
         return 1 + pdu_length + 2
@@ -69,6 +71,7 @@ class RtuFramer(Framer):
     def begin(self, unit: int, request: Request[Any]) -> bytes:
         if self._buffer:
             self._skip(len(self._buffer))
+        self._late.clear()
         self._request = request
         self._unit = unit
         self._sent = with_crc(bytes([unit]) + request.encode())
@@ -101,6 +104,11 @@ class RtuFramer(Framer):
             self._echo_due = False
             data = data[len(self._sent) :]
         self.late_bytes += len(data)
+        self._late += data
+        if MIN_FRAME <= len(self._late) <= MAX_FRAME and crc16(self._late) == 0:
+            self._stray(self._late[0], self._late[1:], 0)
+            self._late.clear()
+        del self._late[MAX_FRAME + 1 :]
 
     def overdue(self, waited_s: float) -> WireError:
         if self._wrong_header:
@@ -221,7 +229,10 @@ class RtuFramer(Framer):
         expected = self._expectation()
         self._end(size)
         hint = "the line echoes what is sent: say so in its settings" if frame == self._sent else ""
-        raise Desync("a frame that answers another request", expected=expected, got=short_hex(frame), hint=hint)
+        other = "a frame that answers another request"
+        if frame[1] == request.function and (carried := counted_bytes(frame[1:-2])):
+            raise WrongSize(other, expected=expected, got=short_hex(frame), hint=hint, got_bytes=carried)
+        raise Desync(other, expected=expected, got=short_hex(frame), hint=hint)
 
     def _strip_echo(self) -> bool:
         """Remove our own request from the front; False while it is incomplete."""
@@ -254,6 +265,7 @@ class RtuFramer(Framer):
 
     def _drop_foreign(self, size: int) -> None:
         self._seen = f"a frame of unit {self._buffer[0]}"
+        self._stray(self._buffer[0], self._buffer[1:size], self._last_ns)
         self.foreign_frames += 1
         self._skip(size)
         if self._strict:

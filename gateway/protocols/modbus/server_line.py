@@ -1,19 +1,24 @@
 """Modbus RTU requests, heard by a slave on a line that it may share: bytes and times in, requests out.
 
 A frame is told by length and check sum; other slaves' requests and replies are stepped over as wholes. What is neither is
-dropped byte by byte, at the latest when the line has been silent for `gap_ns` (cases MB-004, MB-030, MB-034). Nothing here
-knows ports, or which units are ours.
+dropped byte by byte, at the latest when the line has been silent for `gap_ns` (cases MB-004, MB-030, MB-034). In a flood of
+garbage, only requests to the units of interest are looked for. Nothing here knows ports.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from gateway.core.clock import NS_PER_MS
 from gateway.protocols.modbus.crc import crc16, with_crc
-from gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
+from gateway.protocols.modbus.frame_shapes import KNOWN_FUNCTIONS, MAX_FRAME, MIN_FRAME, frame_lengths
 
 _LAST_UNIT = 247
+LOST_AFTER = 4 * MAX_FRAME
+"""Bytes of noise in a row after which only requests to the units of interest are looked for, of functions that tell their
+length, until there is one or the line is silent. So a flood is cleared several times faster than it could be parsed."""
 _USB_LATENCY_NS = 20 * NS_PER_MS  # adapters hold bytes back for up to 16 ms (case MB-006)
 
 
@@ -30,20 +35,29 @@ class LineRequest:
 
 
 class RtuRequests:
-    """The frames on a line whose characters take `char_time_ns`. Never keeps more than `MAX_FRAME` bytes for long."""
+    """The frames on a line whose characters take `char_time_ns`. Never keeps more than `MAX_FRAME` bytes for long.
 
-    def __init__(self, char_time_ns: int) -> None:
+    `units`: those whose requests are of interest. All frames are returned all the same, except in a flood.
+    """
+
+    def __init__(self, char_time_ns: int, units: Collection[int] = range(_LAST_UNIT + 1)) -> None:
         # SL 2.5.1.1: fixed above 19200 bit/s, where 3.5 characters of 11 bits would be shorter.
         self.t35_ns = max(char_time_ns * 7 // 2, 1_750_000)
         self.gap_ns = max(self.t35_ns, _USB_LATENCY_NS)
         self.frames = 0
         self.noise_bytes = 0
         self._buffer = bytearray()
+        self._noise_run = 0
+        self._since_pause = bytearray()  # what was dropped since the last frame or silence, MAX_FRAME bytes at most
+        self._units = frozenset(units)
+        heads = b"".join(re.escape(bytes([unit])) for unit in sorted(units))
+        functions = b"".join(re.escape(bytes([function])) for function in sorted(KNOWN_FUNCTIONS))
+        self._ours = re.compile(b"[" + heads + b"][" + functions + b"]", re.DOTALL) if heads else None
 
     @property
     def pending(self) -> bool:
         """Whether an unfinished frame waits for more bytes, or for a silence of `gap_ns`."""
-        return bool(self._buffer)
+        return bool(self._buffer) or bool(self._since_pause)
 
     def feed(self, data: bytes) -> list[LineRequest]:
         """Take what arrived; the whole frames in it, in order."""
@@ -51,25 +65,60 @@ class RtuRequests:
         return self._scan(silent=False)
 
     def silence(self) -> list[LineRequest]:
-        """The line was silent for `gap_ns`: what is incomplete stays so. As `feed`."""
-        return self._scan(silent=True)
+        """The line was silent for `gap_ns`: what is incomplete stays so. As `feed`.
+
+        All bytes since the last frame or silence are one request of a wrong length if they are addressed to one of `units` and
+        their check sum is right: the device that is asked refuses it (AP 7, exception 03).
+        """
+        whole = bytes(self._since_pause + self._buffer)
+        found = self._scan(silent=True)
+        self._noise_run = 0
+        self._since_pause.clear()
+        if not found and self._is_whole_request(whole):
+            self.noise_bytes -= len(whole)
+            self.frames += 1
+            return [LineRequest(whole[0], whole[1:-2])]
+        return found
+
+    def _is_whole_request(self, data: bytes) -> bool:
+        if not MIN_FRAME <= len(data) <= MAX_FRAME or data[0] not in self._units or data[1] not in KNOWN_FUNCTIONS:
+            return False
+        return crc16(data) == 0
 
     def _scan(self, silent: bool) -> list[LineRequest]:
         found: list[LineRequest] = []
         buffer = self._buffer
         while buffer:
+            if self._noise_run >= LOST_AFTER and not self._find_ours(silent):
+                return found
             lengths, more = frame_lengths(buffer) if len(buffer) > 1 else ([], True)
             size = self._whole(lengths) or self._unknown(lengths, more, silent)
             if size:
                 found.append(LineRequest(buffer[0], bytes(buffer[1 : size - 2])))
                 self.frames += 1
+                self._noise_run = 0
+                self._since_pause.clear()
                 del buffer[:size]
             elif self._may_grow(lengths, more) and not silent:
                 return found
             else:
-                self.noise_bytes += 1
-                del buffer[:1]
+                self._drop(1)
         return found
+
+    def _find_ours(self, silent: bool) -> bool:
+        """Drop what precedes the next place where a request of interest may begin; False where there is none."""
+        match = self._ours.search(self._buffer) if self._ours is not None else None
+        if match is not None:
+            self._drop(match.start())
+            return True
+        self._drop(len(self._buffer) - (not silent))  # the last byte may be a unit id
+        return False
+
+    def _drop(self, count: int) -> None:
+        self.noise_bytes += count
+        self._noise_run += count
+        self._since_pause += self._buffer[: min(count, MAX_FRAME + 1 - len(self._since_pause))]
+        del self._buffer[:count]
 
     def _whole(self, lengths: list[int]) -> int:
         for size in lengths:

@@ -40,6 +40,11 @@ class MbapRequests:
         self.desync = ""
         """Why the stream makes no sense any more; empty while it does."""
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether a request has begun and is not complete."""
+        return bool(self._buffer)
+
     def feed(self, data: bytes) -> list[TcpRequest]:
         """Take what arrived; the whole requests in it, in order."""
         if self.desync:

@@ -1,0 +1,234 @@
+#!/usr/bin/env python3
+"""31 units on a serial line at 19200 8N1, 30 of them silent: how many of its polls does the unit that answers keep?
+
+    benchmarks/dead_units.py [--runs 1] [--seconds 150] [--quick]
+
+A process models the line and the one unit on a pty, on the wall clock: the characters of request and reply, 5 ms of the
+unit's own, silence for all other units. It notes when it hears which unit asked for. Every unit is to be polled for one register
+every 500 ms, with a timeout of 1 s and one repetition: first by our gateway (a process of its own), then by pymodbus's async
+client in a loop that asks the units in turn, begins a round every 500 ms, and begins it at once when the last one took longer.
+The figure is the share of the live unit's polls that took place in the worst minute, from the first request on.
+
+Exit status 1 when the goal is missed, 2 without pymodbus, 3 when the host took so much time away from this machine (steal) that
+the figures say nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import multiprocessing
+import os
+import pty
+import sys
+import tempfile
+import time
+import tty
+from importlib.util import find_spec
+from multiprocessing.connection import Connection
+from pathlib import Path
+from statistics import median
+
+import msgspec
+from peers import Goals, python, ratio
+
+from emulators.wires.serial_line import SerialPacer
+from fieldtwin.running.children import Child
+from gateway.core.endpoint import Endpoint, SerialSettings
+from gateway.protocols.modbus.crc import with_crc
+from twin.controller import ControllerConfig
+from twin.mapping import mapping_to_json
+from twin.physical import image_layout, make_image
+from twin.system import load_system
+
+UNITS, LIVE, PERIOD_S, WINDOW_S, GOAL = 31, 7, 0.5, 60.0, 0.95
+LINE, LATENCY_S = SerialSettings(19200, "8N1"), 0.005
+PLANT = "rtu:/dev/ttyBENCH?baudrate=19200&frame=8N1"
+MOST_STEAL = 0.10
+REQUEST = 8
+REPLY = with_crc(bytes((LIVE, 3, 2, 0, 42)))
+PROFILE = """
+device: benchmark/level
+source: "made for a benchmark: one register"
+protocol: modbus
+numbering: sent
+tags:
+  level: {at: "holding:0", poll: level}
+"""
+PROGRAM = """
+from plc.program import Program
+
+class Idle(Program):
+    def execute(self, scan):
+        pass
+"""
+PEER = """
+import asyncio, logging, sys
+from pymodbus.client import AsyncModbusSerialClient
+from pymodbus.exceptions import ModbusException
+logging.disable(logging.CRITICAL)
+
+async def main(port, units, period_s):
+    client = AsyncModbusSerialClient(port, baudrate=19200, parity="N", timeout=1.0, retries=1)
+    await client.connect()
+    loop = asyncio.get_running_loop()
+    due = loop.time()
+    while True:
+        for unit in range(1, units + 1):
+            try:
+                if not client.connected:
+                    await client.connect()
+                await client.read_holding_registers(0, count=1, device_id=unit)
+            except ModbusException:
+                pass
+        due = max(due + period_s, loop.time())
+        await asyncio.sleep(due - loop.time())
+
+asyncio.run(main(sys.argv[1], int(sys.argv[2]), float(sys.argv[3])))
+"""
+
+
+def line_with_one_unit(fd: int, heard: Connection) -> None:
+    """Answer the live unit; send the time and the unit of every request to `heard`."""
+    pacer, pending = SerialPacer(LINE), b""
+    pause_s = (pacer.duration_ns(REQUEST) + pacer.duration_ns(len(REPLY))) / 1e9 + LATENCY_S
+    while True:
+        pending += os.read(fd, 256)
+        while len(pending) >= REQUEST:
+            unit, pending = pending[0], pending[REQUEST:]
+            heard.send((time.monotonic(), unit))
+            if unit == LIVE:
+                time.sleep(pause_s)
+                os.write(fd, REPLY)
+
+
+def system_file(folder: Path) -> Path:
+    """The system of 31 devices on a serial line."""
+    (folder / "idle_program.py").write_text(PROGRAM)
+    (folder / "level.yaml").write_text(PROFILE)
+    poll = {"level": {"every_ms": round(PERIOD_S * 1000)}}
+    system = {
+        "fieldtwin": 1,
+        "system": "many",
+        "buses": {"line": {"url": PLANT, "timeout_ms": 1000, "retries": 1}},
+        "devices": {
+            f"d{unit}": {"profile": "level.yaml", "bus": "line", "unit": unit, "poll": poll}
+            for unit in range(1, UNITS + 1)
+        },
+        "plc": {"cycle_ms": 1000, "programs": {"idle": {"source": "python: idle_program:Idle"}}},
+    }
+    (folder / "many.yaml").write_bytes(msgspec.json.format(msgspec.json.encode(system)))
+    return folder / "many.yaml"
+
+
+async def our_polls(port: str, seconds: float) -> None:
+    """Let our gateway poll for so long."""
+    with tempfile.TemporaryDirectory(prefix="ft-dead-") as name:
+        folder = Path(name)
+        path = system_file(folder)
+        make_image(image_layout(load_system(str(path))), folder / "image")
+        mapping = mapping_to_json({Endpoint.parse(PLANT): Endpoint.parse(PLANT.replace("/dev/ttyBENCH", port))})
+        config = folder / "gateway.json"
+        config.write_bytes(msgspec.json.encode(ControllerConfig(str(path), str(folder), False, mapping)))
+        gateway = Child("gateway", "twin.controller", config, folder)
+        try:
+            control = await gateway.connect()
+            await asyncio.sleep(seconds)
+            failure = gateway.failure()
+            assert not failure, failure
+            await control.aclose()
+        finally:
+            await gateway.end(5.0)
+
+
+async def peer_polls(port: str, seconds: float) -> None:
+    """Let pymodbus poll for so long."""
+    process = await asyncio.create_subprocess_exec(python(), "-c", PEER, port, str(UNITS), str(PERIOD_S))
+    try:
+        await asyncio.sleep(seconds)
+        assert process.returncode is None, process.returncode
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.wait()
+
+
+def worst_minute(times: list[float], first: float, seconds: float) -> float:
+    """The lowest share of the polls due in any window of one minute that begins on a tenth of a second."""
+    shares = []
+    for tenth in range(int((seconds - WINDOW_S) * 10) + 1):
+        start = first + tenth / 10
+        shares.append(sum(start <= t < start + WINDOW_S for t in times) / (WINDOW_S / PERIOD_S))
+    return min(shares)
+
+
+def measure(name: str, seconds: float) -> tuple[float, float]:
+    """The share of its polls that the live unit keeps, in its worst minute and altogether."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    field = multiprocessing.get_context("fork").Process(target=line_with_one_unit, args=(master, theirs), daemon=True)
+    field.start()
+    heard: list[tuple[float, int]] = []
+    try:
+        polls = our_polls if name == "fieldtwin" else peer_polls
+
+        async def listening() -> None:
+            loop = asyncio.get_running_loop()
+            loop.add_reader(ours.fileno(), lambda: heard.append(ours.recv()))
+            await polls(os.ttyname(slave), seconds + 5.0)
+            loop.remove_reader(ours.fileno())
+
+        asyncio.run(listening())
+    finally:
+        field.terminate()
+        field.join()
+        for fd in (master, slave):
+            os.close(fd)
+    assert heard, f"{name} sent nothing"
+    first = heard[0][0]
+    times = [t for t, unit in heard if unit == LIVE and t < first + seconds]
+    return worst_minute(times, first, seconds), len(times) / (seconds / PERIOD_S)
+
+
+def cpu_ticks() -> tuple[int, int]:
+    """Stolen and all CPU time so far, in clock ticks."""
+    ticks = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
+    return ticks[7], sum(ticks)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=150.0, help="at least 60")
+    parser.add_argument("--quick", action="store_true", help="one run of one minute")
+    options = parser.parse_args()
+    runs, seconds = (1, WINDOW_S) if options.quick else (options.runs, max(options.seconds, WINDOW_S))
+    if find_spec("pymodbus") is None:
+        print("pymodbus is not installed: no comparison")
+        return 2
+    worst: dict[str, list[float]] = {"fieldtwin": [], "pymodbus": []}
+    whole: dict[str, list[float]] = {name: [] for name in worst}
+    before = cpu_ticks()
+    for _ in range(runs):
+        for name in worst:
+            least, all_of_it = measure(name, seconds)
+            worst[name].append(least)
+            whole[name].append(all_of_it)
+    stolen, spent = (b - a for a, b in zip(before, cpu_ticks(), strict=True))
+    print(f"polls of the live unit that took place   worst minute   in {seconds:.0f} s   (medians of {runs})")
+    for name in worst:
+        print(f"  {name:<40} {median(worst[name]):>10.1%} {median(whole[name]):>10.1%}")
+    print(f"  {'ratio':<40} {'':>10} {ratio(whole['fieldtwin'], whole['pymodbus']):>10.1f}")
+    steal = stolen / max(spent, 1)
+    print(f"  load {os.getloadavg()[0]:.1f} on {os.cpu_count()} CPUs, steal {steal:.1%}\n")
+    if steal > MOST_STEAL:
+        print(f"INCONCLUSIVE: the host took {steal:.0%} of the CPU time away (at most {MOST_STEAL:.0%})")
+        return 3
+    goals = Goals()
+    goals.least("share of the live unit's polls in the worst minute", median(worst["fieldtwin"]), GOAL)
+    return goals.verdict()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

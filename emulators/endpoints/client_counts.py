@@ -1,0 +1,80 @@
+"""Which client of an emulated bus sent how many requests, and how many of them were answered.
+
+A prototype run compares what its gateway sent with what its emulators took. A third party that reads an emulator is no fault of
+either, so that its traffic is counted apart, by the address that it connects from. It must never know protocols.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+MOST_CLIENTS = 1024
+"""Addresses that are remembered beside those of open connections; the counts of older ones are kept as a sum."""
+OLDER = "older clients"
+
+
+@dataclass(slots=True)
+class Counts:
+    """Requests that reached a device, and the replies to them. `open`: the client is connected, and is not forgotten."""
+
+    requests: int = 0
+    replies: int = 0
+    open: bool = False
+
+
+class ClientCounts:
+    """The counts of one bus, by client: ``HOST:PORT`` as the emulator sees it."""
+
+    def __init__(self) -> None:
+        self._by_client: dict[str, Counts] = {}
+
+    def of(self, client: str) -> Counts:
+        """The counts of a client, to be added to. The same object as long as the client is remembered."""
+        found = self._by_client.get(client)
+        if found is None:
+            self._forget_oldest()
+            found = self._by_client[client] = Counts()
+        return found
+
+    def add(self, client: str, requests: int, replies: int) -> None:
+        """Count for a client."""
+        counts = self.of(client)
+        counts.requests += requests
+        counts.replies += replies
+
+    def describe(self) -> dict[str, dict[str, int]]:
+        """JSON-able: by client, its requests and replies."""
+        return {name: {"requests": c.requests, "replies": c.replies} for name, c in self._by_client.items()}
+
+    def _forget_oldest(self) -> None:
+        if len(self._by_client) > MOST_CLIENTS:
+            name = next((name for name, c in self._by_client.items() if name != OLDER and not c.open), None)
+            if name is not None:
+                gone = self._by_client.pop(name)
+                self.add(OLDER, gone.requests, gone.replies)
+
+
+class Difference:
+    """Counts for a client what `totals` grew by since the last call: for a line whose one client changes.
+
+    `totals` returns the requests and replies of all devices on the line so far.
+    """
+
+    def __init__(self, clients: ClientCounts, totals: Callable[[], tuple[int, int]]) -> None:
+        self._clients = clients
+        self._totals = totals
+        self._last = totals()
+        self._client = ""
+
+    def change(self, client: str) -> None:
+        """From now on the line's traffic is that of `client`; empty for no client."""
+        self.settle()
+        self._client = client
+
+    def settle(self) -> None:
+        """Count what came since the last call."""
+        requests, replies = self._totals()
+        if self._client and (requests, replies) != self._last:
+            self._clients.add(self._client, requests - self._last[0], replies - self._last[1])
+        self._last = requests, replies

@@ -1,0 +1,36 @@
+"""A device that answers fewer registers than it was asked for."""
+
+from __future__ import annotations
+
+from random import Random
+
+from pydantic import Field
+
+from emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from emulators.faults.frames import Frame
+from emulators.faults.remake import remade
+
+_BITS = frozenset((1, 2))
+_REGISTERS = frozenset((3, 4, 23))
+
+
+class Form(Parameters):
+    by: int = Field(default=1, ge=1, le=125)
+
+
+class FewerRegisters(WireFault):
+    name = "fewer-registers"
+    summary = (
+        "the reply to a read lacks its last `by` registers (of bits: bytes); its byte count and check sum fit what is left, "
+        "which is one register at least"
+    )
+    form = Form
+
+    def strike(self, frame: Frame, random: Random) -> Outcome:
+        pdu = frame.pdu
+        width = 1 if frame.function in _BITS else 2 if frame.function in _REGISTERS else 0
+        if not width or pdu[0] & 0x80 or len(pdu) < 2 + width:
+            return passed(frame.data)
+        data = pdu[2:]
+        kept = data[: max(width, len(data) - width * self.parameters.by)]
+        return passed(remade(frame, pdu=bytes((pdu[0], len(kept))) + kept))

@@ -1,0 +1,109 @@
+"""How a sweep goes on where asking address by address is too expensive: beyond silence, and with other read lengths.
+
+Every question in silence costs a timeout, so the addresses are sampled, the roundest first, until the time budget is used up.
+Among refusals a device may hold values that it gives only whole, so reads of two and more registers are tried there. Pure, as
+`dump_sweep` is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from fieldtwin.commissioning.coverage import INVALID, READABLE, REFUSED, coarse_to_fine
+from fieldtwin.commissioning.dump_sweep import ROUND, Asking, Sweep
+
+LEVELS = ((1000, 4096), (500, 1024), (100, 256), (ROUND, 64), (16,))
+"""Where manuals begin blocks, the likeliest first."""
+SILENT_AGAIN = 3
+"""After so many questions in a row without a reply, a block that was found in silence has ended."""
+LENGTHS = (1, 2, 4, 8, 16, 32)
+"""Registers in a read that looks for values that the device gives only whole."""
+
+
+def beyond_silence(sweep: Sweep) -> Asking:
+    """Sample the addresses of `sweep` that the device has not answered for. Where it answers, ask on from there."""
+    span, known = sweep.span, sweep.coverage
+    sweep.most_silent = SILENT_AGAIN
+    for at in coarse_to_fine(span.address, span.end, sweep.stride, LEVELS):
+        if sweep.found.stopped:
+            return
+        if known.states[at] or known.is_sampled(at):
+            continue
+        grain = sweep.found.grain
+        lengths = (1, 2) if sweep.in_words and grain == 1 and not sweep.singles else (grain,)
+        for count in lengths:
+            if at + count <= span.end and not known.is_definite(at):
+                sweep.patient = False
+                if not (yield from sweep.ask(at, count)) and (unit := (yield from sweep.ask_the_length_that_came(at))):
+                    yield from _extend(sweep, at, unit)
+        if known.is_definite(at):
+            sweep.resume()
+        if known.states[at] == READABLE:
+            yield from sweep.walk((yield from sweep.back_from(at, _last_asked(sweep, at) + 1)))
+        elif known.states[at] == REFUSED:
+            yield from sweep.walk((yield from sweep.through_a_void(at + grain)))
+
+
+def _last_asked(sweep: Sweep, at: int) -> int:
+    """The nearest address below `at` that was asked, or the one before the span."""
+    states = sweep.coverage.states
+    return next((a for a in range(at - 1, sweep.span.address - 1, -1) if states[a]), sweep.span.address - 1)
+
+
+def other_lengths(sweep: Sweep) -> Asking:
+    """Ask for two and more registers at once where single ones were refused. Take down in `found.lengths` the lengths for which
+    that was done everywhere."""
+    if not sweep.in_words:
+        if not sweep.found.stopped:
+            sweep.found.lengths = [1]
+        return
+    sweep.charges_everything = True
+    for length in LENGTHS:
+        for at in _places(sweep, length):
+            if sweep.found.stopped:
+                return
+            if (at, length) in sweep.asked or not _may_hide(sweep, at, length):
+                continue
+            if (yield from sweep.ask(at, length)):
+                yield from _extend(sweep, at, length)
+        sweep.found.lengths.append(length)
+
+
+def _places(sweep: Sweep, length: int) -> Iterator[int]:
+    """Where a read of `length` may be the first of a block. Pairs are asked for in both alignments."""
+    span = sweep.span
+    states = sweep.coverage.states
+    near = [a for a in range(span.address, span.end) if states[a] in (REFUSED, INVALID)]
+    beside = {a for start, end in sweep.found.readable for a in (start - 1, end)} if length == 1 else set()
+    near = [a for a in near if (a, 1) in sweep.asked or (a, 2) in sweep.asked or a in beside]
+    if length > 4:
+        near = [a for a in near if a % length == 0 or a % ROUND == 0]
+    for at in near:
+        yield at
+        if length == 2 and at > span.address:
+            yield at - 1
+
+
+def _may_hide(sweep: Sweep, at: int, length: int) -> bool:
+    """Whether `length` registers at `at` could be one value: none was readable, and the device is not silent there."""
+    if at + length > sweep.span.end:
+        return False
+    states = sweep.coverage.states
+    return READABLE not in states[at : at + length] and (sweep.coverage.is_sampled(at) or states[at] == INVALID)
+
+
+def _extend(sweep: Sweep, at: int, length: int) -> Asking:
+    """A read of `length` registers at `at` was taken where shorter ones were not: find the neighbours of the same kind."""
+    low, high = at, at + length
+    while high + length <= sweep.span.end and sweep.coverage.states[high] != READABLE:
+        if not (yield from sweep.ask(high, length)):
+            break
+        high += length
+    while low - length >= sweep.span.address and sweep.coverage.states[low - 1] != READABLE:
+        if not (yield from sweep.ask(low - length, length)):
+            break
+        low -= length
+    if length > 1:
+        sweep.found.add_unit(low, high, length)
+    if high - low > length and not (yield from sweep.ask(low, 2 * length)):
+        sweep.found.borders += range(low + length, high, length)

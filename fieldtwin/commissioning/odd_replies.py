@@ -1,0 +1,44 @@
+"""Replies of a scan that do not fit its question, and what may cause them on a serial line and on TCP. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from gateway.core.endpoint import SerialSettings
+from gateway.core.errors import ModbusExceptionReply
+
+
+@dataclass(frozen=True, slots=True)
+class OddReply:
+    """The same reply that does not fit the question, from one unit or from many. `pdu` is empty where it was no whole frame."""
+
+    units: tuple[int, ...]
+    settings: SerialSettings | None
+    pdu: bytes
+
+    @property
+    def advice(self) -> str:
+        """What the reply is, and what may cause it on a wire of this kind."""
+        if not self.pdu:
+            if self.settings is not None:
+                return "damaged each time: two devices with one unit id, or a bad line"
+            return "no Modbus frame: another protocol or framing at this port, or a faulty server"
+        said = f"a reply that does not fit the question ({self.pdu[:16].hex(' ').upper()})"
+        if self.pdu[0] & 0x80 and len(self.pdu) == 2:
+            code = self.pdu[1]
+            name = ModbusExceptionReply.NAMES.get(code, "vendor specific")
+            said += f": exception {code:02X}, {name}, for function {self.pdu[0] & 0x7F:02X}, which was not asked for"
+        if self.settings is not None:
+            return f"{said}; two devices with one unit id, or a faulty device"
+        return f"{said}; some servers answer so for unit ids that they do not have"
+
+
+def gathered(
+    known: Sequence[OddReply], damaged: Mapping[int, bytes], settings: SerialSettings | None
+) -> list[OddReply]:
+    """`known` and the replies `damaged` (unit -> PDU) heard at `settings`; the same reply from many units is one finding."""
+    found = {(odd.settings, odd.pdu): set(odd.units) for odd in known}
+    for unit, pdu in damaged.items():
+        found.setdefault((settings, pdu), set()).add(unit)
+    return [OddReply(tuple(sorted(units)), at, pdu) for (at, pdu), units in found.items()]

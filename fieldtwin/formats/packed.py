@@ -1,0 +1,70 @@
+"""Unpack gzip and bzip2 files, up to a limit: a few kilobytes of either can stand for gigabytes.
+
+Memory is no concern, because what is unpacked is read in pieces. Time is: without a limit, reading takes as long as the packed
+file wants it to take.
+"""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import io
+import os
+from pathlib import Path
+from typing import BinaryIO
+
+from gateway.core.errors import FileInvalid
+
+FREE_BYTES = 64 * 1024 * 1024
+"""So much any packed file may hold."""
+MOST_TIMES = 100
+"""A larger one may hold this many times its own size. Real captures and casts stay below 50 times."""
+
+
+def most_unpacked(packed_bytes: int) -> int:
+    """Return how many bytes a packed file of this size may hold."""
+    return max(FREE_BYTES, MOST_TIMES * packed_bytes)
+
+
+def too_much(path: Path, packed_bytes: int) -> FileInvalid:
+    """Return the error for a packed file that holds more than `most_unpacked` allows."""
+    expected = f"at most {most_unpacked(packed_bytes)} bytes ({FREE_BYTES >> 20} MiB, or {MOST_TIMES} times its size)"
+    hint = "if the file is yours, unpack it and give the unpacked file"
+    return FileInvalid("the packed file holds too much", path=str(path), expected=expected, hint=hint)
+
+
+def unpacked(raw: io.BufferedReader, path: Path) -> BinaryIO | None:
+    """Return a reader of what `raw` holds, by its first bytes; None if it is neither gzip nor bzip2.
+
+    The reader raises `FileInvalid` beyond `most_unpacked`, and `OSError`, `EOFError` or `zlib.error` if the data is damaged.
+    """
+    magic = raw.peek(3)[:3]
+    if magic[:2] == b"\x1f\x8b":
+        return io.BufferedReader(_Limited(gzip.GzipFile(fileobj=raw), raw, path))
+    if magic == b"BZh":
+        return io.BufferedReader(_Limited(bz2.BZ2File(raw), raw, path))
+    return None
+
+
+class _Limited(io.RawIOBase):
+    """The unpacked bytes, counted."""
+
+    def __init__(self, packed: gzip.GzipFile | bz2.BZ2File, raw: io.BufferedReader, path: Path) -> None:
+        self._packed, self._path = packed, path
+        self._size = os.fstat(raw.fileno()).st_size
+        self._left = most_unpacked(self._size)
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        data = self._packed.read1(len(buffer))
+        self._left -= len(data)
+        if self._left < 0:
+            raise too_much(self._path, self._size)
+        buffer[: len(data)] = data
+        return len(data)
+
+    def close(self) -> None:
+        self._packed.close()
+        super().close()

@@ -1,0 +1,64 @@
+"""Which simulated field side `--target compose` means where the user named none.
+
+In this order: FIELDTWIN_CONTROL (the judge runs under `fieldtwin with`), the field side in the instance's own run directory, the
+only field side of this system that runs on this host alone (`fieldtwin with`, `fieldtwin emulate`), and the host `field` of the
+compose file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from gateway.core.control import ControlClient
+from gateway.core.errors import FieldtwinError, UsageError
+from twin.system import System
+
+DEFAULT_HOST = "field"
+MOST_LOOKED_AT = 200
+"""Run directories."""
+
+
+async def find_field(system: System, run_dir: Path, environ: Mapping[str, str] = os.environ) -> tuple[str, Path | None]:
+    """``HOST`` and no path, or an empty host and the path of a Unix socket. Raises `UsageError` where there are several."""
+    if said := environ.get("FIELDTWIN_CONTROL"):
+        return "", Path(said)
+    own = run_dir / "field.sock"
+    if own.exists():
+        return "", own
+    if not (run_dir / "gateway.sock").exists():
+        found = [path for path in _sockets(run_dir.parent) if await _is_of(path, system)]
+        if len(found) > 1:
+            raise UsageError(
+                f"several field sides of {system.name!r} run on this host",
+                expected="--instance with one of " + ", ".join(path.parent.name for path in found),
+            )
+        if found:
+            return "", found[0]
+    return DEFAULT_HOST, None
+
+
+def _sockets(root: Path) -> list[Path]:
+    """Control channels of field sides without a gateway of ours beside them."""
+    try:
+        homes = sorted(root.iterdir())[:MOST_LOOKED_AT]
+    except OSError:
+        return []
+    return [
+        home / "field.sock" for home in homes if (home / "field.sock").exists() and not (home / "gateway.sock").exists()
+    ]
+
+
+async def _is_of(path: Path, system: System) -> bool:
+    """Whether a field side answers there that simulates the devices of exactly this system file."""
+    try:
+        client = await ControlClient.connect_unix(path)
+    except FieldtwinError:
+        return False  # its process was killed
+    try:
+        return bool((await client.call("get"))["system_hash"] == system.hash)
+    except FieldtwinError:
+        return False
+    finally:
+        await client.aclose()

@@ -1,0 +1,97 @@
+"""A judge's lease on the simulated field devices, held on behalf of one scenario (`twin.field_leases` is the other side).
+
+What the scenario puts in is taken out when the lease ends: at once at the end of the scenario, and `LEASE_S` seconds after the
+last renewal where the judge died.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import socket
+from contextlib import suppress
+from typing import Any
+
+from fieldtwin.scenarios.bench import NothingKnown
+from gateway.core.control import ControlClient, RemoteError
+from gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from twin.field_leases import LEASE_S
+
+RENEW_EVERY_S = 2.0
+OPEN_WITHIN_S = 2 * LEASE_S
+"""A judge that was killed left its lease: the next judge waits until that has expired."""
+TRY_EVERY_S = 0.2
+FRESH_TIMEOUT_S = 30.0
+
+
+class LeaseLost(NothingKnown):
+    """The lease ended before its scenario: what the scenario had put in was taken out meanwhile, so nothing can be judged."""
+
+
+class FieldLease:
+    """``await open()``, then `run` it as a task, and ``await release()`` at the end. `client` is a connection of its own."""
+
+    def __init__(self, client: ControlClient) -> None:
+        self.id = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
+        self.lost: LeaseLost | None = None
+        self.before = ""
+        """What was in when the lease was opened, in words: not by this scenario."""
+        self._client = client
+        self._life = ""
+
+    async def open(self) -> None:
+        """Open it; another judge's lease is waited for, `OPEN_WITHIN_S` seconds. Raises `Unreachable` after that."""
+        loop = asyncio.get_running_loop()
+        deadline_s = loop.time() + OPEN_WITHIN_S
+        while True:
+            try:
+                answer = await self._client.call("lease", id=self.id, for_s=LEASE_S)
+            except RemoteError as e:
+                if e.kind != "LeaseTaken":
+                    raise
+                if loop.time() > deadline_s:
+                    raise Unreachable(str(e)) from e
+                await asyncio.sleep(TRY_EVERY_S)
+                continue
+            self._life = answer["life"]
+            said = [f"the fault {fault['id']!r} ({fault['name']})" for fault in answer["faults"]]
+            said += [f"{name} set to {value:g}" for name, value in answer["set"].items()]
+            self.before = ", ".join(said)
+            return
+
+    async def run(self) -> None:
+        """Renew it until cancelled, or until it is lost: `lost` says why then."""
+        while self.lost is None:
+            await asyncio.sleep(RENEW_EVERY_S)
+            try:
+                answer = await self._client.call("lease", id=self.id, for_s=LEASE_S, renew=True)
+                if answer["life"] != self._life:
+                    self.lost = LeaseLost("the simulated field devices were made anew by someone else meanwhile")
+            except RemoteError as e:
+                self.lost = LeaseLost(str(e))
+            except FieldtwinError as e:
+                self.lost = LeaseLost(f"the simulated field devices cannot be reached: {e}")
+
+    async def call(self, verb: str, **args: Any) -> Any:
+        """`fault` and `set` under this lease. Raises `LeaseLost`; `UsageError` for what makes no sense."""
+        try:
+            return await self._client.call(verb, lease=self.id, **args)
+        except RemoteError as e:
+            if e.kind == "LeaseEnded":
+                self.lost = LeaseLost(str(e))
+                raise self.lost from e
+            if e.remote_exit_code == UsageError.exit_code:
+                raise UsageError(str(e)) from e
+            raise
+
+    async def fresh(self) -> int:
+        """Every device from its beginning; when that was done, ns on the host's monotonic clock."""
+        answer = await self._client.call("fresh", FRESH_TIMEOUT_S, lease=self.id)
+        self._life, self.before = answer["life"], ""
+        return int(answer["now_ns"])
+
+    async def release(self) -> None:
+        """End it. Where the field side cannot be reached, it ends by itself."""
+        with suppress(FieldtwinError):
+            await self._client.call("lease", id=self.id, release=True)

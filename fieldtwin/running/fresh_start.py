@@ -1,0 +1,76 @@
+"""`start: fresh` on a system that runs already: PLC, simulations and devices begin anew, and no container is restarted.
+
+The order matters. The PLC forgets everything first and stays paused, so that no scan sees what the old devices said and no output
+of the old run reaches a new device. Then the devices are made anew, the gateway reads all of them, and the PLC goes on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from fieldtwin.running.field_lease import FieldLease
+from gateway.core.control import ControlClient
+from gateway.core.errors import ReplyTimeout
+
+BY = "fieldtwin test, start: fresh"
+WITHIN_S = 60.0
+"""The gateway looks for a device that does not answer less and less often; a busy host starts slowly."""
+SCANS_WITHIN_S = 10.0
+LOOK_EVERY_S = 0.05
+
+
+async def make_fresh(lease: FieldLease, gateway: ControlClient, plc: ControlClient) -> None:
+    """Return when the PLC runs from its beginning on values of the new devices. Forces are removed; retained values too.
+
+    Raises `ReplyTimeout` where a simulated device is not back within `WITHIN_S` seconds. The PLC is not left paused.
+    """
+    await plc.call("pause", by=BY)
+    try:
+        await plc.call("unforce", all=True, by=BY)
+        await plc.call("restart", cold=True, by=BY)
+        made_ns = await lease.fresh()
+        await _all_read(gateway, made_ns)
+        await plc.call("restart", cold=True, by=BY)  # what it was shown while it was paused is forgotten as well
+    finally:
+        await plc.call("go", by=BY)
+    await programs_scan(plc)
+
+
+async def programs_scan(plc: ControlClient) -> None:
+    """Wait until the programs have had the inputs that they need before their first scan, at most `SCANS_WITHIN_S` seconds.
+
+    A program that waits longer than that is a matter of the scenario.
+    """
+    loop = asyncio.get_running_loop()
+    deadline_s = loop.time() + SCANS_WITHIN_S
+    while (await plc.call("get", brief=True))["state"] in ("ready", "paused", "waiting") and loop.time() < deadline_s:
+        await asyncio.sleep(LOOK_EVERY_S)
+
+
+async def _all_read(gateway: ControlClient, since_ns: int) -> None:
+    """Until the gateway has read every device after `since_ns`, on the host's monotonic clock."""
+    loop = asyncio.get_running_loop()
+    deadline_s = loop.time() + WITHIN_S
+    while missing := await _not_read(gateway, since_ns):
+        if loop.time() > deadline_s:
+            raise ReplyTimeout(
+                f"no fresh start: the gateway has not read {', '.join(missing)} within {WITHIN_S:g} s after the devices "
+                "were made anew"
+            )
+        await asyncio.sleep(LOOK_EVERY_S)
+
+
+async def _not_read(gateway: ControlClient, since_ns: int) -> list[str]:
+    """The devices that are not online, or of which every value is older than that."""
+    status: dict[str, Any] = await gateway.call("get")
+    tags = (await gateway.call("watch", names=list(status["tags"])))["tags"]
+    newest: dict[str, int] = {}
+    for name, (value, _, _, t_ns) in tags.items():
+        device = name.partition(".")[0]
+        newest[device] = max(newest.get(device, 0), t_ns if value is not None else 0)
+    return [
+        name
+        for name, device in status["devices"].items()
+        if not device["online"] or (newest.get(name) and newest[name] < since_ns)
+    ]

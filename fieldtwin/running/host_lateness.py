@@ -1,0 +1,44 @@
+"""How late things were while a judge waited for a system on the same host. Times are in seconds since the scenario's start.
+
+Two measures that must not be mixed. *Own* lateness is the time by which a sleep of the judge ended too late: the host did not
+serve the judge, and nothing of the system under test has a part in it. *Any* lateness also has answers that took long and scans
+of the PLC that began late: that may be the host, and it may be a gateway that is stuck.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+KEPT = 10_000
+SLACK_S = 0.005
+"""A sleep that ends so much later than asked for is what sleeps do: it is never counted."""
+
+
+class HostLateness:
+    """What was late, the latest `KEPT` of it."""
+
+    def __init__(self) -> None:
+        self._own: deque[tuple[float, float]] = deque(maxlen=KEPT)
+        self._any: deque[tuple[float, float]] = deque(maxlen=KEPT)
+
+    def slept(self, t_s: float, late_s: float) -> None:
+        """A sleep of the judge ended at `t_s`, so much later than asked for."""
+        if late_s > SLACK_S:
+            self._own.append((t_s, late_s - SLACK_S))
+
+    def waited(self, t_s: float, late_s: float) -> None:
+        """A look of the judge ended at `t_s`, or a scan of the PLC began by then, so much later than asked for."""
+        if late_s > SLACK_S:
+            self._any.append((t_s, late_s))
+
+    def longest_s(self, since_s: float) -> float:
+        """The longest single delay of any kind that ended after `since_s`."""
+        return max((late_s for t_s, late_s in self._any if t_s >= since_s), default=0.0)
+
+    def own_s(self, since_s: float) -> float:
+        """All own lateness after `since_s` together. Sleeps do not overlap; what lies before `since_s` is not counted."""
+        return sum(min(late_s, t_s - since_s) for t_s, late_s in self._own if t_s > since_s)
+
+    def any_s(self, since_s: float) -> float:
+        """All lateness of any kind after `since_s` together."""
+        return sum(min(late_s, t_s - since_s) for t_s, late_s in self._any if t_s > since_s)

@@ -1,0 +1,13 @@
+"""How often faults struck, as a field simulator tells it (`twin.fault_history`)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fieldtwin.report.model import Struck
+
+
+def struck_of(told: Mapping[str, Any]) -> Struck:
+    """Return one entry of a field simulator's history."""
+    return Struck(told["id"], told["name"], told["on"], told["struck"], told["optional"])

@@ -1,0 +1,53 @@
+"""The last exchanges on the wire before a check failed, as lines for people: the evidence of a verdict that is not PASSED."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+
+from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.report.model import CheckResult, Verdict
+
+SECONDS = 5
+"""How long before the failed check an exchange may have ended and still be shown."""
+MOST = 10
+"""Exchanges that are shown: the last ones. The first line says how many were left out."""
+_NS = 1_000_000_000
+
+
+def last_exchanges(exchanges: Iterable[Exchange], check: CheckResult, devices: Collection[str]) -> list[str]:
+    """Return what was on the wire in the last `SECONDS` until `check` was decided, a heading first, ordered by request.
+
+    If the check is about `devices`, only their exchanges count. A check that names none of them, or whose devices were silent, is
+    shown with the exchanges of all devices. Values of secret tags stay hidden, as in every decoded text.
+    """
+    at_ns = check.t_ns or 0
+    near = [e for e in exchanges if e.t_ns <= at_ns and e.end_ns >= at_ns - SECONDS * _NS]
+    about = sorted({device for name in check.names if (device := _device_of(name, devices))})
+    of_these = [e for e in near if e.device in about]
+    whose = f" with {', '.join(about)}" if of_these else ""
+    found = sorted(of_these or near, key=lambda e: (e.t_ns, e.end_ns))
+    left_out = len(found) - MOST
+    more = f" ({left_out} earlier exchanges were left out)" if left_out > 0 else ""
+    heading = f"exchanges{whose} in the {SECONDS} s before the failed check{more}:"
+    if not found:
+        return [f"no exchange in the {SECONDS} s before the failed check"]
+    return [heading, *map(line_of, found[-MOST:])]
+
+
+def line_of(exchange: Exchange) -> str:
+    """Return an exchange as ``12.340 s  ctd: read pressure -> ctd: pressure 1.2 dbar``."""
+    at = f"{exchange.t_ns / _NS:.3f} s"
+    if exchange.is_stray:
+        return f"{at}  {exchange.text}"
+    pending = "no reply so far" if exchange.problem == "pending" else ""
+    return f"{at}  {exchange.text} -> {pending or exchange.reply_text or exchange.problem or 'no answer wanted'}"
+
+
+def deciding(checks: Sequence[CheckResult], verdict: Verdict) -> CheckResult | None:
+    """Return the check that gave a scenario its `verdict`, or None where it was not a check: nothing was expected at all."""
+    return next((check for check in checks if check.verdict is verdict and check.t_ns is not None), None)
+
+
+def _device_of(name: str, devices: Collection[str]) -> str:
+    """Return the device that a check's name (DEVICE, DEVICE.TAG or PROGRAM.VARIABLE) belongs to, "" for none."""
+    return next((part for part in (name, name.rpartition(".")[0]) if part in devices), "")

@@ -1,0 +1,97 @@
+"""Values as an electronic data sheet writes them (CiA 306-1, 4.6.3.2): text to a number, a string or bytes.
+
+The `canopen` package reads these texts too, but it passes over octal numbers, limits of real types and signed numbers that are
+written by their bits, and it does not report a value that it cannot read. Pure; knows no section and no node.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+
+from gateway.core.values import Scalar
+from gateway.protocols.canopen.cob_id import NODE_MAX
+from gateway.protocols.canopen.datatypes import DataType, is_signed, size_of
+
+_TEXTS = (DataType.VISIBLE_STRING, DataType.UNICODE_STRING)
+_TIMES = (DataType.TIME_OF_DAY, DataType.TIME_DIFFERENCE)
+_REALS = {DataType.REAL32: "<f", DataType.REAL64: "<d"}
+_OCTAL = re.compile(r"[+-]?0[0-9]+")
+_WITH_NODE_ID = re.compile(r"\$NODEID(?:\+(?P<after>[0-9A-FX]+))?|(?P<before>[0-9A-FX]+)\+\$NODEID")
+
+
+def read_value(data_type: int, text: str, node_id: int | None = None) -> Scalar | None:
+    """The value that `text` means in an object of `data_type`; None for one that needs a node id where none is given.
+
+    Raises `ValueError` for a text that is no value of the type, or that the type has no room for. A signed type also takes the
+    unsigned reading of its bits (FFh for -1). A time is its six octets, or a number of 48 bits.
+    """
+    text = text.strip()
+    if data_type in _TEXTS:
+        return text.encode("latin-1", "replace").decode("ascii", "backslashreplace") if data_type == 9 else text
+    size = size_of(data_type)
+    if size is None or (data_type in _TIMES and len(text) == 2 * size):
+        return _octets(text)
+    if data_type in _TIMES:
+        return _whole(text).to_bytes(size, "little")
+    if data_type in _REALS:
+        return _real(_REALS[DataType(data_type)], text, size)
+    if data_type == DataType.BOOLEAN:
+        return _held(_whole(text), 1, signed=False) != 0
+    relative = text.replace(" ", "").upper()
+    if "$NODEID" not in relative:
+        return _held(_whole(text), size, signed=is_signed(data_type))
+    match = _WITH_NODE_ID.fullmatch(relative)
+    if match is None:
+        raise ValueError("neither a number, nor a number and the node id")
+    base = _held(_whole(match["after"] or match["before"] or "0"), size, signed=is_signed(data_type))
+    _held(base + NODE_MAX, size, signed=is_signed(data_type))  # the type has room for every node id
+    return None if node_id is None else base + node_id
+
+
+def read_limit(data_type: int, text: str) -> int | float | None:
+    """The limit that `text` means; None where values of the type have no order, and where it depends on the node id.
+
+    Raises `ValueError` for a text that is no number of the type.
+    """
+    ordered = size_of(data_type) is not None and data_type not in _TIMES
+    if not text.strip() or not ordered or "$NODEID" in text.upper():
+        return None
+    if data_type == DataType.BOOLEAN:
+        return _held(_whole(text), 1, signed=False)
+    value = read_value(data_type, text)
+    assert isinstance(value, int | float)
+    return value
+
+
+def _whole(text: str) -> int:
+    """Decimal, hexadecimal with 0x, or octal with a leading zero."""
+    text = text.strip()
+    if _OCTAL.fullmatch(text):
+        return int(text, 8)
+    return int(text, 16 if text.lstrip("+-")[:2].lower() == "0x" else 10)
+
+
+def _held(value: int, size: int, *, signed: bool) -> int:
+    """The number that the type holds. Raises `ValueError` where it has no room."""
+    bits = 8 * size
+    if not (-(1 << bits - 1) if signed else 0) <= value < 1 << bits:
+        raise ValueError("the type has no room for it")
+    return value - (1 << bits) if signed and value >= 1 << bits - 1 else value
+
+
+def _real(form: str, text: str, size: int) -> float:
+    """As the type holds it; a hexadecimal number is its bits."""
+    try:
+        raw = _whole(text).to_bytes(size, "little") if text[:2].lower() == "0x" else struct.pack(form, float(text))
+    except OverflowError as e:
+        raise ValueError("the type has no room for it") from e
+    return float(struct.unpack(form, raw)[0])
+
+
+def _octets(text: str) -> bytes:
+    digits = "".join(text.split())
+    if digits[:2].lower() == "0x":
+        digits = digits[2:]
+        digits = digits.zfill(len(digits) + len(digits) % 2)
+    return bytes.fromhex(digits)

@@ -1,0 +1,35 @@
+"""The first write of an output: the gateway reads the device first, and does not write what the device holds already.
+
+This holds before the first write only, and for a device that was not lost meanwhile: what a device holds when it comes back may
+be a default that reads the same by chance, so it is told again. A value that is not good counts for nothing.
+"""
+
+from __future__ import annotations
+
+from gateway.core.clock import NS_PER_S
+from gateway.core.values import Quality, Reason, TagValue
+from gateway.devices.canopen_device import CanopenDriver
+from gateway.runtime.output import SAFE, Output
+
+READ_BACK_NS = 2 * NS_PER_S
+"""How long the first write of an output waits, once its device is there, for the first reading of what the device holds."""
+
+
+def waits_for_reading(output: Output, current: TagValue, now_ns: int) -> bool:
+    """Whether the first write has to wait for a reading that is still to come. A safe value does not wait."""
+    if output.due_since_ns is None:
+        output.due_since_ns = now_ns
+    if is_known(output, current) or output.by.startswith(SAFE) or not output.read_back:
+        return False
+    was_asked = current.quality is Quality.BAD and current.reason is not Reason.NEVER_READ
+    return not was_asked and now_ns - output.due_since_ns < READ_BACK_NS
+
+
+def is_known(output: Output, current: TagValue) -> bool:
+    """Whether `current` is what the device holds. A node may hold other values since its configuration was written: then
+    only a later reading counts."""
+    if current.quality is not Quality.GOOD or output.due_since_ns is None:
+        return False
+    driver = output.driver
+    written = isinstance(driver, CanopenDriver) and driver.config.canopen.configuration is not None
+    return not written or current.t_ns > output.due_since_ns

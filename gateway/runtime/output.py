@@ -1,0 +1,110 @@
+"""One output: its tag, its device, what is wanted and how far the last write got. It decides nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from gateway.core.errors import FieldtwinError, NotAllowed
+from gateway.core.values import COMMAND, TagValue
+from gateway.devices.canopen_device import CanopenDriver
+from gateway.devices.register_device import RegisterDriver
+from gateway.runtime.canopen_bus import CanopenBus
+from gateway.runtime.modbus_bus import Job, ModbusBus
+
+SAFE = "safe: "
+
+
+@dataclass
+class Output:
+    """One output: its tag, its device, and how far the last write got."""
+
+    tag: str
+    local: str
+    driver: RegisterDriver | CanopenDriver
+    bus: ModbusBus | CanopenBus
+    safe: float | None
+    wanted: float | None = None
+    by: str = ""
+    held: float | None = None
+    held_since_ns: int = 0
+    compared: TagValue | None = None
+    """What the device was last heard to hold, found to be what it was told."""
+    pending: bool = False
+    refused: tuple[float, str] | None = None
+    not_a_number: bool = False
+    """The program's newest value is not a number, so `wanted` is an older value."""
+    waits_since_ns: int | None = None
+    """Since when the output waits for a device that does not answer; `AWAY_REPORTED` once the journal has it."""
+    next_try_ns: int = 0
+    commanded: bool = False
+    """Whether a program writes it. Else the gateway writes its safe value, and what a client asks for, and nothing more."""
+    untouched: bool = True
+    """Nothing was written to it yet, and its device was not lost: what the device holds may be what is wanted."""
+    due_since_ns: int | None = None
+    """Since when the first write is due and the device there (monotonic)."""
+    asked: Callable[[FieldtwinError | None], None] | None = None
+    """Who asked for one write and waits for its end; None for what the PLC or the safe state commands."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether the device takes a write now."""
+        if isinstance(self.driver, CanopenDriver):
+            assert isinstance(self.bus, CanopenBus)
+            return self.bus.takes(self.driver, self.local)
+        assert isinstance(self.bus, ModbusBus)
+        return self.bus.online(self.driver)
+
+    @property
+    def frame(self) -> object | None:
+        """What it shares one frame with: the same object for each of those outputs. None where it is written by itself."""
+        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
+            return self.bus.frame_of(self.driver, self.local)
+        return None
+
+    @property
+    def settle_ns(self) -> int:
+        """How long after a write the device may still be heard to say what it held before."""
+        if isinstance(self.bus, CanopenBus) and isinstance(self.driver, CanopenDriver):
+            return self.bus.settle_ns(self.driver, self.local)
+        return 0
+
+    @property
+    def read_back(self) -> bool:
+        """Whether the gateway reads it again and again: by polls, or by process data that the node sends."""
+        driver, tag = self.driver, self.driver.profile.tags[self.local]
+        if not tag.readable:
+            return False
+        if isinstance(driver, CanopenDriver) and self.tag in driver.pdo_tags:
+            return True
+        return any(tag in driver.profile.group(group) for group in driver.config.poll)
+
+    def submit(self, command: COMMAND, done: Callable[[FieldtwinError | None], None]) -> None:
+        """Put the write on its way."""
+        if isinstance(self.driver, CanopenDriver):
+            assert isinstance(self.bus, CanopenBus)
+            self.bus.write(self.driver, self.local, command, done)
+        else:
+            assert isinstance(self.bus, ModbusBus)
+            self.driver.consumer.observe(command)
+            self.bus.submit(Job(self.driver, self.driver.send, done))
+
+    def shown(self, value: object) -> object:
+        """`value` as the audit log may show it: a secret is not written down."""
+        return "(secret)" if self.driver.profile.tags[self.local].secret else value
+
+    def answer(self, error: FieldtwinError | None) -> None:
+        """Tell who asked how it ended. It was for once: nothing is written again behind a person's back."""
+        asked, self.asked = self.asked, None
+        if asked is not None:
+            if not self.by.startswith(SAFE):
+                self.wanted = None
+            asked(error)
+
+
+def as_sent(output: Output) -> bytes:
+    """What `output` holds, as it would be sent now; empty where it may not be sent any more."""
+    try:
+        return output.driver.command(output.local, output.held).data if output.held is not None else b""
+    except NotAllowed:
+        return b""

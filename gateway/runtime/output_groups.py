@@ -1,0 +1,132 @@
+"""Outputs of one device that are written whole or not at all.
+
+A drive that is started with its old setpoint because the new one was refused is worse than one that is not started. So the
+members of a group are checked before any of them is written: when a program's value for one of them is refused, or is not there
+yet, the others are held back. Adjacent registers are written with one request, objects that share an RPDO with one frame, and all
+else in the group's order, each write after the one before it was confirmed. What the wire then interrupts is reported, and the
+whole group is written again.
+
+The safe state does not ask: safe values are written one by one, whatever the programs want.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+from gateway.core.errors import FieldtwinError
+from gateway.core.values import COMMAND
+from gateway.devices.register_device import Progress, RegisterDriver
+from gateway.runtime.modbus_bus import Job, ModbusBus
+from gateway.runtime.output import Output
+from gateway.runtime.refusals import HeldBack
+
+Ended = Callable[[Output, FieldtwinError | None], None]
+"""Called once for each member with how its write ended."""
+
+
+class OutputGroup:
+    """The members of one group, in the order of the system file. They are outputs of one device."""
+
+    def __init__(self, name: str, outputs: Sequence[Output]) -> None:
+        self.name = name
+        self.outputs = tuple(outputs)
+        self.told: tuple[object, ...] = ()
+        """What the journal was told last about values that are held back, so that it is told once."""
+
+    @property
+    def obstacle(self) -> tuple[Output, str] | None:
+        """The member because of which the group may not be written, and why; None where it may."""
+        for output in self.outputs:
+            if output.not_a_number or (output.wanted is not None and output.refused == (output.wanted, output.by)):
+                return output, f"{output.tag} was refused"
+        for output in self.outputs:
+            if output.wanted is None:
+                return output, f"{output.tag} has no value yet"
+        return None
+
+    @property
+    def by_programs(self) -> bool:
+        """Whether programs command it: not while any member is at, or on its way to, its safe value."""
+        return all(output.by in ("plc", "") for output in self.outputs)
+
+    def differing(self) -> list[Output]:
+        """The members whose device does not hold what is wanted."""
+        return [o for o in self.outputs if o.wanted is not None and o.held != o.wanted]
+
+    def submit(self, commands: Sequence[COMMAND], ended: Ended) -> None:
+        """Write all members. `commands` are theirs, in their order."""
+        first = self.outputs[0]
+        if isinstance(first.driver, RegisterDriver) and isinstance(first.bus, ModbusBus):
+            self._submit_registers(first.driver, first.bus, commands, ended)
+        else:
+            _InOrder(self.outputs, commands, ended).next()
+
+    def _submit_registers(
+        self, driver: RegisterDriver, bus: ModbusBus, commands: Sequence[COMMAND], ended: Ended
+    ) -> None:
+        progress = Progress()
+
+        def done(error: FieldtwinError | None) -> None:
+            for output in self.outputs:
+                if output.local in progress.confirmed:
+                    ended(output, None)
+                else:
+                    unsent = bool(progress.sent) and output.local not in progress.sent
+                    ended(output, _not_sent(output) if unsent else error)
+
+        bus.submit(Job(driver, partial(driver.write_together, commands, progress), done))
+
+
+class _InOrder:
+    """Writes outputs one after another, those that share a frame together; after one that failed the others are not sent."""
+
+    def __init__(self, outputs: Sequence[Output], commands: Sequence[COMMAND], ended: Ended) -> None:
+        self._ended = ended
+        self._steps: list[list[tuple[Output, COMMAND]]] = []
+        frames: dict[object, list[tuple[Output, COMMAND]]] = {}
+        for output, command in zip(outputs, commands, strict=True):
+            frame = output.frame
+            step = frames.get(frame) if frame is not None else None
+            if step is None:
+                self._steps.append(step := [])
+                if frame is not None:
+                    frames[frame] = step
+            step.append((output, command))
+        self._open = 0
+        self._error: FieldtwinError | None = None
+
+    def next(self) -> None:
+        """Start the next step, or end the rest after a failure."""
+        if self._error is not None:
+            rest, self._steps = self._steps, []
+            for output, _ in (item for step in rest for item in step):
+                self._ended(output, _not_sent(output))
+        elif self._steps:
+            step = self._steps.pop(0)
+            self._open = len(step)
+            for output, command in step:
+                output.submit(command, partial(self._done, output))
+
+    def _done(self, output: Output, error: FieldtwinError | None) -> None:
+        self._error = self._error or error
+        self._ended(output, error)
+        self._open -= 1
+        if not self._open:
+            self.next()
+
+
+def _not_sent(output: Output) -> HeldBack:
+    return HeldBack("not sent: the write of another member of its group failed", where=output.driver.config.where)
+
+
+def groups_of(outputs: Sequence[Output]) -> list[OutputGroup]:
+    """The groups that the devices of `outputs` declare."""
+    found = []
+    by_tag = {output.tag: output for output in outputs}
+    for config in {id(o.driver): o.driver.config for o in outputs}.values():
+        for name, tags in config.write_groups.items():
+            members = [by_tag[tag] for tag in (f"{config.name}.{local}" for local in tags) if tag in by_tag]
+            if members:
+                found.append(OutputGroup(name, members))
+    return found

@@ -1,0 +1,57 @@
+"""Which line of a PROGRAM assigned an output last: a pass over the Python that Structured Text was compiled to.
+
+After each assignment of an output (a statement, an output of a block or function, a VAR_IN_OUT) it inserts one that keeps the
+line's number. That costs one constant an assignment, and nothing where no output is assigned.
+"""
+
+from __future__ import annotations
+
+import ast
+
+_PREFIX = "line_"
+
+
+def line_of(attribute: str) -> str:
+    """The attribute that keeps the line of the last assignment of `attribute`."""
+    return f"{_PREFIX}{attribute}"
+
+
+def is_line(attribute: str) -> bool:
+    """Whether an attribute keeps a line. Lines are no state of a program: the next scan does not depend on them."""
+    return attribute.startswith(_PREFIX)
+
+
+class Assignments(ast.NodeTransformer):
+    """Adds the assignments of lines to a class whose outputs are the attributes `outputs` of ``self``."""
+
+    def __init__(self, outputs: frozenset[str]) -> None:
+        self._outputs = outputs
+
+    def visit_Assign(self, node: ast.Assign) -> list[ast.stmt]:
+        found = [name for target in node.targets for name in self._assigned(target)]
+        return [node, *self._lines(found, node.lineno)]
+
+    def visit_For(self, node: ast.For) -> ast.For:
+        self.generic_visit(node)
+        node.body[:0] = self._lines(self._assigned(node.target), node.lineno)
+        return node
+
+    def _assigned(self, target: ast.expr) -> list[str]:
+        if isinstance(target, ast.Tuple | ast.List):
+            return [name for part in target.elts for name in self._assigned(part)]
+        if isinstance(target, ast.Attribute) and isinstance(target.value, ast.Name) and target.value.id == "self":
+            return [target.attr] if target.attr in self._outputs else []
+        return []
+
+    @staticmethod
+    def _lines(names: list[str], line: int) -> list[ast.stmt]:
+        made: list[ast.stmt] = []
+        for name in names:
+            target = ast.Attribute(ast.Name("self", ast.Load()), line_of(name), ast.Store())
+            statement = ast.Assign([target], ast.Constant(line), lineno=line, end_lineno=line)
+            for node in ast.walk(statement):
+                if isinstance(node, ast.stmt | ast.expr):
+                    node.lineno = node.end_lineno = line
+                    node.col_offset = node.end_col_offset = 0
+            made.append(statement)
+        return made

@@ -1,0 +1,109 @@
+"""What the programs of one Structured Text file share while they run together: compiled code, global variables, the scan.
+
+The standard calls this a resource (IEC 61131-3, 6.8.1). Programs of one file that one PLC runs share one, so that they see the
+same VAR_GLOBAL. A deep copy has global variables of its own and shares the code, which has no state.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from gateway.core.image import Message
+from gateway.core.values import Quality, TagValue
+from plc.blocks import BLOCKS, FunctionBlock
+from plc.program import Outbox, ScanInfo, ScanTooLong
+from plc.st import values
+from plc.st.compile import CompiledUnit
+
+MAX_STEPS = 1_000_000
+"""Loop iterations, and calls of functions and function blocks, that a program may make in one scan. The same in real and in
+virtual time, where nothing else ends a loop without an end."""
+Together = dict[Any, Any]
+"""The resources of one PLC, by file and code."""
+
+
+class Context:
+    """What compiled code knows of the scan that runs."""
+
+    __slots__ = ("first_scan", "left", "lookup", "now_ns")
+
+    def __init__(self) -> None:
+        self.left = MAX_STEPS
+        """How many loop iterations and calls the scan may still make."""
+        self.now_ns = 0
+        self.first_scan = False
+        self.lookup: Callable[[str], TagValue] | None = None
+
+    @property
+    def scan_ns(self) -> int:
+        """The scan's time as SCAN_TIME() gives it: a program that asks for it depends on more than differences."""
+        return self.now_ns
+
+    def is_good(self, name: str) -> bool:
+        """Return whether an input is good. A forced value counts as good: the user who forces it wants it to be used."""
+        assert self.lookup is not None
+        return self.lookup(name).quality in (Quality.GOOD, Quality.SIMULATED)
+
+    @staticmethod
+    def too_long() -> NoReturn:
+        """End a scan that has used up its iterations and calls. Raises `ScanTooLong`."""
+        raise ScanTooLong(f"more than {MAX_STEPS:,} loop iterations and calls in one scan")
+
+    @staticmethod
+    def message(messages: tuple[Message, ...], number: int) -> Message:
+        """Return a message of a mailbox; `number` counts from 1."""
+        return messages[values.index(number, 1, len(messages))]
+
+
+class Resource:
+    """One execution of a compiled unit: its classes and functions, and its global variables with their initial values."""
+
+    def __init__(self, unit: CompiledUnit) -> None:
+        self.context = Context()
+        self.space: dict[str, Any] = {"_v": values, "_c": self.context, "_blocks": BLOCKS}
+        exec(unit.code, self.space)
+        self.globals: Any = self.space["_G"]
+        self.absolute = ".scan_ns" in unit.python
+        """Whether a program asks for SCAN_TIME, so that its behaviour depends on the time itself."""
+
+    @classmethod
+    def of(cls, unit: CompiledUnit, together: Together | None) -> Resource:
+        """Return the resource of `unit` in `together`, made there if need be; without `together`, a new one."""
+        if together is None:
+            return cls(unit)
+        key = (unit.path, unit.python)
+        if key not in together:
+            together[key] = cls(unit)
+        found: Resource = together[key]
+        return found
+
+    def begin(self, scan: ScanInfo, lookup: Callable[[str], TagValue]) -> None:
+        """Prepare one execution of a program: from now on compiled code sees this scan and these global variables."""
+        self.space["_G"] = self.globals
+        context = self.context
+        context.left = MAX_STEPS
+        context.now_ns, context.first_scan, context.lookup = scan.now_ns, scan.first_scan, lookup
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Resource:
+        new = Resource.__new__(Resource)
+        memo[id(self)] = new
+        new.context, new.space, new.absolute = self.context, self.space, self.absolute
+        new.globals = copy.deepcopy(self.globals, memo)
+        return new
+
+
+def state_of(value: Any, now_ns: int) -> Any:
+    """Return what of a variable matters for what comes, as something hashable. Equal states behave the same from now on."""
+    if isinstance(value, list):
+        return tuple([state_of(v, now_ns) for v in value])
+    if isinstance(value, FunctionBlock):
+        return type(value).__name__, *value.state(now_ns)
+    if isinstance(value, Outbox):
+        return value.outstanding, tuple(value.pending)
+    names = getattr(value, "__slots__", None)
+    if names is None or isinstance(value, bool | int | float | str | Message):
+        return repr(value) if isinstance(value, float) else value  # so that 0.0, -0.0 and NaN are what they are
+    references = getattr(value, "in_outs", ())
+    return tuple([state_of(getattr(value, name), now_ns) for name in names if name not in references])

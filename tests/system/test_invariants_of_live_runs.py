@@ -1,0 +1,113 @@
+"""Invariants of the system file are judged in runs of processes on this host, and in scenarios on the target local."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fieldtwin.report.model import Verdict
+from fieldtwin.running.scenario_targets import Target, run_scenario
+from fieldtwin.scenarios.form import load_scenario
+
+pytestmark = pytest.mark.long
+
+PROFILE = """device: fieldtwin/well
+source: "made for this test"
+protocol: modbus
+numbering: sent
+tags:
+  level: {at: "holding:0", poll: level}
+"""
+PLANT = """fieldtwin: 1
+system: plant
+buses:
+  lan: {url: "tcp://192.0.2.1:502"}
+devices:
+  sensor: {profile: well.yaml, bus: lan, unit: 1, poll: {level: {every_ms: 200}}}
+plc:
+  cycle_ms: 50
+  watchdog: {late_ms: 2000, stop_after: 1000}
+  programs:
+    well: {source: well.st, inputs: {level: {tag: sensor.level}}}
+invariants:
+  always: ["sensor.level < 1000"]
+  never: ["well.runs and sensor.level == 42"]
+"""
+PROTOTYPE = """prototype_of: plant.yaml
+buses:
+  lan: {listen: "tcp://127.0.0.1:0"}
+devices:
+  sensor: {model: profile, values: {level: 42}}
+"""
+PROGRAM = """PROGRAM Well
+VAR_INPUT
+  level : INT;
+END_VAR
+VAR
+  runs : BOOL;
+END_VAR
+  runs := level > %s;
+END_PROGRAM
+"""
+SCENARIO = """scenario: the well
+system: plant.yaml
+steps:
+  - wait: {until: "sensor.level == 42", within: 60s}
+  - pause: 2s
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    for name, text in (("well.yaml", PROFILE), ("plant.yaml", PLANT), ("plant.prototype.yaml", PROTOTYPE)):
+        (tmp_path / name).write_text(text)
+    (tmp_path / "well.scenario.yaml").write_text(SCENARIO)
+    with tempfile.TemporaryDirectory(prefix="ft-", dir="/tmp") as runtime:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", runtime)
+        yield tmp_path
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    words = [sys.executable, "-m", "fieldtwin", "run", "plant.yaml", "--prototype", "--for", "6s", "--json"]
+    ended = subprocess.run(words, cwd=folder, env=os.environ, capture_output=True, text=True, check=False)
+    told: dict[str, Any] = json.loads(ended.stdout)
+    assert ended.returncode == (0 if told["ok"] else 1)
+    return told
+
+
+@pytest.mark.slow
+def test_a_live_run_with_a_broken_invariant_is_not_ok(folder: Path) -> None:
+    (folder / "well.st").write_text(PROGRAM % "10")
+    told = summary(folder)
+    found = {one["number"]: one for one in told["invariants"]}
+    assert found["invariant always 1"]["verdict"] == "passed", found
+    assert found["invariant never 1"]["verdict"] == "failed", found
+    (error,) = [error for error in told["errors"] if "invariant" in error]
+    assert error.startswith("invariant never 1: well.runs and sensor.level == 42: broken at ")
+    assert error.endswith("plant.yaml:14)")
+
+
+@pytest.mark.slow
+def test_a_live_run_whose_invariants_hold_says_so(folder: Path) -> None:
+    (folder / "well.st").write_text(PROGRAM % "50")
+    told = summary(folder)
+    assert [one["verdict"] for one in told["invariants"]] == ["passed", "passed"], told["invariants"]
+    assert not [error for error in told["errors"] if "invariant" in error]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("limit", "verdict"), [("10", Verdict.FAILED), ("50", Verdict.PASSED)])
+def test_a_scenario_on_the_target_local_judges_invariants(folder: Path, limit: str, verdict: Verdict) -> None:
+    (folder / "well.st").write_text(PROGRAM % limit)
+    result = run_scenario(load_scenario(folder / "well.scenario.yaml"), Target("local"))
+    assert result.verdict is verdict, result.reason
+    if verdict is Verdict.FAILED:
+        assert result.reason.startswith("invariant never 1: ")

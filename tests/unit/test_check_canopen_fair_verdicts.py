@@ -1,0 +1,109 @@
+"""Unfair verdicts of `check canopen`: CO-005 failed a node that aborts, and cases were skipped for a false reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from canopen_slave_rig import NODE
+from nodes_on_a_bus import LONG, on_bus, ours
+
+from emulators.canopen.dictionary import parse_eds
+from emulators.canopen.node import CanopenNode
+from emulators.canopen.serve import serve_node
+from emulators.virtual.clock import VirtualClock
+from emulators.virtual.ports import MemoryNet
+from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
+from fieldtwin.checking.run import Plan
+from fieldtwin.conformance.case import Danger
+from fieldtwin.report.model import Verdict
+from gateway.core.canframe import CanFrame
+from gateway.core.connection import CanConnection
+
+SDO, REPLY = 0x600 + NODE, 0x580 + NODE
+ABORT = bytes.fromhex("80 00 10 00 01 00 04 05")
+NEEDS_A_NUMBER = ("CO-009a", "CO-009b", "CO-013a", "CO-013b", "CO-015", "CO-029")
+NEEDS_A_TEXT = ("CO-001b", "CO-017", "CO-020")
+Serve = Callable[[CanConnection, VirtualClock], object]
+
+
+class AbortingNode(CanopenNode):
+    """A node that aborts an initiate during a transfer. Then it serves again, unless it `hangs`."""
+
+    hangs = False
+    _in_transfer = False
+    _hung = False
+
+    def accepts(self, frame: CanFrame) -> bool:
+        return True
+
+    def feed(self, frame: CanFrame, now_ns: int) -> list[CanFrame]:
+        if frame.can_id != SDO or frame.extended:
+            return super().feed(frame, now_ns)
+        if self._in_transfer and frame.data[:1] == b"\x40":
+            self._in_transfer = False
+            self._hung = self.hangs
+            super().feed(CanFrame(SDO, b"\x80" + frame.data[1:4] + bytes(4)), now_ns)
+            return [CanFrame(REPLY, ABORT)]
+        if self._hung and frame.data[:1] == b"\x40":
+            return [CanFrame(REPLY, ABORT)]
+        replies = super().feed(frame, now_ns)
+        self._in_transfer = frame.data[0] & 0xE0 == 0x60 and not any(reply.data[0] & 0x81 for reply in replies)
+        return replies
+
+
+def aborting(*, hangs: bool) -> Callable[[CanConnection, VirtualClock], object]:
+    async def serve(connection: CanConnection, clock: VirtualClock) -> None:
+        node = AbortingNode(parse_eds(LONG), NODE)
+        node.hangs = hangs
+        await serve_node(connection, node, clock)
+
+    return serve
+
+
+def verdicts(
+    serve: Serve, tmp_path: Path, *only: str, may_write: tuple[tuple[int, int], ...]
+) -> dict[str, tuple[Verdict, str]]:
+    eds = tmp_path / "rig.eds"
+    eds.write_text(LONG)
+
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> dict[str, tuple[Verdict, str]]:
+        plan = Plan(frozenset(only), Danger.WRITE, frozenset({"object", "eds"}))
+        options = CanopenOptions(
+            url, NODE, plan, eds=eds, may_write=may_write, connector=net, clock=clock, timeout_s=0.1, boot_s=0.5
+        )  # fmt: skip
+        return {r.case.id: (r.verdict, r.reason) for r in (await check_canopen(options)).results}
+
+    return on_bus(serve, use)  # type: ignore[arg-type]
+
+
+def test_a_node_that_aborts_a_new_initiate_and_serves_the_next_one_passes(tmp_path: Path) -> None:
+    found = verdicts(aborting(hangs=False), tmp_path, "CO-005", may_write=())
+    verdict, reason = found["CO-005"]
+    assert verdict is Verdict.PASSED, found
+    assert "abort 05040001" in reason
+    assert "then good service" in reason
+
+
+def test_a_node_that_aborts_a_new_initiate_and_serves_no_more_fails(tmp_path: Path) -> None:
+    verdict, reason = verdicts(aborting(hangs=True), tmp_path, "CO-005", may_write=())["CO-005"]
+    assert verdict is Verdict.FAILED
+    assert "afterwards: abort" in reason
+
+
+def test_the_heartbeat_time_alone_serves_the_cases_that_need_a_number(tmp_path: Path) -> None:
+    # They were skipped: "none of the objects given by --write is a number of 1, 2 or 4 bytes". 1017h is one of 2 bytes.
+    found = verdicts(ours, tmp_path, *NEEDS_A_NUMBER, may_write=((0x1017, 0),))
+    assert {id: verdict for id, (verdict, _) in found.items()} == dict.fromkeys(NEEDS_A_NUMBER, Verdict.PASSED), found
+
+
+def test_a_skipped_case_says_what_each_given_object_is(tmp_path: Path) -> None:
+    found = verdicts(ours, tmp_path, *NEEDS_A_TEXT, may_write=((0x1017, 0), (0x5FFE, 0)))
+    for verdict, reason in found.values():
+        assert verdict is Verdict.SKIPPED
+        assert "1017h:00 holds 2 bytes" in reason
+        assert "5FFEh:00 could not be read (abort 06020000" in reason
+    (found_number,) = verdicts(ours, tmp_path, "CO-029", may_write=((0x2004, 0), (0x5FFE, 0))).values()
+    assert found_number[0] is Verdict.SKIPPED
+    assert "2004h:00 is text or a domain in the EDS" in found_number[1]
+    assert "5FFEh:00 could not be read" in found_number[1]

@@ -1,0 +1,195 @@
+"""One emulated Modbus device: data after the run indicator, any unit id on TCP, and `emulate` with values and faults.
+
+Observed before: function 11h ended with the run indicator, a single device on TCP refused unit ids other than its own, 0 and
+255, and `fieldtwin emulate` of one device took neither faults nor the values of registers.
+"""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from test_cli import invoke as invoke_command
+
+from emulators.faults.frames import Framing, Way, understood
+from emulators.faults.on_link import wire_faults
+from emulators.faults.schema import parse_fault
+from emulators.modbus.bank import MapBank, Span
+from emulators.modbus.mbap import MbapSlave
+from emulators.modbus.unit import ModbusUnit
+from emulators.stated import parts_of
+from gateway.core.errors import UsageError
+from gateway.core.profile import DeviceProfile, resolve
+from gateway.core.yaml_file import parse
+
+METER = """
+device: test/meter
+source: "a test"
+protocol: modbus
+numbering: sent
+server_id: "4D 54"
+server_data: "01 02 03"
+tags:
+  power: {at: "holding:0", type: int16, scale: 0.1}
+  energy: {at: "holding:1", type: uint32}
+  mode: {at: "holding:3", values: {1: idle, 2: running}}
+  name: {at: "holding:4", type: string, registers: 4}
+"""
+
+
+def meter() -> DeviceProfile:
+    return resolve(parse(METER, "meter.yaml"))
+
+
+def test_function_11h_tells_data_after_the_run_indicator() -> None:
+    unit = ModbusUnit(MapBank([Span("holding", 0, 1)]), **parts_of(meter()))
+    assert unit.respond(b"\x11", 0) == bytes.fromhex("11 06 4D 54 FF 01 02 03")
+    unit.running = False
+    assert unit.respond(b"\x11", 0) == bytes.fromhex("11 06 4D 54 00 01 02 03")
+
+
+def test_a_server_id_and_its_data_have_to_fit_one_reply() -> None:
+    ModbusUnit(MapBank([]), server_id=b"a" * 200, server_data=b"b" * 49)
+    with pytest.raises(UsageError):
+        ModbusUnit(MapBank([]), server_id=b"a" * 200, server_data=b"b" * 50)
+
+
+def test_one_device_answers_any_unit_id_on_tcp_and_echoes_it() -> None:
+    unit = ModbusUnit(MapBank([Span("holding", 0, 1)]))
+    request = bytes.fromhex("0001 0000 0006 63 03 0000 0001")
+    assert MbapSlave({1: unit}).feed(request, 0) == [bytes.fromhex("0001 0000 0003 63 83 0A")]
+    assert MbapSlave({1: unit}, any_unit=True).feed(request, 0) == [bytes.fromhex("0001 0000 0005 63 03 02 0000")]
+    with pytest.raises(UsageError):
+        MbapSlave({1: unit, 2: unit}, any_unit=True)
+
+
+@pytest.mark.parametrize(
+    ("count", "struck"), [(40, {40}), ("40", {40}), ("65..125", {65, 100, 125}), ("65..", {65, 100, 125})]
+)
+def test_a_fault_strikes_by_the_number_of_registers_that_the_request_reads(count: str | int, struck: set[int]) -> None:
+    faults = wire_faults([{"name": "silence", "registers": count, "direction": "request"}], Framing.MBAP, 1, 0)
+    for registers in (1, 39, 40, 41, 64, 65, 100, 125):
+        request = bytes.fromhex("0001 0000 0006 01 03 0000") + registers.to_bytes(2)
+        assert (faults.decide(understood(Way.REQUEST, Framing.MBAP, request), 0) is not None) == (registers in struck)
+
+
+@pytest.mark.parametrize("count", [0, 2001, "5..4", "x", "..4", -1])
+def test_a_count_that_no_request_can_have_is_refused(count: str | int) -> None:
+    with pytest.raises(UsageError, match="count of registers"):
+        parse_fault({"name": "silence", "registers": count})
+
+
+# -- the command --------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def emulated(folder: Path, *options: str) -> Iterator[tuple[int, list[str]]]:
+    """`fieldtwin emulate meter.yaml` on a port; the lines of its diagnostics are complete after the block."""
+    (folder / "meter.yaml").write_text(METER)
+    said: list[str] = []
+    command = [sys.executable, "-m", "fieldtwin", "emulate", str(folder / "meter.yaml"), *options]
+    with subprocess.Popen([*command, "--on", "tcp://127.0.0.1:0"], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        port = 0
+        try:
+            for text in process.stderr:
+                said.append(text)
+                if "tcp://127.0.0.1:" in text:
+                    port = int(text.rpartition(":")[2])
+                    break
+            assert port, said
+            yield port, said
+        finally:
+            process.terminate()
+            said += process.stderr
+            process.wait()
+
+
+def ask(port: int, pdu: str, unit: int = 1, within_s: float = 10.0) -> bytes:
+    """The reply PDU; empty if none comes."""
+    request = bytes.fromhex(pdu)
+    with socket.create_connection(("127.0.0.1", port), timeout=within_s) as client:
+        client.sendall(b"\0\1\0\0" + (len(request) + 1).to_bytes(2) + bytes([unit]) + request)
+        try:
+            head = client.recv(7)
+            return client.recv(int.from_bytes(head[4:6]) - 1)
+        except TimeoutError:
+            return b""
+
+
+def test_emulate_gives_registers_their_values_and_answers_any_unit(tmp_path: Path) -> None:
+    (tmp_path / "more.yaml").write_text("energy: 70000\nname: bench\n")
+    options = ("--values", "power=-12.5", "--values", str(tmp_path / "more.yaml"), "--values", "mode=running")
+    with emulated(tmp_path, *options, "--any-unit") as (port, _):
+        assert ask(port, "03 0000 0004", unit=77) == bytes.fromhex("03 08 FF83 0001 1170 0002")
+        assert ask(port, "03 0004 0004") == b"\x03\x08bench\0\0\0"
+
+
+def test_emulate_puts_faults_in_and_says_how_often_they_struck(tmp_path: Path) -> None:
+    (tmp_path / "faults.yaml").write_text(
+        "faults:\n"
+        "  - {name: fewer-registers, by: 2, registers: 4}\n"
+        "  - {name: exception, code: 6, register: mode}\n"
+        "  - {name: set, register: power, value: 5}\n"
+        "  - {name: silence, registers: '100..'}\n"
+    )
+    with emulated(tmp_path, "--values", "energy=1", "--faults", str(tmp_path / "faults.yaml")) as (port, said):
+        assert ask(port, "03 0000 0004") == bytes.fromhex("03 04 0032 0000")
+        assert ask(port, "03 0003 0001") == bytes.fromhex("83 06")
+        assert ask(port, "03 0001 0002") == bytes.fromhex("03 04 0000 0001")
+    told = "".join(said)
+    assert "fewer-registers-1: struck 1 of 1 frames" in told
+    assert "exception-2: struck 1 of 1 frames" in told
+    assert "silence-4: struck 0 of 0 frames" in told
+
+
+invoke = invoke_command  # the fixture
+ON = ("--on", "tcp://127.0.0.1:0")
+Invoke = Callable[..., tuple[int, str, str]]
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("{name: lost-frame}", "CAN"),
+        ("{name: silence, device: meter}", "only one device"),
+        ("{name: silence, register: nothing}", "no register"),
+        ("{name: silence, registers: 9..1}", "count of registers"),
+        ("{name: drift, register: power}", "come from a recording"),
+    ],
+)
+def test_a_fault_that_one_device_cannot_have_is_refused_with_its_line(
+    invoke: Invoke, tmp_path: Path, fault: str, told: str
+) -> None:
+    (tmp_path / "meter.yaml").write_text(METER)
+    (tmp_path / "f.yaml").write_text(f"faults:\n  - {fault}\n")
+    code, _, err = invoke("emulate", str(tmp_path / "meter.yaml"), "--faults", str(tmp_path / "f.yaml"), *ON)
+    assert code == 3
+    assert told in err
+    assert "f.yaml:2" in err
+
+
+@pytest.mark.parametrize("values", ["nothing=1", "mode=flying", "power=1e9", "power=nan", "missing.yaml"])
+def test_values_that_the_device_cannot_hold_are_refused_in_one_line(
+    invoke: Invoke, tmp_path: Path, values: str
+) -> None:
+    (tmp_path / "meter.yaml").write_text(METER)
+    device = str(tmp_path / "meter.yaml")
+    code, _, err = invoke("emulate", device, "--values", values, *ON)
+    assert code in (2, 3), err
+    assert len(err.strip().splitlines()) <= 2
+
+
+@pytest.mark.parametrize("options", [("--values", "a=1"), ("--any-unit",)])
+@pytest.mark.parametrize("what", ["observatory", "drive-cia402"])
+def test_options_of_one_modbus_device_are_refused_for_others(
+    invoke: Invoke, what: str, options: tuple[str, ...]
+) -> None:
+    code, _, err = invoke("emulate", what, *options, *(ON if what != "observatory" else ()))
+    assert code == 2
+    assert "Modbus device" in err

@@ -1,0 +1,87 @@
+"""The line of the program that set each refused output: asked of the PLC's process, once for each entry of the journal.
+
+The gateway knows tags and values; the PLC's process knows which line of which program assigned them. A PLC that does not answer
+leaves the line unknown, and never delays the entry by more than `ANSWER_S`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from gateway.core.control import ControlClient
+from gateway.core.errors import FieldtwinError
+from gateway.runtime.refusals import Refusal, Refusals
+
+ANSWER_S = 1.0
+"""How long the PLC may take to answer."""
+MOST_WAITING = 64
+"""Entries that wait for their line; a further one is told without it."""
+
+
+class RefusalPlaces:
+    """Completes the entries of `journal` over the PLC's control channel at `socket`. `tell` is called with each of them then."""
+
+    def __init__(self, journal: Refusals, socket: Path, tell: Callable[[dict[str, Any]], None] | None = None) -> None:
+        self._journal = journal
+        self._socket = socket
+        self._tell = tell
+        self._waiting: deque[Refusal] = deque()
+        self._wake, self._idle = asyncio.Event(), asyncio.Event()
+        self._idle.set()
+        self._client: ControlClient | None = None
+        journal.looks_up = True
+        journal.on_new = self._on_new
+
+    def _on_new(self, entry: Refusal) -> None:
+        if entry.known or len(self._waiting) >= MOST_WAITING:
+            self._complete(entry, "", "")
+        else:
+            self._waiting.append(entry)
+            self._idle.clear()
+            self._wake.set()
+
+    def _complete(self, entry: Refusal, program: str, place: str) -> None:
+        self._journal.placed(entry.number, program, place)
+        if self._tell is not None:
+            self._tell(entry.describe())
+
+    async def run(self) -> None:
+        """Look up lines until cancelled."""
+        try:
+            while True:
+                await self._wake.wait()
+                self._wake.clear()
+                while self._waiting:
+                    entry = self._waiting[0]
+                    program, place = await self._origin(entry)
+                    self._waiting.popleft()
+                    self._complete(entry, program, place)
+                self._idle.set()
+        finally:
+            if self._client is not None:
+                await self._client.aclose()
+
+    async def _origin(self, entry: Refusal) -> tuple[str, str]:
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                if self._client is None:
+                    self._client = await ControlClient.connect_unix(self._socket)
+                answer = await self._client.call("origin", tag=entry.tag, value=entry.first)
+        except (FieldtwinError, OSError, TimeoutError):
+            client, self._client = self._client, None
+            if client is not None:
+                await client.aclose()
+            return "", ""
+        return str(answer.get("program", "")), str(answer.get("place", ""))
+
+    async def settle(self) -> None:
+        """Return when no entry waits for its line, after `ANSWER_S` at the latest."""
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                await self._idle.wait()
+        except TimeoutError:
+            pass  # the entries are told without it

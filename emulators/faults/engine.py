@@ -45,13 +45,20 @@ class WireFaults:
         return bool(refusing)
 
     def decide(self, frame: Frame, now_ns: int) -> Outcome | None:
-        """What becomes of the frame; None: nothing happens to it. Several faults strike one after the other."""
+        """What becomes of the frame; None: nothing happens to it. Several faults strike in the order in which they were put in,
+        those that divide it after the others."""
         outcome: Outcome | None = None
         if frame.spared:
             return None
+        dividing: list[tuple[Active, WireFault]] = []
         for active in self.in_at(now_ns):
             if isinstance(active.fault, WireFault) and active.strikes(frame, now_ns):
-                outcome = _joined(outcome, frame, active.fault, active)
+                if active.fault.divides:
+                    dividing.append((active, active.fault))
+                else:
+                    outcome = _joined(outcome, frame, active.fault, active)
+        for active, fault in dividing:
+            outcome = _joined(outcome, frame, fault, active)
         return outcome
 
 

@@ -143,6 +143,9 @@ class WireFault(Fault):
 
     refuses: ClassVar[bool] = False
     """Whether nobody can connect while it lasts."""
+    divides: ClassVar[bool] = False
+    """Whether it delivers the frame in several pieces, all bytes unchanged. Such a fault strikes after all others: they expect a
+    whole frame, and bytes that they add to a piece would lie inside the frame, where Modbus TCP cannot notice them."""
 
 
 class ValueFault(Fault):

@@ -18,6 +18,7 @@ class Pause(WireFault):
     name = "pause"
     summary = "a silence of `pause_ms` in the middle of the frame"
     form = Form
+    divides = True
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
         half = len(frame.data) // 2

@@ -22,6 +22,7 @@ class Split(WireFault):
         "the frame arrives cut behind `at` bytes, up to `times` times, each piece `pause_ms` behind the one before"
     )
     form = Form
+    divides = True
 
     def strike(self, frame: Frame, random: Random) -> Outcome:
         p, left, cut = self.parameters, frame.data, list[bytes]()

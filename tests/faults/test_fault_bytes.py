@@ -351,6 +351,19 @@ def test_faults_strike_one_after_the_other() -> None:
     assert not faults.active, "what is over is forgotten"
 
 
+@pytest.mark.parametrize("divides", [kind for kind in FAULTS.values() if issubclass(kind, WireFault) and kind.divides])
+def test_what_divides_a_frame_strikes_after_all_others(divides: type[WireFault]) -> None:
+    """Else the bytes of `garbage` would lie inside the frame, and Modbus TCP has no check sum to notice them."""
+    faults = WireFaults(Framing.MBAP)
+    for fault in (divides(divides.form()), made("garbage", data="FFFF")):
+        faults.put_in(Active(fault.name, fault, Aim(), Random(1), 0, 5))
+    frame = understood(Way.REPLY, Framing.MBAP, bytes.fromhex("000700000007010304000A0102"))
+    outcome = faults.decide(frame, 1)
+    assert outcome is not None
+    assert len(outcome.pieces) == 2
+    assert b"".join(piece.data for piece in outcome.pieces) == frame.data + b"\xff\xff"
+
+
 # -- frames ---------------------------------------------------------------------------------------------------------------
 
 PDUS = st.binary(min_size=2, max_size=60)

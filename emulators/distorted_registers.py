@@ -7,15 +7,13 @@ Pure; a function of time only through what is asked.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
-from emulators.stated import cells_of, merged, raw_of
+from emulators.stated import Peek, bytes_of, cells_of, merged, raw_of
 from gateway.core.profile import DeviceProfile, Tag
-
-Peek = Callable[[Table, int], int]
 
 
 class DistortedRegisters(RegisterBank):
@@ -62,7 +60,7 @@ class DistortedRegisters(RegisterBank):
                         held[cell - address] = merged(tag, held[cell - address], content)
             elif tag.name in self._noted:  # it is over: what lies beneath is held again
                 self._noted.discard(tag.name)
-                self._note(tag, own, now_ns)
+                self._journal.note(tag.name, bytes_of(tag, own), now_ns)
         return held
 
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
@@ -81,9 +79,5 @@ class DistortedRegisters(RegisterBank):
             return own  # no bits say "no number"
         cells = [merged(tag, a, b) for a, b in zip(own, cells_of(tag, value, exponent), strict=True)]
         self._noted.add(tag.name)
-        self._note(tag, cells, now_ns)
+        self._journal.note(tag.name, bytes_of(tag, cells), now_ns)
         return cells
-
-    def _note(self, tag: Tag, cells: Sequence[int], now_ns: int) -> None:
-        bits = tag.registers.table in BIT_TABLES
-        self._journal.note(tag.name, bytes(cells) if bits else b"".join(c.to_bytes(2, "big") for c in cells), now_ns)

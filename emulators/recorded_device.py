@@ -19,7 +19,7 @@ from emulators.replay.counters import CounterSpan
 from emulators.replay.profiled import ProfiledReplay
 from emulators.replay.replay import ExchangeReplay
 from emulators.replay.requests import parse_request
-from emulators.stated import cells_of, merged, raw_of
+from emulators.stated import bytes_of, cells_of, merged, raw_of
 from gateway.core.connection import Connection
 from gateway.core.device import wire
 from gateway.core.errors import FileInvalid, UnknownCommand
@@ -104,7 +104,7 @@ class RecordedDevice(ProfiledReplay):
             if math.isnan(value) and tag.bits is not None:
                 continue  # no bits mean "no number"
             words = [merged(tag, own, cell) for own, cell in zip(words, cells_of(tag, value), strict=True)]
-            data[first : first + 2 * at.count] = b"".join(w.to_bytes(2) for w in words)
+            data[first : first + 2 * at.count] = bytes_of(tag, words)
         return bytes(data)
 
     def _note(self, pdu: bytes, reply: bytes, now_ns: int) -> None:

@@ -7,7 +7,7 @@ Pure; encodes for itself, as everything on this side of the wire. It knows neith
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from emulators.codec import decode, encode
 from emulators.modbus.bank import BIT_TABLES, Access, Span, Table
@@ -16,6 +16,9 @@ from emulators.modbus.file_records import FileRecords
 from emulators.modbus.identification import Identification
 from emulators.modbus.unit import UnitParts
 from gateway.core.profile import DeviceProfile, Effect, Tag
+
+Peek = Callable[[Table, int], int]
+"""Returns the value of one cell without the effects of a read."""
 
 
 def cells_of(tag: Tag, value: float | str, exponent: int = 0) -> list[int]:
@@ -68,6 +71,19 @@ def raw_of(tag: Tag, cells: Sequence[int]) -> float:
         low, high = tag.bits
         return cells[0] >> low & (1 << (high - low + 1)) - 1
     return float(decode(cells, tag.type, tag.order))
+
+
+def cells_held(tag: Tag, peek: Peek) -> list[int]:
+    """Return the values of all cells of `tag`."""
+    at = tag.registers
+    return [peek(at.table, address) for address in range(at.address, at.end)]
+
+
+def bytes_of(tag: Tag, cells: Sequence[int]) -> bytes:
+    """Return the cells of `tag` as bytes: one byte for a bit, two bytes (the high byte first) for a register."""
+    if tag.registers.table in BIT_TABLES:
+        return bytes(cells)
+    return b"".join(cell.to_bytes(2) for cell in cells)
 
 
 def spans_of(profile: DeviceProfile) -> list[Span]:

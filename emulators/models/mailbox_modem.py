@@ -13,8 +13,9 @@ from random import Random
 
 from emulators.codec import encode
 from emulators.journal import HeldJournal
-from emulators.modbus.bank import BIT_TABLES, IllegalValue, MapBank, RegisterBank, Span, Table
+from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
 from emulators.models.packet_link import TAME, Incoming, Outgoing, PacketLink, Untamed
+from emulators.stated import bytes_of, cells_held
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import Box, DeviceProfile, RegisterRange, Tag
 
@@ -53,10 +54,7 @@ class MailboxModem(RegisterBank):
 
     def _note(self, tag: Tag, now_ns: int) -> None:
         """Journal what the registers of `tag` hold now."""
-        at = tag.registers
-        words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
-        bits = at.table in BIT_TABLES
-        self.journal.note(tag.name, bytes(words) if bits else b"".join(w.to_bytes(2) for w in words), now_ns)
+        self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
     def _state(self, name: str, text: str) -> None:
         """A tag that never changes."""
@@ -66,7 +64,7 @@ class MailboxModem(RegisterBank):
         except ValueError as e:
             raise FileInvalid(f"{name!r} is a number", expected="such as 1", got=text) from e
         self._cells.poke(tag.registers.table, tag.registers.address, *words)
-        self.journal.note(name, b"".join(w.to_bytes(2) for w in words), 0)
+        self.journal.note(name, bytes_of(tag, words), 0)
 
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
         self.advance(now_ns)
@@ -107,7 +105,7 @@ class MailboxModem(RegisterBank):
             if tag is not None and number != told:
                 words = encode(number, tag.type, tag.order)
                 self._cells.poke(tag.registers.table, tag.registers.address, *words)
-                self.journal.note(name, b"".join(w.to_bytes(2) for w in words), now_ns)
+                self.journal.note(name, bytes_of(tag, words), now_ns)
 
     def _on_write(self, table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
         """Sequence, length and payload come in one write, from the outbox's first register."""

@@ -11,9 +11,9 @@ import re
 from collections.abc import Mapping, Sequence
 
 from emulators.journal import HeldJournal
-from emulators.modbus.bank import BIT_TABLES, IllegalValue, MapBank, RegisterBank, Table
+from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Table
 from emulators.modbus.unit import Handler, ModbusUnit
-from emulators.stated import Effects, cells_of, fits, spans_of
+from emulators.stated import Effects, bytes_of, cells_held, cells_of, fits, merged, spans_of
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import DeviceProfile, OwnFunction, Tag
 
@@ -74,9 +74,7 @@ class StatedRegisters(RegisterBank):
             value = _number(tag, value)
         cells = cells_of(tag, value, self._exponents[tag.name])
         if tag.bits is not None:
-            low, high = tag.bits
-            mask = (1 << (high - low + 1)) - 1 << low
-            cells = [self._cells.peek(at.table, at.address) & ~mask | cells[0]]
+            cells = [merged(tag, self._cells.peek(at.table, at.address), cells[0])]
         self._cells.poke(at.table, at.address, *cells)
 
     def _note_all(self, table: Table, addresses: range, now_ns: int) -> None:
@@ -86,10 +84,7 @@ class StatedRegisters(RegisterBank):
                 self._note(tag, now_ns)
 
     def _note(self, tag: Tag, now_ns: int) -> None:
-        at = tag.registers
-        cells = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
-        bits = at.table in BIT_TABLES
-        self.journal.note(tag.name, bytes(cells) if bits else b"".join(c.to_bytes(2, "big") for c in cells), now_ns)
+        self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
 
 def add_own_functions(unit: ModbusUnit, bank: StatedRegisters, profile: DeviceProfile) -> None:

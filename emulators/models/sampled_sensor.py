@@ -16,6 +16,7 @@ from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
 from emulators.signals import Signals
+from emulators.stated import bytes_of, cells_held
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import DeviceProfile, Tag
@@ -99,8 +100,7 @@ class SampledSensor(RegisterBank):
             self._set_period(self._held_period(), now_ns)
 
     def _held_period(self) -> int:
-        at = self._period_tag.registers
-        words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
+        words = cells_held(self._period_tag, self._cells.peek)
         return int(decode(words, self._period_tag.type, self._period_tag.order))
 
     def _on_write(self, table: Table, address: int, values: tuple[int, ...], now_ns: int) -> None:
@@ -151,7 +151,7 @@ class SampledSensor(RegisterBank):
         at = tag.registers
         words = encode(value, tag.type, tag.order, registers=at.count)
         self._cells.poke(at.table, at.address, *words)
-        self.journal.note(tag.name, b"".join(w.to_bytes(2) for w in words), now_ns)
+        self.journal.note(tag.name, bytes_of(tag, words), now_ns)
 
     def _note_tags(self, table: Table, address: int, count: int, now_ns: int) -> None:
         """Journal what a master's write made of the tags that it touched."""
@@ -162,9 +162,7 @@ class SampledSensor(RegisterBank):
 
     def _note(self, tag: Tag, now_ns: int) -> None:
         """Journal what the registers of `tag` hold now."""
-        at = tag.registers
-        words = [self._cells.peek(at.table, a) for a in range(at.address, at.end)]
-        self.journal.note(tag.name, b"".join(w.to_bytes(2) for w in words), now_ns)
+        self.journal.note(tag.name, bytes_of(tag, cells_held(tag, self._cells.peek)), now_ns)
 
 
 def _spans(profile: DeviceProfile) -> list[Span]:

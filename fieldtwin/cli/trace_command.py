@@ -16,9 +16,8 @@ from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Decoded, Exchange
 from fieldtwin.decoding.trace_file import read_events
 from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.clock import NS_PER_S
 from gateway.core.errors import UsageError
-
-NS_PER_S = 1_000_000_000
 
 
 @click.command("trace")

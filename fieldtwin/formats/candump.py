@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid
 from gateway.core.input_file import open_input
 
@@ -33,7 +34,7 @@ class LeftOut:
 
 def line_of(t_ns: int, frame: CanFrame, channel: str = "can0") -> bytes:
     """A frame's line, newline included. An error frame is written as candump does it: its class with the error flag."""
-    seconds, ns = divmod(t_ns, 1_000_000_000)
+    seconds, ns = divmod(t_ns, NS_PER_S)
     if frame.error:
         text = f"{frame.can_id | _ERROR_FLAG:08X}#{frame.data.hex().upper()}"
     elif frame.remote:
@@ -69,7 +70,7 @@ def read_log(path: Path, left: LeftOut | None = None) -> Iterator[tuple[int, str
                         expected="(SECONDS) NAME ID#DATA",
                         got=got,
                     )
-                t_ns = int(found[1]) * 1_000_000_000 + int(found[2].ljust(9, b"0"))
+                t_ns = int(found[1]) * NS_PER_S + int(found[2].ljust(9, b"0"))
                 frame = _frame(found[4], found[5])
                 if frame is None:
                     left.errors += 1

@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 from fieldtwin.formats.packed import unpacked
+from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid
 from gateway.core.input_file import open_input
 
@@ -31,7 +32,6 @@ _CLASSIC = {
 _SECTION = b"\x0a\x0d\x0d\x0a"
 _INTERFACE, _OBSOLETE, _SIMPLE, _ENHANCED = 1, 2, 3, 6
 _TSRESOL, _TSOFFSET = 9, 14
-NS_PER_S = 1_000_000_000
 
 Packet = tuple[int, int, bytes]
 """(time in ns since 1970, 0 where the file has none; link type; bytes)"""

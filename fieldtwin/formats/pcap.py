@@ -19,6 +19,7 @@ from typing import Any
 
 from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FieldtwinError, FileInvalid
@@ -31,7 +32,6 @@ LINKTYPE_CAN_SOCKETCAN = 227
 MAGIC_NS = 0xA1B23C4D
 """Time stamps in nanoseconds, in the byte order of the file: big endian."""
 SNAPLEN = 65_535
-NS_PER_S = 1_000_000_000
 
 MODBUS_PORT = 502
 CLIENT_PORT = 50_200

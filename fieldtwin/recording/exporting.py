@@ -21,6 +21,7 @@ from fieldtwin.formats.pcap import read_capture, write_pcap
 from fieldtwin.recording.rotating import RotatingFile, exchanges_of, header_of, parts_of
 from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
 from gateway.core.connection import Direction
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import FileInvalid, UsageError
@@ -261,7 +262,7 @@ def _start_ns(header: RecordingHeader) -> int:
     try:
         return round(datetime.fromisoformat(header.start_utc).timestamp() * 1e9)
     except (ValueError, OverflowError):
-        return 1_000_000_000  # unknown: a second after 1970 began, so that a handshake before it has a time too
+        return NS_PER_S  # unknown: a second after 1970 began, so that a handshake before it has a time too
 
 
 def _is_capture(path: Path) -> bool:

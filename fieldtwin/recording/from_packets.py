@@ -22,11 +22,11 @@ from fieldtwin.recording.modbus_talk import ModbusTalk
 from fieldtwin.recording.pairing import Bad, OneWirePairer, PairCounters, Pairer, SerialPairer
 from fieldtwin.recording.rotating import RotatingFile
 from gateway.core.canframe import CanFrame
+from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FieldtwinError, FileInvalid
 from gateway.core.recording import Exchange, RecordingHeader, encode_exchange, encode_header
 
 LINK_CAN, LINK_USER0, LINK_RTAC = 227, 147, 250
-NS_PER_S = 1_000_000_000
 MAX_SERVERS = 256
 EVERY = 4096
 """Packets between two reports of progress."""

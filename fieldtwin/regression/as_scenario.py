@@ -14,12 +14,12 @@ from itertools import pairwise
 from typing import Any
 
 from fieldtwin.regression.story import Change, Story
+from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FieldtwinError, UsageError
 from gateway.core.statemachine import decode_period
 from gateway.core.values import COMMAND
 from twin.system import System
 
-NS_PER_S = 1_000_000_000
 BRIEF_NS = 200_000_000
 """A state that lasted less is not waited for: a check might come too late for it."""
 RESTLESS = 3

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from statistics import median
 
 from fieldtwin.regression.story import Change, Story
+from gateway.core.clock import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 MOST_SHOWN = 1_000
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fieldtwin.report.markup import Markup, el
+from gateway.core.clock import NS_PER_S
 
-NS_PER_S = 1_000_000_000
 WIDTH = 1180.0
 LEFT = 176.0
 RIGHT = 14.0

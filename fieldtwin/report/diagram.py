@@ -13,7 +13,8 @@ from fieldtwin.decoding.tags import show_value
 from fieldtwin.report.axis import CHAR, LEFT, RIGHT, WIDTH, Axis, fitted, label, seconds
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.value_lanes import value_lane
-from fieldtwin.report.window import SECOND_NS, FaultBar, Step, Window
+from fieldtwin.report.window import FaultBar, Step, Window
+from gateway.core.clock import NS_PER_S
 from gateway.core.profile import Tag
 from twin.system import System
 
@@ -112,7 +113,7 @@ def _fault_lane(axis: Axis, bar: FaultBar) -> tuple[float, list[Markup]]:
 def _wire_lane(axis: Axis, window: Window, bus: str, system: System | None) -> tuple[float, list[Markup]]:
     """Requests that wait for an answer are boxes as long as the wait, messages are ticks; words where there is room."""
     config = system.buses.get(bus) if system else None
-    timeout_ns = round((config.timeout_s if config else 1.0) * SECOND_NS)
+    timeout_ns = round((config.timeout_s if config else 1.0) * NS_PER_S)
     exchanges = sorted((e for e in window.exchanges if e.bus == bus), key=lambda e: e.t_ns)
     marks = label(bus, config.endpoint.scheme.upper() if config else "")
     rows = sorted({_row(e) for e in exchanges})
@@ -219,7 +220,7 @@ def _time_axis(axis: Axis, window: Window, height: float) -> list[Markup]:
     for t_ns in range(first, window.end_ns + 1, max(1, step)):
         x = axis.x(t_ns)
         marks.append(el("line", cls="grid", x1=x, x2=x, y1=26.0, y2=height - 4))
-        marks.append(el("text", f"{t_ns / SECOND_NS:.{digits}f} s", cls="tick", x=x, y=16.0))
+        marks.append(el("text", f"{t_ns / NS_PER_S:.{digits}f} s", cls="tick", x=x, y=16.0))
     return marks
 
 

@@ -18,7 +18,8 @@ from fieldtwin.report.markup import Markup, el, join
 from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, SystemKey, Verdict, key_of
 from fieldtwin.report.requirements import requirement_section
 from fieldtwin.report.style import style
-from fieldtwin.report.window import MOST_FRAMES, SECOND_NS, Study, Window
+from fieldtwin.report.window import MOST_FRAMES, Study, Window
+from gateway.core.clock import NS_PER_S
 
 MOST_DRAWN = 16
 """Failures with a diagram and frames."""
@@ -238,7 +239,7 @@ def _failure(report: Report, number: int, scenario: ScenarioResult, windows: lis
             continue
         drawn.add(same)
         title = f"{scenario.title}, {window.check.number}: {window.check.text}"
-        parts.append(el("h4", f"Around {window.at_ns / SECOND_NS:.3f} s: {window.check.text}"))
+        parts.append(el("h4", f"Around {window.at_ns / NS_PER_S:.3f} s: {window.check.text}"))
         if window.lost:
             parts.append(el("p", "The trace no longer holds the beginning of this time.", cls="small"))
         parts += [
@@ -298,7 +299,7 @@ def _frames(window: Window, opened: bool) -> Markup:
         said = f"{line.text} ({bad})" if bad == "no reply" else line.text
         rows.append(
             el(
-                "tr", el("td", f"{line.t_ns / SECOND_NS:.6f}", cls="mono"), el("td", line.bus),
+                "tr", el("td", f"{line.t_ns / NS_PER_S:.6f}", cls="mono"), el("td", line.bus),
                 el("td", "→" if line.sent else "←", title="sent" if line.sent else "received"),
                 el("td", _cut(said, 400), cls="long check"), el("td", _cut(line.raw, 96), cls="mono raw"),
                 cls="bad" if bad else None,
@@ -318,7 +319,7 @@ def _frames(window: Window, opened: bool) -> Markup:
 def _moment(window: Window) -> Markup:
     said = f"{window.check.number}: {window.check.text}"
     return el(
-        "tr", el("td", f"{window.at_ns / SECOND_NS:.6f}", cls="mono"), el("td", _cut(said, 200), colspan=4), cls="mark"
+        "tr", el("td", f"{window.at_ns / NS_PER_S:.6f}", cls="mono"), el("td", _cut(said, 200), colspan=4), cls="mark"
     )
 
 
@@ -352,7 +353,7 @@ def _struck(scenario: ScenarioResult) -> list[Markup]:
 def _check_table(checks: Iterable[CheckResult]) -> Markup:
     rows = []
     for check in checks:
-        at = f"{check.t_ns / SECOND_NS:.3f}" if check.t_ns is not None else "–"
+        at = f"{check.t_ns / NS_PER_S:.3f}" if check.t_ns is not None else "–"
         found = [
             join([el("span", f"{name} ", cls="none"), _lines(_cut(said, MOST_SAID)), el("br")])
             for name, said in (("expected", check.expected), ("got", check.got), ("", check.reason)) if said

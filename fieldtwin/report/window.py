@@ -16,13 +16,13 @@ from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.report.coverage import Collector
 from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult
 from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.clock import NS_PER_S
 
-SECOND_NS = 1_000_000_000
 MOST_FRAMES = 160
 """Frames before the failure; a quarter as many behind it."""
 MOST_STEPS = 600
 MOST_EXCHANGES = 1500
-LONGEST_NS = 60 * SECOND_NS
+LONGEST_NS = 60 * NS_PER_S
 """Of what led to a failure, this much is drawn at most."""
 
 
@@ -99,8 +99,8 @@ def around(check: CheckResult, end_ns: int) -> Window | None:
         return None
     at = check.t_ns
     since = check.since_ns if check.since_ns is not None else at
-    led_up = min(LONGEST_NS, max(SECOND_NS, (at - since) * 6 // 5))
-    behind = max(SECOND_NS // 4, led_up // 6)
+    led_up = min(LONGEST_NS, max(NS_PER_S, (at - since) * 6 // 5))
+    behind = max(NS_PER_S // 4, led_up // 6)
     return Window(check, max(0, at - led_up), min(at + behind, max(end_ns, at + behind // 4)), at)
 
 

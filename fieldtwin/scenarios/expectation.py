@@ -10,10 +10,10 @@ from emulators.faults.schema import seconds
 from fieldtwin.decoding.exchange import SECRET, Exchange
 from fieldtwin.scenarios.bench import Bench, Reading
 from fieldtwin.scenarios.words import Bounds, Expect, WireForm
+from gateway.core.clock import NS_PER_S
 from gateway.devices.codec import decode, decode_little
 from twin.system import System
 
-_NS = 1_000_000_000
 Said = tuple[str, str] | None
 LIKE_S = 0.5
 """How long before a value's own time its device may have held it: a reply takes its time on the wire."""
@@ -110,7 +110,9 @@ def judge_wire(expect: Expect, watched: Watched) -> Said:
     assert expect.wire is not None
     since_s = watched.since_s if expect.requests_per_s is not None else watched.stimulus_s
     seen = [
-        x for x in watched.exchanges if x.device == expect.wire and x.t_ns >= since_s * _NS and wire_matches(expect, x)
+        x
+        for x in watched.exchanges
+        if x.device == expect.wire and x.t_ns >= since_s * NS_PER_S and wire_matches(expect, x)
     ]
     if expect.requests_per_s is not None:
         took_s = max(watched.bench.now_s() - since_s, 0.001)

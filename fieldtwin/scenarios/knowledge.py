@@ -14,11 +14,11 @@ from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.expectation import is_secret
 from fieldtwin.scenarios.expression import Expression
 from fieldtwin.scenarios.trace import Event, Kind
+from gateway.core.clock import NS_PER_S
 from twin.system import System
 
 PENDING_S = 5.0
 """How long ``command pending`` is true after the remote client's command."""
-_NS = 1_000_000_000
 
 
 class Knowledge:
@@ -82,7 +82,7 @@ class Knowledge:
         last, why = self._last.get(name), self._bench.why_unknown(name)
         if last is None:
             return f"never published{f' ({why})' if why else ''}"
-        at = f"{last.t_ns / _NS:.3f} s"
+        at = f"{last.t_ns / NS_PER_S:.3f} s"
         if last.kind is Kind.STATE and last.data.get("value") is not None:
             return f"never read back; a program set it to {SECRET if secret else repr(last.data['value'])} at {at}"
         why = why or str(last.data.get("reason", "")).replace("_", " ")

@@ -6,12 +6,12 @@ from collections.abc import Collection, Iterable, Sequence
 
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.report.model import CheckResult, Verdict
+from gateway.core.clock import NS_PER_S
 
 SECONDS = 5
 """How long before the failed check an exchange may have ended and still be shown."""
 MOST = 10
 """Exchanges that are shown: the last ones. The first line says how many were left out."""
-_NS = 1_000_000_000
 
 
 def last_exchanges(exchanges: Iterable[Exchange], check: CheckResult, devices: Collection[str]) -> list[str]:
@@ -21,7 +21,7 @@ def last_exchanges(exchanges: Iterable[Exchange], check: CheckResult, devices: C
     shown with the exchanges of all devices. Values of secret tags stay hidden, as in every decoded text.
     """
     at_ns = check.t_ns or 0
-    near = [e for e in exchanges if e.t_ns <= at_ns and e.end_ns >= at_ns - SECONDS * _NS]
+    near = [e for e in exchanges if e.t_ns <= at_ns and e.end_ns >= at_ns - SECONDS * NS_PER_S]
     about = sorted({device for name in check.names if (device := _device_of(name, devices))})
     of_these = [e for e in near if e.device in about]
     whose = f" with {', '.join(about)}" if of_these else ""
@@ -36,7 +36,7 @@ def last_exchanges(exchanges: Iterable[Exchange], check: CheckResult, devices: C
 
 def line_of(exchange: Exchange) -> str:
     """Return an exchange as ``12.340 s  ctd: read pressure -> ctd: pressure 1.2 dbar``."""
-    at = f"{exchange.t_ns / _NS:.3f} s"
+    at = f"{exchange.t_ns / NS_PER_S:.3f} s"
     if exchange.is_stray:
         return f"{at}  {exchange.text}"
     pending = "no reply so far" if exchange.problem == "pending" else ""

@@ -30,6 +30,7 @@ from fieldtwin.scenarios.standing import Standing
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.whole_run import WholeRun
 from fieldtwin.scenarios.words import Expect, Step, word_of
+from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FieldtwinError, UsageError
 
 TICK_S = 0.02
@@ -45,7 +46,6 @@ NO_FRESH_START = (
     "`start: fresh` begins PLC, simulation and devices anew, which is possible only where the devices are simulated "
     "and the PLC is fieldtwin's"
 )
-_NS = 1_000_000_000
 
 
 @dataclass
@@ -269,7 +269,7 @@ class Runner:
             text,
             verdict,
             self._now_ns(),
-            round(since_s * _NS),
+            round(since_s * NS_PER_S),
             expected,
             got,
             where=self.scenario.line("steps", n),
@@ -441,7 +441,7 @@ class Runner:
         since_s = self.bench.now_s() - said.bound_s - RECENT_S
         broken = _Broken(verdict, said.expected, said.got, said.bound_s, since_s)
         verdict, expected, got = self._judged_on_time(broken, since_s)
-        since_ns, now_ns = round(said.since_s * _NS), self._now_ns()
+        since_ns, now_ns = round(said.since_s * NS_PER_S), self._now_ns()
         raise _RuleBroken(
             CheckResult(
                 said.number,
@@ -502,4 +502,4 @@ class Runner:
                 self._standing.saw(exchange)
 
     def _now_ns(self) -> int:
-        return round(self.bench.now_s() * _NS)
+        return round(self.bench.now_s() * NS_PER_S)

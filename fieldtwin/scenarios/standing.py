@@ -20,8 +20,7 @@ from fieldtwin.scenarios.invariants import Invariants, Stated
 from fieldtwin.scenarios.knowledge import Knowledge
 from fieldtwin.scenarios.violation import Violation
 from fieldtwin.scenarios.words import WireForm
-
-_NS = 1_000_000_000
+from gateway.core.clock import NS_PER_S
 
 
 class Standing:
@@ -121,7 +120,7 @@ class AlwaysRule:
         if self.unknown_s is not None:
             verdict = Verdict.INCONCLUSIVE
             got += f"; unknown at {self.unknown_looks} looks, first at {self.unknown_s:.3f} s"
-        since_ns = round((self.since_s or 0.0) * _NS)
+        since_ns = round((self.since_s or 0.0) * NS_PER_S)
         return CheckResult(
             self.number,
             self.expression.text,
@@ -159,7 +158,7 @@ class _NeverOnWire:
         while self.watched:
             exchange = self.watched.popleft()
             if not excused and exchange.device == self.form.wire and wire_matches(self.form, exchange):
-                seen_s = exchange.t_ns / _NS
+                seen_s = exchange.t_ns / NS_PER_S
                 return Violation(
                     self.number, said(self.form), exchange.text, (self.form.wire,), 0.0, seen_s, self.where
                 )

@@ -23,10 +23,10 @@ from fieldtwin.scenarios.lateness import allowance
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.violation import Violation
 from fieldtwin.scenarios.words import Cycle, Rate
+from gateway.core.clock import NS_PER_S
 
 SAMPLES = 500
 """Looks that a rate remembers: its windows begin that much apart at most."""
-_NS = 1_000_000_000
 
 
 class WholeRun:
@@ -306,7 +306,7 @@ class _Cycle:
         if value == self._value:
             return
         known, self._value = self._value is not None, value
-        at_s = event.t_ns / _NS
+        at_s = event.t_ns / NS_PER_S
         if known and self._last_s is not None:
             self._between.append((self._last_s, at_s))
         self._last_s = at_s if known else None

@@ -12,6 +12,7 @@ from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.connection import PROTOCOL, ByteConnection
 from gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
 from gateway.core.profile import RegisterRange, Tag
@@ -297,7 +298,7 @@ class RegisterDriver(DeviceDriver):
         period_s = period.value if period is not None and isinstance(period.value, int) else 0
         if not self._sample_t_ns or period_s <= 0:
             return Reason.NOT_SAMPLING
-        limit_ns = period_s * 1_000_000_000 + sampled.slack_ms * 1_000_000
+        limit_ns = period_s * NS_PER_S + sampled.slack_ms * NS_PER_MS
         return Reason.NONE if now_ns - self._sample_t_ns <= limit_ns else Reason.NOT_SAMPLING
 
     # -- writing ------------------------------------------------------------------------------------------------------

@@ -14,9 +14,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
-MS = 1_000_000
+from gateway.core.clock import NS_PER_MS, NS_PER_S
+
+MS = NS_PER_MS
 """One millisecond in ns: ``PT=500 * MS``."""
-SECOND = 1_000_000_000
+SECOND = NS_PER_S
 
 
 class FunctionBlock(ABC):

@@ -9,6 +9,7 @@ from fractions import Fraction
 from math import isfinite
 from typing import Any
 
+from gateway.core.clock import NS_PER_S
 from plc.st import types as ty
 from plc.st.tree import Literal
 from plc.st.values import real
@@ -152,5 +153,5 @@ def _moment(kind: str, text: str) -> Constant:
     if seconds >= 60:
         raise Malformed("no such date or time: a minute has 60 seconds")
     since = base - datetime(1970, 1, 1, tzinfo=UTC)
-    value = (since.days * 86_400 + since.seconds) * 1_000_000_000 + int(seconds * 1_000_000_000)
+    value = (since.days * 86_400 + since.seconds) * NS_PER_S + int(seconds * NS_PER_S)
     return Constant(value, {"DATE": ty.DATE, "TIME_OF_DAY": ty.TOD}.get(kind, ty.DT))

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.errors import Blame, FieldtwinError
 from plc.st.references import Cell, Cut, Element, Member
 
@@ -24,8 +25,6 @@ _FLOAT = struct.Struct("<f")
 _WHOLE = re.compile(r"[+-]?[0-9][0-9_]{0,39}", re.ASCII)
 _BASED = re.compile(r"(2|8|16)#([0-9a-f][0-9a-f_]{0,79})", re.ASCII | re.IGNORECASE)
 _REAL = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)(e[+-]?[0-9]+)?", re.ASCII | re.IGNORECASE)
-_NS = 1_000_000_000
-MS = 1_000_000
 MAX_SHOWN = 60
 
 
@@ -295,11 +294,11 @@ def duration_text(ns: int, prefix: str) -> str:
     """``T#1h2m3s4ms``, the largest units first, none that is zero."""
     rest, out = abs(ns), []
     for unit, size in (
-        ("d", 86_400 * _NS),
-        ("h", 3_600 * _NS),
-        ("m", 60 * _NS),
-        ("s", _NS),
-        ("ms", MS),
+        ("d", 86_400 * NS_PER_S),
+        ("h", 3_600 * NS_PER_S),
+        ("m", 60 * NS_PER_S),
+        ("s", NS_PER_S),
+        ("ms", NS_PER_MS),
         ("us", 1000),
         ("ns", 1),
     ):

@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import Protocol
 
 from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
+from gateway.core.clock import NS_PER_MS, NS_PER_S
 from gateway.core.errors import UsageError
 from gateway.protocols.canopen import cob_id
 
 NS_PER_US = 1_000
-_DAY_NS = 24 * 3600 * 1_000_000_000
+_DAY_NS = 24 * 3600 * NS_PER_S
 _DAYS_TO_1984 = 5113
 """1970-01-01 to 1984-01-01, the first day of TIME_OF_DAY (7.1.6.5)."""
 COUNTER_MAX = 240

@@ -15,7 +15,6 @@ from fieldtwin.report.model import Verdict
 
 pytestmark = [
     pytest.mark.interop,
-    pytest.mark.slow,
     pytest.mark.timeout(120),
 ]
 KNOWN = tomllib.loads((Path(__file__).parent / "strangers.toml").read_text())

@@ -17,7 +17,7 @@ from compare import Comparison, DeviceRules, Tolerances, compare, load_tolerance
 from conversation import Conversation
 from held import Held
 
-pytestmark = [pytest.mark.interop, pytest.mark.slow, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.interop, pytest.mark.timeout(120)]
 
 DEVICES = ["ctd", "modem", "inclinometer"]
 

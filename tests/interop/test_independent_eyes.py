@@ -18,7 +18,7 @@ from gateway.connections.tap import Captured
 from gateway.core.canframe import CanFrame
 from gateway.core.endpoint import Endpoint
 
-pytestmark = [pytest.mark.interop, pytest.mark.slow, pytest.mark.timeout(120), needs_tshark]
+pytestmark = [pytest.mark.interop, pytest.mark.timeout(120), needs_tshark]
 
 
 @pytest.fixture(params=["with_emulators", "with_strangers"])

@@ -33,7 +33,6 @@ from twin.system import load_system
 
 pytestmark = [
     pytest.mark.interop,
-    pytest.mark.slow,
     pytest.mark.skipif(shutil.which("socat") is None, reason="socat is not installed"),
 ]
 SETTINGS = "baudrate=19200&frame=8E1"

@@ -22,7 +22,6 @@ from gateway.core.endpoint import Endpoint
 pytestmark = [
     pytest.mark.socketcan,
     pytest.mark.interop,
-    pytest.mark.slow,
     pytest.mark.timeout(300),
     pytest.mark.skipif(shutil.which("candump") is None, reason="can-utils is not installed"),
 ]

@@ -72,7 +72,6 @@ def test_a_failure_stays_one_and_says_of_its_faults_as_well(tmp_path: Path) -> N
     assert result.faults[0].struck == 0
 
 
-@pytest.mark.slow
 def test_faults_are_counted_in_processes_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     idle = "  - fault: {id: idle, name: silence, device: modem, function: 23}\n"

@@ -90,7 +90,7 @@ def run(path: Path, target: str = "virtual") -> ScenarioResult:
     [(AT_ONCE, "pump.st:9"), (PYTHON, ".py:10")],
     ids=["ST divides by zero in its first scan", "Python raises"],
 )
-@pytest.mark.parametrize("target", ["virtual", pytest.param("local", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("target", ["virtual", "local"])
 def test_a_program_that_fails_in_its_first_scan_fails_the_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, logic: str, place: str, target: str
 ) -> None:

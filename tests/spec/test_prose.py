@@ -25,8 +25,6 @@ from gateway.core.clock import NS_PER_S
 from gateway.core.recording import RecordingReader, shown
 from twin.system import load_system
 
-pytestmark = pytest.mark.slow
-
 WITNESS = """
 import os, sys
 _log = os.open(os.environ["SPEC_OPENED"], os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)

@@ -77,7 +77,6 @@ async def mbpoll(port: int, unit: int, *args: str, values: tuple[str, ...] = ())
 
 
 @pytest.mark.interop
-@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
 def test_mbpoll_through_the_bridge(tmp_path: Path) -> None:
     async def main() -> None:
@@ -97,7 +96,6 @@ def test_mbpoll_through_the_bridge(tmp_path: Path) -> None:
     run(main(), timeout_s=40)
 
 
-@pytest.mark.slow
 def test_pymodbus_clients_through_the_bridge_and_read_only_unless_told(tmp_path: Path) -> None:
     async def reads(port: int, unit: int) -> None:
         client = AsyncModbusTcpClient("127.0.0.1", port=port, timeout=10)

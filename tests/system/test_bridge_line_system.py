@@ -26,7 +26,6 @@ from gateway.core.endpoint import Endpoint
 from gateway.core.nursery import Nursery
 from gateway.wallclock import WallClock
 
-pytestmark = pytest.mark.slow
 LINE = "baudrate=115200&frame=8N1"
 SYSTEM = """
 fieldtwin: 1

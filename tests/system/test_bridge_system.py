@@ -18,7 +18,6 @@ from gateway.core.errors import ModbusExceptionReply
 from gateway.protocols.modbus.client import ModbusClient
 from gateway.wallclock import WallClock
 
-pytestmark = pytest.mark.slow
 SYSTEMS = CHECKOUT / "profiles" / "systems"
 SECTIONS = """
 serve:

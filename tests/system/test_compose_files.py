@@ -229,7 +229,6 @@ def container_health(*sockets: Path) -> tuple[int, str]:
     return done.returncode, done.stdout.strip()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(150)  # a shore of 8 s and four starts: half a minute on a busy computer
 @pytest.mark.long
 def test_field_side_controller_and_shore_as_three_strangers(tmp_path: Path) -> None:

@@ -8,8 +8,6 @@ from pathlib import Path
 import pytest
 from procs import CHECKOUT, every_device_online, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
-pytestmark = pytest.mark.slow
-
 RUN = ("run", "observatory", "--prototype", "--json", "--instance", "r")
 
 

@@ -24,8 +24,6 @@ from procs import (
     wait_for,
 )
 
-pytestmark = pytest.mark.slow
-
 PROTOTYPE = ("run", "observatory", "--prototype", "--commands", "none", "--json")
 ROWS = 2400
 STEP_S = 0.25

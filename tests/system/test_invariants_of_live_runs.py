@@ -83,7 +83,6 @@ def summary(folder: Path) -> dict[str, Any]:
     return told
 
 
-@pytest.mark.slow
 def test_a_live_run_with_a_broken_invariant_is_not_ok(folder: Path) -> None:
     (folder / "well.st").write_text(PROGRAM % "10")
     told = summary(folder)
@@ -95,7 +94,6 @@ def test_a_live_run_with_a_broken_invariant_is_not_ok(folder: Path) -> None:
     assert error.endswith("plant.yaml:14)")
 
 
-@pytest.mark.slow
 def test_a_live_run_whose_invariants_hold_says_so(folder: Path) -> None:
     (folder / "well.st").write_text(PROGRAM % "50")
     told = summary(folder)
@@ -103,7 +101,6 @@ def test_a_live_run_whose_invariants_hold_says_so(folder: Path) -> None:
     assert not [error for error in told["errors"] if "invariant" in error]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("limit", "verdict"), [("10", Verdict.FAILED), ("50", Verdict.PASSED)])
 def test_a_scenario_on_the_target_local_judges_invariants(folder: Path, limit: str, verdict: Verdict) -> None:
     (folder / "well.st").write_text(PROGRAM % limit)

@@ -27,8 +27,6 @@ from procs import (
 )
 from stores import log_of, own
 
-pytestmark = pytest.mark.slow
-
 PROTOTYPE = ("run", "observatory", "--prototype", "--commands", "none", "--json")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from procs import no_tracebacks, run_to_end
 
-pytestmark = [pytest.mark.slow, pytest.mark.long, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 
 RELAYED = """
 scenario: what the ship says reaches the eastern observatory over the two others

@@ -20,8 +20,6 @@ from twin.system import load_system
 HERE = CHECKOUT / "examples" / "own-plc"
 MODBUS_H = Path("/usr/include/modbus/modbus.h")
 
-pytestmark = pytest.mark.slow
-
 
 def compiled(source: str, to: Path) -> Path:
     if shutil.which("cc") is None or not MODBUS_H.exists():

@@ -26,8 +26,6 @@ from procs import (
 )
 from stores import Row, log_of, own
 
-pytestmark = pytest.mark.slow
-
 SYSTEMS = CHECKOUT / "profiles" / "systems"
 
 

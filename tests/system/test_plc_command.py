@@ -25,7 +25,6 @@ def plc(*args: str) -> str:
 
 
 @pytest.mark.long
-@pytest.mark.slow
 def test_a_running_plc_is_watched_forced_stepped_and_asked_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FIELDTWIN_RUN", str(tmp_path))
     with pytest.raises(Unreachable, match="no PLC is running"):

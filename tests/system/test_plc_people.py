@@ -76,7 +76,6 @@ def status() -> Any:
     return plc("status", "--json")
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_a_plc_of_two_tasks_is_forced_stepped_and_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with station(tmp_path, monkeypatch):
@@ -102,7 +101,6 @@ def test_a_plc_of_two_tasks_is_forced_stepped_and_stopped(tmp_path: Path, monkey
         assert status()["inputs"]["drive.pressure"]["quality"] == "bad"
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(180)
 def test_a_reload_names_a_program_whose_file_was_edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with station(tmp_path, monkeypatch):

@@ -11,8 +11,6 @@ from typing import Any
 import pytest
 from procs import Fieldtwin, no_tracebacks, run_to_end
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory: pytest.TempPathFactory) -> Fieldtwin:

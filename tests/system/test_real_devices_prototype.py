@@ -6,10 +6,8 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
-import pytest
 from procs import fieldtwin, no_tracebacks, wait_for
 
-pytestmark = pytest.mark.slow
 SYSTEM = """
 fieldtwin: 1
 system: workshop

@@ -143,7 +143,6 @@ def test_a_read_only_plant_says_what_it_did_not_write_and_is_ok(tmp_path: Path) 
     assert {e["tag"] for e in refused if e["action"] == "refuse"} == {"drive.speed", "drive.run"}
 
 
-@pytest.mark.slow
 def test_a_force_that_is_refused_is_on_record(tmp_path: Path) -> None:
     with fieldtwin(tmp_path, "run", str(written(tmp_path)), "--prototype", "--instance", "f") as run:
         plc = run.control("f", "plc")

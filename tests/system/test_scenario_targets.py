@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 from procs import Fieldtwin, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
-pytestmark = pytest.mark.slow
-
 EVERYTHING = """
 scenario: everything at once
 system: observatory

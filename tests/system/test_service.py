@@ -35,7 +35,6 @@ def edit(path: Path, old: str, new: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.slow
 def test_a_run_under_systemd(tmp_path: Path) -> None:
     run_dir = tmp_path / "r"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd, (tmp_path / "err").open("w+") as said:

@@ -8,7 +8,6 @@ import pytest
 from procs import fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 
-@pytest.mark.slow
 @pytest.mark.long
 def test_a_shadow_opposite_a_prototype_follows_its_states_and_survives_its_own_death(tmp_path: Path) -> None:
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
@@ -35,7 +34,6 @@ def test_a_shadow_opposite_a_prototype_follows_its_states_and_survives_its_own_d
     no_tracebacks(root)
 
 
-@pytest.mark.slow
 def test_a_shadow_of_nobody_says_so(tmp_path: Path) -> None:
     ended = run_to_end(
         tmp_path / "r",

@@ -22,7 +22,7 @@ from stores import ask, log_of, own
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
 from mosquitto_here import broker
 
-pytestmark = [pytest.mark.slow, pytest.mark.long, pytest.mark.interop, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.long, pytest.mark.interop, pytest.mark.timeout(240)]
 
 FAULTS = """faults:
   - {name: drop, direction: both, probability: 0.2}

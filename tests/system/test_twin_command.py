@@ -10,7 +10,6 @@ import pytest
 from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, wait_for
 
 
-@pytest.mark.slow
 def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_path: Path) -> None:
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"
     shutil.copytree(CHECKOUT / "profiles", tmp_path / "profiles")
@@ -45,7 +44,6 @@ def test_a_twin_commands_a_prototype_and_a_restarted_one_repeats_nothing(tmp_pat
     no_tracebacks(root)
 
 
-@pytest.mark.slow
 @pytest.mark.long
 def test_a_twin_that_asks_first_sends_what_its_prototype_allows_and_nothing_else(tmp_path: Path) -> None:
     root, place = tmp_path / "r", f"tcp://127.0.0.1:{free_port()}"

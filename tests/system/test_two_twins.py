@@ -22,7 +22,6 @@ def what_if(root: Path, system: str, instance: str) -> tuple[int, str, int]:
     return ended.process.returncode, state, outcome["variables"]["ctd.sample_period_s"]["last"]
 
 
-@pytest.mark.slow
 @pytest.mark.long
 def test_two_twins_of_one_system_run_side_by_side_and_each_has_its_own_plant(tmp_path: Path) -> None:
     root = tmp_path / "r"

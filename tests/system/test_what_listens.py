@@ -20,7 +20,7 @@ import pytest
 from procs import CHECKOUT, Asking, alive, fieldtwin, free_port, run_to_end, wait_for
 from wires.modbus_pki import make_pki
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(180)]
+pytestmark = pytest.mark.timeout(180)
 LISTENING = "0A"
 LOOPBACK = "127.0.0.1"
 

@@ -43,7 +43,6 @@ def test_a_stranger_finds_every_port(tmp_path: Path) -> None:
     no_tracebacks(tmp_path)
 
 
-@pytest.mark.slow
 @pytest.mark.interop
 @pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
 def test_mbpoll_reads_the_sensor(tmp_path: Path) -> None:
@@ -66,7 +65,6 @@ def test_what_cannot_start_is_said_before_anything_runs(tmp_path: Path, words: l
     assert not [path for path in tmp_path.iterdir() if path.is_dir()]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_a_signal_ends_the_program_first_and_then_the_field(tmp_path: Path, number: int) -> None:
     script = "trap 'echo told; exit 5' INT TERM; echo up; while :; do sleep 0.05; done"
@@ -79,7 +77,6 @@ def test_a_signal_ends_the_program_first_and_then_the_field(tmp_path: Path, numb
     wait_for(lambda: not Path(f"/proc/{field}").exists(), 5, "the field side ended")
 
 
-@pytest.mark.slow
 def test_a_field_that_dies_is_no_success(tmp_path: Path) -> None:
     script = "echo up; while [ ! -e gone ]; do sleep 0.05; done"
     with fieldtwin(tmp_path, "with", "--instance", "w", "observatory", "--", "sh", "-c", script) as started:

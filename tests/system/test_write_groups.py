@@ -27,7 +27,6 @@ HALF_AN_HOUR_LATER = TOO_FAST.replace("speed := 60.0", "speed := SEL(pressure > 
 
 
 @pytest.mark.long
-@pytest.mark.slow
 @pytest.mark.parametrize(("system", "prototype"), [(GROUPED, PROTOTYPE), (LINE, ON_PTY)], ids=["TCP", "serial line"])
 def test_a_modbus_drive_is_not_started_with_its_old_speed(tmp_path: Path, system: str, prototype: str) -> None:
     path = written(tmp_path, HALF_AN_HOUR_LATER, system=system, prototype=prototype)
@@ -50,7 +49,6 @@ def test_a_modbus_drive_is_not_started_with_its_old_speed(tmp_path: Path, system
     no_tracebacks(tmp_path)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("by_rpdo", [True, False], ids=["in one RPDO", "over SDO"])
 def test_a_canopen_drive_is_not_started_with_its_old_speed(tmp_path: Path, *, by_rpdo: bool) -> None:
     system = WINCH_SYSTEM.replace(

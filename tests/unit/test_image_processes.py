@@ -44,7 +44,7 @@ while True:
 @pytest.mark.parametrize(
     ("reads", "rounds"),
     [
-        pytest.param(READS, ROUNDS, marks=pytest.mark.slow),
+        (READS, ROUNDS),
         pytest.param(100 * READS, 10 * ROUNDS, marks=[pytest.mark.long, pytest.mark.timeout(900)]),
     ],
 )

@@ -118,7 +118,6 @@ def pytest_collection_finish():
 """A user's environment that has pytest and fieldtwin without what that depends on; nothing is imported before a test runs."""
 
 
-@pytest.mark.slow
 def test_the_docs_run_where_nothing_but_pytest_is_installed(pytester: pytest.Pytester) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (HERE / "docs/testing.md").read_text(), re.DOTALL)
     for block in blocks:
@@ -172,7 +171,6 @@ def test_a_running_plc_is_steered(prototype, plc):
     assert properties == ["METER-3", "METER-7"]
 
 
-@pytest.mark.slow
 def test_workers_of_xdist_do_not_meet(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """

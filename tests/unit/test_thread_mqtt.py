@@ -37,7 +37,6 @@ def host(here: Mosquitto) -> MqttCarrier:
     )
 
 
-@pytest.mark.slow
 def test_over_a_broker_with_loss_deaths_and_a_broker_that_restarts_both_logs_are_equal(tmp_path: Path) -> None:
     async def main() -> None:
         with broker(tmp_path) as here:

@@ -12,7 +12,6 @@ import termios
 from pathlib import Path
 from typing import Any
 
-import pytest
 from support import eventually, run
 
 from emulators.canopen.dictionary import parse_eds
@@ -58,7 +57,6 @@ async def answer_at(end: PtyEnd, speed: int) -> None:
         os.close(port)
 
 
-@pytest.mark.slow
 def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line", Endpoint.parse("pty:line"))
@@ -85,7 +83,6 @@ def test_a_pty_with_a_hidden_baud_rate(tmp_path: Path) -> None:
     run(main(), timeout_s=40)
 
 
-@pytest.mark.slow
 def test_rtu_over_tcp_and_nobody_there() -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         device = slave()
@@ -126,7 +123,6 @@ def test_a_drive_on_the_software_bus() -> None:
     run(main(), timeout_s=40)
 
 
-@pytest.mark.slow
 def test_an_interrupt_keeps_what_was_found_and_says_that_it_is_not_all(tmp_path: Path) -> None:
     async def main() -> None:
         end = await PtyEnd.open(tmp_path / "line", Endpoint.parse("pty:line"))

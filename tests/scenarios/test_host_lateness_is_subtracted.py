@@ -11,8 +11,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 from click.testing import CliRunner
+from late_host_rig import HEAD, judged_on
 
-from emulators.virtual.loop import VirtualLoop
 from fieldtwin.cli import test_command
 from fieldtwin.report.html import render_html
 from fieldtwin.report.junit import render_junit
@@ -23,11 +23,7 @@ from fieldtwin.running.scenario_targets import Target, run_scenario
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.scenarios.runner import Runner
-from fieldtwin.scenarios.trace import Trace
-from twin.prototype_file import load_prototype
 
-HEAD = "scenario: a test\nsystem: observatory\n"
 REACTS = "steps:\n  - pause: 1s\n  - send: {period_s: 1}\n  - expect: {that: \"relay.state == 'ACTIVE'\", within: %s}\n"
 
 
@@ -41,20 +37,7 @@ def judge(folder: Path, text: str, own_s: float, any_s: float, target: str = "lo
             return own_s, any_s
 
     LateBench.target = target
-    path = folder / "x.scenario.yaml"
-    path.write_text(HEAD + text)
-    scenario = load_scenario(path)
-    loop = VirtualLoop()
-
-    async def main() -> ScenarioResult:
-        prototype = load_prototype(scenario.system, None)
-        async with LateBench(scenario.system, prototype, loop, folder, Trace()) as bench:
-            return await Runner(scenario, bench).run()
-
-    try:
-        return loop.run_until_complete(main())
-    finally:
-        loop.close()
+    return judged_on(LateBench, folder, text)
 
 
 @pytest.fixture(scope="module")

@@ -7,20 +7,14 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from late_host_rig import HEAD, judged_on
 
-from emulators.virtual.loop import VirtualLoop
 from fieldtwin.cli.test_command import command
 from fieldtwin.conformance.waivers import Waiver, Waivers
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.bench import Can
-from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.scenarios.runner import Runner
-from fieldtwin.scenarios.trace import Trace
 from fieldtwin.scenarios.waiving import all_well, waive
-from twin.prototype_file import load_prototype
-
-HEAD = "scenario: a test\nsystem: observatory\n"
 
 
 class LateBench(VirtualBench):
@@ -36,23 +30,6 @@ class LateBench(VirtualBench):
 
     def late_ms(self) -> float:
         return 7.0
-
-
-def judge(folder: Path, text: str) -> ScenarioResult:
-    path = folder / "x.scenario.yaml"
-    path.write_text(HEAD + text)
-    scenario = load_scenario(path)
-    loop = VirtualLoop()
-
-    async def main() -> ScenarioResult:
-        prototype = load_prototype(scenario.system, None)
-        async with LateBench(scenario.system, prototype, loop, folder, Trace()) as bench:
-            return await Runner(scenario, bench).run()
-
-    try:
-        return loop.run_until_complete(main())
-    finally:
-        loop.close()
 
 
 @pytest.mark.parametrize(
@@ -72,7 +49,7 @@ def judge(folder: Path, text: str) -> ScenarioResult:
     ],
 )
 def test_a_late_host_proves_nothing_about_short_times(tmp_path: Path, text: str, verdict: Verdict) -> None:
-    result = judge(tmp_path, text)
+    result = judged_on(LateBench, tmp_path, text)
     assert result.verdict is verdict, result.checks
     if verdict is Verdict.INCONCLUSIVE:
         assert "late" in result.checks[-1].got

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from tank_plant import write_plant
 
 from fieldtwin.cli.run_command import command as run_command
 from fieldtwin.report.model import ScenarioResult, Verdict
@@ -19,13 +20,6 @@ from fieldtwin.running.shrink import same_failure, smallest
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 
-PROFILE = """device: fieldtwin/tank
-source: "made for this test"
-protocol: modbus
-numbering: sent
-tags:
-  level: {at: "holding:0", poll: level}
-"""
 PLANT = """fieldtwin: 1
 system: plant
 buses:
@@ -36,12 +30,6 @@ plc:
   cycle_ms: 100
   programs:
     pump: {source: pump.st, inputs: {level: {tag: sensor.level}}}
-"""
-PROTOTYPE = """prototype_of: plant.yaml
-buses:
-  lan: {listen: "tcp://127.0.0.1:0"}
-devices:
-  sensor: {model: profile, values: {level: 42}}
 """
 PROGRAM = """PROGRAM Pump
 VAR_INPUT
@@ -61,8 +49,7 @@ CORRECT = PROGRAM % "IF NOT IS_GOOD(level) THEN share := 0; END_IF;"
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    for name, text in (("tank.yaml", PROFILE), ("plant.yaml", PLANT), ("plant.prototype.yaml", PROTOTYPE)):
-        (tmp_path / name).write_text(text)
+    write_plant(tmp_path, PLANT)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
+from tank_plant import DIVIDES_BY_ZERO, PLANT, PROTOTYPE, write_plant
 
 from fieldtwin.report.html import write_html
 from fieldtwin.report.junit import write_junit
@@ -18,43 +19,8 @@ from fieldtwin.report.model import Report, ScenarioResult, Verdict
 from fieldtwin.running.scenario_targets import Target, run_scenario
 from fieldtwin.scenarios.form import load_scenario
 
-PROFILE = """device: fieldtwin/tank
-source: "made for this test"
-protocol: modbus
-numbering: sent
-tags:
-  level: {at: "holding:0", poll: level}
-"""
-PLANT = """fieldtwin: 1
-system: plant
-buses:
-  lan: {url: "tcp://192.0.2.1:502"}
-devices:
-  sensor: {profile: tank.yaml, bus: lan, unit: 1, poll: {level: {every_ms: 100}}}
-plc:
-  cycle_ms: 50
-  programs:
-    pump: {source: PUMP, inputs: {level: {tag: sensor.level}}}
-"""
-PROTOTYPE = """prototype_of: plant.yaml
-buses:
-  lan: {listen: "tcp://127.0.0.1:0"}
-devices:
-  sensor: {model: profile, values: {level: 42}}
-"""
-AT_ONCE = """PROGRAM Pump
-VAR_INPUT
-  level : INT;
-END_VAR
-VAR
-  zero  : INT;
-  fault : BOOL;
-END_VAR
-  fault := 3 / zero > 3;
-END_PROGRAM
-"""
-WELL = AT_ONCE.replace("3 / zero > 3", "FALSE AND zero > level")
-LATER = AT_ONCE.replace("3 / zero > 3", "100 / (level - 7) > 1000")
+WELL = DIVIDES_BY_ZERO.replace("3 / zero > 3", "FALSE AND zero > level")
+LATER = DIVIDES_BY_ZERO.replace("3 / zero > 3", "100 / (level - 7) > 1000")
 PYTHON = """from gateway.core.image import TagKind
 from plc.program import Program, ScanInfo, var_input, var_local
 
@@ -73,9 +39,7 @@ def plant(folder: Path, logic: str, steps: str, head: str = "") -> Path:
     module = f"pump_{abs(hash(folder))}"  # a module is imported once in a process
     source = f'"python: {module}:Pump"' if "class" in logic else "pump.st"
     (folder / (f"{module}.py" if "class" in logic else "pump.st")).write_text(logic)
-    (folder / "tank.yaml").write_text(PROFILE)
-    (folder / "plant.yaml").write_text(PLANT.replace("PUMP", source))
-    (folder / "plant.prototype.yaml").write_text(PROTOTYPE)
+    write_plant(folder, PLANT.replace("pump.st", source))
     path = folder / "x.scenario.yaml"
     path.write_text(f"scenario: the pump has no fault\nsystem: plant.yaml\n{head}steps:\n{steps}")
     return path
@@ -87,7 +51,7 @@ def run(path: Path, target: str = "virtual") -> ScenarioResult:
 
 @pytest.mark.parametrize(
     ("logic", "place"),
-    [(AT_ONCE, "pump.st:9"), (PYTHON, ".py:10")],
+    [(DIVIDES_BY_ZERO, "pump.st:9"), (PYTHON, ".py:10")],
     ids=["ST divides by zero in its first scan", "Python raises"],
 )
 @pytest.mark.parametrize("target", ["virtual", "local"])
@@ -132,7 +96,7 @@ def test_a_scenario_can_ask_for_a_program_that_stops(tmp_path: Path) -> None:
 
 
 def test_terminal_html_and_junit_name_file_and_line_of_the_logic(tmp_path: Path) -> None:
-    path = plant(tmp_path, AT_ONCE, NO_FAULT)
+    path = plant(tmp_path, DIVIDES_BY_ZERO, NO_FAULT)
     result = run(path)
     report = Report("scenarios", [result], load_scenario(path).system)
     write_html(report, tmp_path / "r.html")

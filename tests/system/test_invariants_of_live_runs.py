@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from well_site import write_program, write_site
 
 from fieldtwin.report.model import Verdict
 from fieldtwin.running.scenario_targets import Target, run_scenario
@@ -19,57 +20,10 @@ from fieldtwin.scenarios.form import load_scenario
 
 pytestmark = pytest.mark.long
 
-PROFILE = """device: fieldtwin/well
-source: "made for this test"
-protocol: modbus
-numbering: sent
-tags:
-  level: {at: "holding:0", poll: level}
-"""
-PLANT = """fieldtwin: 1
-system: plant
-buses:
-  lan: {url: "tcp://192.0.2.1:502"}
-devices:
-  sensor: {profile: well.yaml, bus: lan, unit: 1, poll: {level: {every_ms: 200}}}
-plc:
-  cycle_ms: 50
-  watchdog: {late_ms: 2000, stop_after: 1000}
-  programs:
-    well: {source: well.st, inputs: {level: {tag: sensor.level}}}
-invariants:
-  always: ["sensor.level < 1000"]
-  never: ["well.runs and sensor.level == 42"]
-"""
-PROTOTYPE = """prototype_of: plant.yaml
-buses:
-  lan: {listen: "tcp://127.0.0.1:0"}
-devices:
-  sensor: {model: profile, values: {level: 42}}
-"""
-PROGRAM = """PROGRAM Well
-VAR_INPUT
-  level : INT;
-END_VAR
-VAR
-  runs : BOOL;
-END_VAR
-  runs := level > %s;
-END_PROGRAM
-"""
-SCENARIO = """scenario: the well
-system: plant.yaml
-steps:
-  - wait: {until: "sensor.level == 42", within: 60s}
-  - pause: 2s
-"""
-
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    for name, text in (("well.yaml", PROFILE), ("plant.yaml", PLANT), ("plant.prototype.yaml", PROTOTYPE)):
-        (tmp_path / name).write_text(text)
-    (tmp_path / "well.scenario.yaml").write_text(SCENARIO)
+    write_site(tmp_path, "plant", "tcp://192.0.2.1:502")
     with tempfile.TemporaryDirectory(prefix="ft-", dir="/tmp") as runtime:
         monkeypatch.setenv("XDG_RUNTIME_DIR", runtime)
         yield tmp_path
@@ -84,7 +38,7 @@ def summary(folder: Path) -> dict[str, Any]:
 
 
 def test_a_live_run_with_a_broken_invariant_is_not_ok(folder: Path) -> None:
-    (folder / "well.st").write_text(PROGRAM % "10")
+    write_program(folder, "10")
     told = summary(folder)
     found = {one["number"]: one for one in told["invariants"]}
     assert found["invariant always 1"]["verdict"] == "passed", found
@@ -95,7 +49,7 @@ def test_a_live_run_with_a_broken_invariant_is_not_ok(folder: Path) -> None:
 
 
 def test_a_live_run_whose_invariants_hold_says_so(folder: Path) -> None:
-    (folder / "well.st").write_text(PROGRAM % "50")
+    write_program(folder, "50")
     told = summary(folder)
     assert [one["verdict"] for one in told["invariants"]] == ["passed", "passed"], told["invariants"]
     assert not [error for error in told["errors"] if "invariant" in error]
@@ -103,7 +57,7 @@ def test_a_live_run_whose_invariants_hold_says_so(folder: Path) -> None:
 
 @pytest.mark.parametrize(("limit", "verdict"), [("10", Verdict.FAILED), ("50", Verdict.PASSED)])
 def test_a_scenario_on_the_target_local_judges_invariants(folder: Path, limit: str, verdict: Verdict) -> None:
-    (folder / "well.st").write_text(PROGRAM % limit)
+    write_program(folder, limit)
     result = run_scenario(load_scenario(folder / "well.scenario.yaml"), Target("local"))
     assert result.verdict is verdict, result.reason
     if verdict is Verdict.FAILED:

@@ -11,53 +11,10 @@ from typing import Any
 
 import pytest
 from procs import every_device_online, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
+from well_site import write_program, write_site
 
 pytestmark = [pytest.mark.long, pytest.mark.timeout(300)]
 SYSTEMS = Path(__file__).resolve().parents[2] / "profiles" / "systems"
-PROFILE = """device: own/well
-source: "made for this test"
-protocol: modbus
-numbering: sent
-tags:
-  level: {at: "holding:0", poll: level}
-"""
-PLANT = """fieldtwin: 1
-system: shed
-buses:
-  lan: {url: "tcp://127.0.0.1:PORT"}
-devices:
-  sensor: {profile: well.yaml, bus: lan, unit: 1, poll: {level: {every_ms: 200}}}
-plc:
-  cycle_ms: 50
-  watchdog: {late_ms: 2000, stop_after: 1000}
-  programs:
-    well: {source: well.st, inputs: {level: {tag: sensor.level}}}
-invariants:
-  always: ["sensor.level < 1000"]
-  never: ["well.runs and sensor.level == 42"]
-"""
-PROTOTYPE = """prototype_of: shed.yaml
-buses:
-  lan: {listen: "tcp://127.0.0.1:0"}
-devices:
-  sensor: {model: profile, values: {level: 42}}
-"""
-PROGRAM = """PROGRAM Well
-VAR_INPUT
-  level : INT;
-END_VAR
-VAR
-  runs : BOOL;
-END_VAR
-  runs := level > %s;
-END_PROGRAM
-"""
-SCENARIO = """scenario: the well
-system: shed.yaml
-steps:
-  - wait: {until: "sensor.level == 42", within: 60s}
-  - pause: 2s
-"""
 PROBED = """scenario: the well, with a controller of the user
 system: shed.yaml
 probes:
@@ -70,10 +27,7 @@ HOLDS = pytest.mark.parametrize(("limit", "verdict"), [("10", "failed"), ("50", 
 
 @pytest.fixture
 def site(tmp_path: Path) -> Iterator[Path]:
-    (tmp_path / "well.yaml").write_text(PROFILE)
-    (tmp_path / "shed.yaml").write_text(PLANT.replace("PORT", str(free_port())))
-    (tmp_path / "shed.prototype.yaml").write_text(PROTOTYPE)
-    (tmp_path / "well.scenario.yaml").write_text(SCENARIO)
+    write_site(tmp_path, "shed", f"tcp://127.0.0.1:{free_port()}")
     (tmp_path / "probed.scenario.yaml").write_text(PROBED)
     yield tmp_path
     no_tracebacks(tmp_path)
@@ -99,7 +53,7 @@ def check(result: dict[str, Any], verdict: str) -> None:
 
 @HOLDS
 def test_what_runs_already_is_judged_by_its_invariants(site: Path, limit: str, verdict: str) -> None:
-    (site / "well.st").write_text(PROGRAM % limit)
+    write_program(site, limit)
     with fieldtwin(site, "run", str(site / "shed.yaml"), "--prototype") as running:
         every_device_online(running.control("shed", "gateway"))
         check(judged(site, str(site / "well.scenario.yaml"), "--target", "compose", "--json"), verdict)
@@ -107,7 +61,7 @@ def test_what_runs_already_is_judged_by_its_invariants(site: Path, limit: str, v
 
 @HOLDS
 def test_a_plant_is_judged_by_its_invariants(site: Path, limit: str, verdict: str) -> None:
-    (site / "well.st").write_text(PROGRAM % limit)
+    write_program(site, limit)
     port = (site / "shed.yaml").read_text().split("127.0.0.1:")[1].split('"')[0]
     words = ("emulate", str(site / "well.yaml"), "--values", "level=42", "--on", f"tcp://127.0.0.1:{port}")
     with fieldtwin(site, *words, name="field") as field:
@@ -116,7 +70,7 @@ def test_a_plant_is_judged_by_its_invariants(site: Path, limit: str, verdict: st
 
 
 def test_with_a_controller_of_the_user_they_are_skipped_and_that_is_said(site: Path) -> None:
-    (site / "well.st").write_text(PROGRAM % "10")
+    write_program(site, "10")
     words = (str(site / "probed.scenario.yaml"), "--json", "--with", "--", "sleep", "600")
     result = judged(site, *words)
     assert result["verdict"] == "passed", result

@@ -13,32 +13,10 @@ from typing import Any
 
 import pytest
 from procs import Asking, fieldtwin, free_port, no_tracebacks, wait_for
+from shed_site import write_shed
 
 pytestmark = pytest.mark.long
 
-SYSTEM = """fieldtwin: 1
-system: shed
-buses: {lan: {url: "tcp://tank:502", timeout_ms: 500}}
-devices: {tank: {profile: tank.yaml, bus: lan, unit: 1, poll: {values: {every_ms: 100}}}}
-plc: {programs: {idle: {source: idle.st, inputs: {level: {tag: tank.level, if_bad: hold}}}}}
-"""
-IDLE = """PROGRAM idle
-  VAR_INPUT level : REAL; END_VAR
-  VAR high : BOOL; END_VAR
-  high := level > 100.0;
-END_PROGRAM
-"""
-TANK = """device: own/tank
-source: "this test"
-protocol: modbus
-numbering: printed
-defaults: {poll: values}
-tags: {level: {at: 30001, type: uint16, range: [0, 500]}}
-"""
-PROTOTYPE = """prototype_of: shed.yaml
-buses: {lan: {listen: "tcp://127.0.0.1:0"}}
-devices: {tank: {model: profile, values: {level: 20}}}
-"""
 WITHIN_S = 4
 SCENARIO = f"""scenario: the level rises
 system: shed.yaml
@@ -53,13 +31,7 @@ steps:
 def test_the_lateness_of_the_judge_is_subtracted_and_that_of_the_system_is_not(tmp_path: Path, stopped: bool) -> None:
     """The level rises after the deadline. Where the judge was stopped for that time, it cannot know that, and passes; where it
     was served all the time, the same rise fails."""
-    for name, text in {
-        "shed.yaml": SYSTEM,
-        "idle.st": IDLE,
-        "tank.yaml": TANK,
-        "shed.prototype.yaml": PROTOTYPE,
-    }.items():
-        (tmp_path / name).write_text(text)
+    write_shed(tmp_path)
     (tmp_path / "a.scenario.yaml").write_text(SCENARIO)
     port = free_port()
     emulate = ("emulate", str(tmp_path / "shed.yaml"), "--control", f"127.0.0.1:{port}")

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from procs import Asking, fieldtwin, no_tracebacks, run_to_end, wait_for
+from shed_site import write_shed
 
 pytestmark = pytest.mark.long
 
@@ -48,31 +49,6 @@ while True:
     except OSError:
         time.sleep(0.05)
 """
-SYSTEM = """fieldtwin: 1
-system: shed
-buses: {lan: {url: "tcp://tank:502", timeout_ms: 500}}
-devices: {tank: {profile: tank.yaml, bus: lan, unit: 1, poll: {values: {every_ms: 100}}, writable: [valve]}}
-plc: {programs: {idle: {source: idle.st, inputs: {level: {tag: tank.level, if_bad: hold}}}}}
-"""
-IDLE = """PROGRAM idle
-  VAR_INPUT level : REAL; END_VAR
-  VAR high : BOOL; END_VAR
-  high := level > 100.0;
-END_PROGRAM
-"""
-TANK = """device: own/tank
-source: "this test"
-protocol: modbus
-numbering: printed
-defaults: {poll: values}
-tags:
-  level: {at: 30001, type: uint16, range: [0, 500]}
-  valve: {at: 40001, type: uint16, access: rw, range: [0, 1]}
-"""
-PROTOTYPE = """prototype_of: shed.yaml
-buses: {lan: {listen: "tcp://127.0.0.1:0"}}
-devices: {tank: {model: profile, values: {level: 20}}}
-"""
 SCENARIO = """scenario: the valve opens above 100
 system: shed.yaml
 {start}probes:
@@ -88,10 +64,7 @@ steps:
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
     (tmp_path / "controller.py").write_text(CONTROLLER)
-    (tmp_path / "shed.yaml").write_text(SYSTEM)
-    (tmp_path / "idle.st").write_text(IDLE)
-    (tmp_path / "tank.yaml").write_text(TANK)
-    (tmp_path / "shed.prototype.yaml").write_text(PROTOTYPE)
+    write_shed(tmp_path)
     (tmp_path / "valve.scenario.yaml").write_text(SCENARIO.format(start="start: fresh\n"))
     (tmp_path / "as_is.scenario.yaml").write_text(SCENARIO.format(start=""))
     return tmp_path

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
+from device_rig import emulated, started_runner
 
 from fieldtwin.testing.handles import Device
 from fieldtwin.testing.outcome import Outcome
@@ -17,17 +18,14 @@ from fieldtwin.testing.runner import FieldtwinRefused, Runner
 
 @pytest.fixture(scope="module")
 def runner() -> Iterator[Runner]:
-    runner = Runner()
-    runner.call("hello")  # its threads begin before those of the first test are counted
-    yield runner
-    runner.close()
+    with started_runner() as runner:
+        yield runner
 
 
 @pytest.fixture
 def device(runner: Runner) -> Iterator[Device]:
-    answer = runner.call("device", device="inclinometer-cia410", unit=9)
-    yield Device(runner, answer["id"], "device", answer)
-    runner.call("end", id=answer["id"])
+    with emulated(runner, "inclinometer-cia410", unit=9) as device:
+        yield device
 
 
 def test_a_value_beyond_the_range_of_its_object_is_refused(device: Device) -> None:

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
+from device_rig import emulated, started_runner
 
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange as Decoded
@@ -29,17 +30,14 @@ PATIENCE_S = 30.0
 
 @pytest.fixture(scope="module")
 def runner() -> Iterator[Runner]:
-    runner = Runner()
-    runner.call("hello")  # its threads begin before those of the first test are counted
-    yield runner
-    runner.close()
+    with started_runner() as runner:
+        yield runner
 
 
 @pytest.fixture
 def device(runner: Runner) -> Iterator[Device]:
-    answer = runner.call("device", device="eastron-sdm630", on="tcp", values={"voltage_l1": 230.5})
-    yield Device(runner, answer["id"], "device", answer)
-    runner.call("end", id=answer["id"])
+    with emulated(runner, "eastron-sdm630", on="tcp", values={"voltage_l1": 230.5}) as device:
+        yield device
 
 
 class Client:

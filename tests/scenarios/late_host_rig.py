@@ -1,0 +1,33 @@
+"""Judging a scenario in virtual time on a bench that says how late its host is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from emulators.virtual.loop import VirtualLoop
+from fieldtwin.report.model import ScenarioResult
+from fieldtwin.running.virtual_bench import VirtualBench
+from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.scenarios.runner import Runner
+from fieldtwin.scenarios.trace import Trace
+from twin.prototype_file import load_prototype
+
+HEAD = "scenario: a test\nsystem: observatory\n"
+
+
+def judged_on(bench_type: type[VirtualBench], folder: Path, text: str) -> ScenarioResult:
+    """Write `text` below `HEAD` as a scenario file into `folder`, run it on a bench of `bench_type` and return the result."""
+    path = folder / "x.scenario.yaml"
+    path.write_text(HEAD + text)
+    scenario = load_scenario(path)
+    loop = VirtualLoop()
+
+    async def main() -> ScenarioResult:
+        prototype = load_prototype(scenario.system, None)
+        async with bench_type(scenario.system, prototype, loop, folder, Trace()) as bench:
+            return await Runner(scenario, bench).run()
+
+    try:
+        return loop.run_until_complete(main())
+    finally:
+        loop.close()

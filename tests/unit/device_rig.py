@@ -1,0 +1,27 @@
+"""A runner of the pytest plugin and one of its devices, for tests that do not go through the plugin's own fixtures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from fieldtwin.testing.handles import Device
+from fieldtwin.testing.runner import Runner
+
+
+@contextmanager
+def started_runner() -> Iterator[Runner]:
+    """Yield a runner whose threads run already, so that no test is charged with having started them."""
+    runner = Runner()
+    runner.call("hello")
+    yield runner
+    runner.close()
+
+
+@contextmanager
+def emulated(runner: Runner, profile: str, **asked: Any) -> Iterator[Device]:
+    """Yield an emulated device of `profile`; `asked` are the other arguments of the runner's call `device`."""
+    answer = runner.call("device", device=profile, **asked)
+    yield Device(runner, answer["id"], "device", answer)
+    runner.call("end", id=answer["id"])

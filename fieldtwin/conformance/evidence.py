@@ -64,7 +64,11 @@ def line_of(event: Event) -> tuple[str, str, str]:
         case Garbled():
             return "master", event.data.hex(" "), "no request"
         case Came():
-            return "master", "", f"opens connection {event.client}"
+            return (
+                ("device", "", "gives the port back")
+                if event.by_us
+                else ("master", "", f"opens connection {event.client}")
+            )
         case Left():
             return ("device" if event.by_us else "master"), "", f"closes connection {event.client}"
         case Shown():

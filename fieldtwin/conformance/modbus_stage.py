@@ -76,12 +76,12 @@ class Stage:
         """All is answered well from now on; moves under way are made."""
         self.play = None
 
-    async def serve(self, connection: ByteConnection) -> None:
-        """One client until it is gone."""
+    async def serve(self, connection: ByteConnection, *, plugged_in_again: bool = False) -> None:
+        """Serve one client until it is gone. `plugged_in_again`: the connection is a port that a case had taken away."""
         self.clients += 1
         number, wire = self.clients, self._make_wire()
         client = _Client(self, connection, wire, number)
-        self.note(Came(self.now_ns(), number))
+        self.note(Came(self.now_ns(), number, plugged_in_again))
         try:
             async with Nursery() as nursery:
                 client.nursery = nursery

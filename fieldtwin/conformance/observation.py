@@ -60,10 +60,12 @@ class Garbled:
 
 @dataclass(frozen=True, slots=True)
 class Came:
-    """A connection of the master, numbered from 1. A serial line and a bus have one that is always there."""
+    """A connection of the master, numbered from 1. A serial line and a bus have one that is always there; `by_us`: the case
+    took the port away and gave it back."""
 
     t_ns: int
     client: int
+    by_us: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,8 +42,10 @@ class PtyLine:
 
     async def run(self) -> None:
         """Serve the master; unplugged, do what was asked for, and serve on."""
+        plugged_in_again = False
         while True:
-            await self._stage.serve(self._port)
+            await self._stage.serve(self._port, plugged_in_again=plugged_in_again)
+            plugged_in_again = True
             move, self._unplugged = self._unplugged, None
             if move is None:
                 raise Unreachable("the virtual port is gone", where=str(self._listen))

@@ -86,6 +86,27 @@ def minimalmodbus_ascii() -> Master:
     return minimalmodbus_rtu("ascii")
 
 
+def modbus_tk_tcp() -> Master:
+    from modbus_tk.modbus_tcp import TcpMaster
+
+    host, port = _tcp()
+    return _modbus_tk(TcpMaster(host, port, timeout_in_sec=TIMEOUT_S))
+
+
+def modbus_tk_rtu() -> Master:
+    from modbus_tk.modbus_rtu import RtuMaster
+    from serial import Serial
+
+    master = RtuMaster(Serial(os.environ["FIELDTWIN_TTY"], baudrate=19200))
+    master.set_timeout(TIMEOUT_S)
+    return _modbus_tk(master)
+
+
+def _modbus_tk(master: Any) -> Master:
+    """`open` does nothing while the library believes that it is connected, as does pymodbus's `connect`."""
+    return lambda: master.execute(1, 3, 0, 2)[0], master.open
+
+
 def pymodbustcp() -> Master:
     from pyModbusTCP.client import ModbusClient
 
@@ -151,7 +172,8 @@ MASTERS: dict[str, Callable[[], Master]] = {
     made.__name__: made
     for made in (
         pymodbus_tcp, pymodbus_rtu, pymodbus_ascii, pymodbus_async_tcp, pymodbus_async_rtu, minimalmodbus_rtu,
-        minimalmodbus_ascii, pymodbustcp, umodbus_tcp, canopen, canopen_block_upload, canopen_block_download,
+        minimalmodbus_ascii, modbus_tk_tcp, modbus_tk_rtu, pymodbustcp, umodbus_tcp,
+        canopen, canopen_block_upload, canopen_block_download,
     )
 }  # fmt: skip
 

@@ -183,3 +183,32 @@ def test_a_marked_value_that_is_no_number_is_no_value() -> None:
     assert probe.learn(Word.FIRST)
     probe.feed("level=11.11\nlevel=None\nlevel=-1\nlevel=3333\nlevel=0\n7\n")
     assert [word for word, _ in seen[1:]] == [Word.FIRST, Word.NONE, Word.NONE, Word.POISON, Word.OTHER]
+
+
+def _gives_up_at_the_first_adu(pause_s: float) -> Callable[..., object]:
+    """A Modbus TCP master that takes no second ADU when the first one has another transaction id, as modbus_tk does."""
+
+    async def poll(net: MemoryNet, endpoint: Endpoint, clock: VirtualClock, publish: Publish) -> None:
+        link = await net.open_bytes(endpoint)
+        number = 0
+        while True:
+            number = number % 0x3FFF + 1
+            link.read_pending()
+            await link.write(number.to_bytes(2, "big") + bytes((0, 0, 0, 6)) + REQUEST)
+            try:
+                async with asyncio.timeout(TIMEOUT_S):
+                    reply = await link.read()
+            except TimeoutError:
+                reply = b""
+            if len(reply) >= 13 and int.from_bytes(reply[:2], "big") == number:
+                publish(str(int.from_bytes(reply[9:11], "big")))
+            await asyncio.sleep(pause_s)
+
+    return poll
+
+
+@pytest.mark.parametrize("pause_s", [0.005, 0.016, 0.020, 0.021, 0.030])
+def test_an_honest_answer_at_the_end_of_a_case_is_not_taken_for_an_odd_one(pause_s: float) -> None:
+    """The device answered honestly with the value of the case until its last delayed frame was sent."""
+    result = judge(_gives_up_at_the_first_adu(pause_s), "tcp://plc:502", "MB-056c")["MB-056c"]  # type: ignore[arg-type]
+    assert (result.verdict, "were not taken" in result.reason) == (Verdict.FAILED, True), result.reason

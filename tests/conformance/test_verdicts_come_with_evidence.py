@@ -133,3 +133,36 @@ def test_an_abort_of_a_client_that_names_no_object_ends_the_open_transfer() -> N
     assert [(e.problem, e.abort) for e in done] == [("abort", 0x05030000)]
     assert "by the master" in done[0].reply_text
     assert wire.pending() == []
+
+
+GIVES_UP_ITS_PORT = """
+import os, time
+port = os.open(os.environ["FIELDTWIN_TTY"], os.O_RDWR | os.O_NOCTTY)
+import select, tty
+tty.setraw(port)
+while True:
+    try:
+        os.write(port, bytes.fromhex("010300000001840a"))
+        got = b""
+        while len(got) < 7 and select.select([port], [], [], 0.15)[0]:
+            got += os.read(port, 64)
+        if len(got) == 7:
+            print(int.from_bytes(got[3:5], "big"), flush=True)
+    except OSError:
+        time.sleep(60)
+    time.sleep(0.02)
+"""
+
+
+@pytest.mark.long
+def test_a_port_that_the_case_gives_back_is_no_connection_of_the_master(tmp_path: Path) -> None:
+    """The evidence said that the master opened a connection, while the reason said that the master sent nothing any more."""
+    (tmp_path / "master.py").write_text(GIVES_UP_ITS_PORT)
+    words = ["check", "modbus-master", "--listen", f"pty:{tmp_path}/line", "--timeout", "150ms", "--only", "66"]
+    words += ["--probe", "output", "--patience", "3s", "--json", "--", sys.executable, "master.py"]
+    (result,) = json.loads(_run(words, tmp_path).stdout)
+    assert (result["verdict"], "wedged" in result["reason"]) == ("failed", True), result
+    assert [(line["by"], line["text"]) for line in result["wire"] if line["text"]] == [
+        ("device", "closes connection 1"),
+        ("device", "gives the port back"),
+    ]

@@ -170,8 +170,10 @@ class Starts:
                 at = index[tag]
                 if tag in self._forces.inputs or (alive and snapshot.qualities[at] < _UNCERTAIN):
                     del start.missing[tag]
-                else:
-                    start.missing[tag] = Reason(snapshot.reasons[at]) if alive else Reason.GATEWAY_DEAD
+                elif alive:
+                    start.missing[tag] = Reason(snapshot.reasons[at])
+                elif snapshot.counter > 0:  # else the gateway has not published anything yet, and may be about to
+                    start.missing[tag] = Reason.GATEWAY_DEAD
             if start.since_ns is None:
                 start.since_ns = now_ns
             start.overdue = now_ns - start.since_ns >= start.policy.timeout_ms * NS_PER_MS

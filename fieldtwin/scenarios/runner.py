@@ -40,6 +40,10 @@ RECENT_S = 2.0
 KNOWN_WITHIN_S = 5.0
 """How long an expression may take to become known when a step begins to look at it: programs have not run yet at the start."""
 KEPT = 20_000
+LAST_WRITE_S = 0.25
+"""How long the gateway may take to write, or to refuse, what the PLC commanded, and to tell of it."""
+LAST_REACTION_MOST_S = 2.0
+"""The longest time that a scenario goes on after its last step so that the PLC can react to what that step has seen."""
 LATE_SHARE = 0.1
 """A host that was late by more than this part of the time that a check is about has proved nothing."""
 NO_FRESH_START = (
@@ -107,6 +111,15 @@ def gone(error: FieldtwinError, t_ns: int) -> CheckResult:
     """Return the check that a part of the system broke by failing with `error`, `t_ns` after the run's start."""
     text, where = "every part of the system runs", getattr(error, "place", "")
     return CheckResult("running", text, Verdict.ERROR, t_ns, t_ns, text, str(error), where=where)
+
+
+def last_reaction_s(scenario: Scenario) -> float:
+    """Return how long the rules of the whole run are looked at after the last step, in seconds: two scans of the slowest task and
+    a write. Without it a step that is met at once would end the scenario before the PLC has reacted, and an output that is
+    refused then would never be seen."""
+    plc = scenario.system.plc
+    cycles_ms = [task.interval_ms for task in plc.tasks.values() if task.interval_ms is not None]
+    return min(LAST_REACTION_MOST_S, 2 * max(cycles_ms, default=plc.cycle_ms) / 1000 + LAST_WRITE_S)
 
 
 def fault_id(n: int, step: Step) -> str:
@@ -196,6 +209,7 @@ class Runner:
                     return result.verdict, f"step {result.number}: {result.text}"
             if self._by_chance is not None:
                 await self._until(self._by_chance.until_s)
+            await self._until(self.bench.now_s() + last_reaction_s(self.scenario))
             return await self._hold_to_the_end()
         except _RuleBroken as broken:
             self.results.append(broken.rule)

@@ -262,9 +262,12 @@ class OutputWriter:
             old = self._tags.current(output.tag, self._now_ns).value
             if not self._on_record(output, output.driver.config.name, old, wanted[output.tag]):
                 return
+        by = {output.tag: output.by for output in group.outputs}
         for output in group.outputs:
             output.pending, output.untouched, output.waits_since_ns = True, False, None
-        group.submit(commands, lambda output, error: self._done(output, wanted[output.tag], error))
+        group.submit(
+            commands, lambda output, error: self._done(output, wanted[output.tag], by[output.tag], error)
+        )
 
     def _wait(self, output: Output, value: float) -> None:
         """The device takes no write now. What waits for longer than a moment is reported, once."""
@@ -321,7 +324,7 @@ class OutputWriter:
             output.answer(Unreachable("the write could not be put on record", where=name))
             return
         output.pending, output.untouched = True, False
-        output.submit(command, partial(self._done, output, value))
+        output.submit(command, partial(self._done, output, value, output.by))
 
     def _refuse(self, output: Output, value: float, error: NotAllowed) -> None:
         """The value may not be written: it is not tried again until another one is wanted."""
@@ -386,7 +389,8 @@ class OutputWriter:
         if output.local not in output.driver.config.writable:
             raise NotAllowed(f"{output.tag} is not marked writable in the system file", where=where)
 
-    def _done(self, output: Output, value: float, error: FieldtwinError | None) -> None:
+    def _done(self, output: Output, value: float, by: str, error: FieldtwinError | None) -> None:
+        """A write of `value` ended. `by` is who asked for it, which may be somebody else than who commands the output now."""
         output.pending = False
         output.next_try_ns = self._now_ns + (MIN_SPACING_NS if error is None else RETRY_NS)
         if error is None:
@@ -397,12 +401,12 @@ class OutputWriter:
             self.journal.settle(output.tag)
         else:
             self.failures += 1
-            self._note(output, value, cause_of(error), error, output.by, audit=False)
+            self._note(output, value, cause_of(error), error, by, audit=False)
             output.driver.consumer.queue.clear()  # the command that failed must not go out ahead of a newer one
         result = "done" if error is None else f"failed: {error}"
         try:
             self._audit.note(
-                "write", output.driver.config.name, by=output.by, result=result, tag=output.tag, new=output.shown(value)
+                "write", output.driver.config.name, by=by, result=result, tag=output.tag, new=output.shown(value)
             )
         except Unreachable:
             self.failures += 1  # counted; the next write will not start without a record

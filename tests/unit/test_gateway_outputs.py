@@ -274,6 +274,30 @@ def test_a_device_that_acknowledges_and_does_not_hold_is_a_failure(tmp_path: Pat
     run(main())
 
 
+def test_a_write_that_fails_is_on_record_for_who_asked_for_it(tmp_path: Path) -> None:
+    """Observed: a write of the program was under way when the gateway stopped, and its failure was recorded as one of the
+    safe state, with the program's value."""
+    writers: list[OutputWriter] = []
+
+    class StopsMeanwhile(MapBank):
+        def write(self, table, address, values, now_ns):  # type: ignore[no-untyped-def]
+            if values == [5] or values == (5,):
+                writers[0].make_safe("a test")  # while the write is under way; and the value is not held
+                return
+            super().write(table, address, values, now_ns)
+
+    async def main() -> None:
+        async with rig(tmp_path / "a", "period", safe={"period": -1}, bank=StopsMeanwhile) as r:
+            writers.append(r.writer)
+            r.writer.want("d.period", 5)
+            await eventually(lambda: r.holding(0) == 0xFFFF, within_s=15)
+            await eventually(lambda: str(r.audit[-1]["result"]) == "done")
+            assert {(e["new"], e["by"]) for e in r.audit} == {(5, "plc"), (-1, "safe: a test")}
+            assert [entry["by"] for entry in r.writer.journal.describe()["entries"]] == ["plc"]
+
+    run(main())
+
+
 def test_without_a_record_only_safe_values_are_written() -> None:
     """/dev/full is a disk without room: the log opens, and cannot be written."""
 

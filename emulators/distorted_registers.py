@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
-from emulators.stated import Peek, bytes_of, cells_of, merged, raw_of
+from emulators.stated import Peek, bytes_of, cells_of, merged, raw_of, touches
 from gateway.core.profile import DeviceProfile, Tag
 
 
@@ -47,9 +47,9 @@ class DistortedRegisters(RegisterBank):
             return cells
         held = list(cells)
         for tag in self._tags:
-            at = tag.registers
-            if at.table != table or at.address >= address + count or address >= at.end:
+            if not touches(tag, table, range(address, address + count)):
                 continue
+            at = tag.registers
             own = [
                 cells[a - address] if 0 <= a - address < count else self._peek(table, a)
                 for a in range(at.address, at.end)

@@ -136,13 +136,14 @@ class Effects:
         return [
             pair
             for e in effects
-            if _touches(e.tag, table, addresses)
+            if touches(e.tag, table, addresses)
             and (e.value is None or written is None or _is(e.tag, e.value, addresses, written))
             for pair in e.sets
         ]
 
 
-def _touches(tag: Tag, table: Table, addresses: range) -> bool:
+def touches(tag: Tag, table: Table, addresses: range) -> bool:
+    """Return whether any cell of `tag` is among these."""
     at = tag.registers
     return at.table == table and at.address < addresses.stop and addresses.start < at.end
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Table
 from emulators.modbus.unit import Handler, ModbusUnit
-from emulators.stated import Effects, bytes_of, cells_held, cells_of, fits, merged, spans_of
+from emulators.stated import Effects, bytes_of, cells_held, cells_of, fits, merged, spans_of, touches
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import DeviceProfile, OwnFunction, Tag
 
@@ -79,8 +79,7 @@ class StatedRegisters(RegisterBank):
 
     def _note_all(self, table: Table, addresses: range, now_ns: int) -> None:
         for tag in self._tags:
-            at = tag.registers
-            if at.table == table and at.address < addresses.stop and addresses.start < at.end:
+            if touches(tag, table, addresses):
                 self._note(tag, now_ns)
 
     def _note(self, tag: Tag, now_ns: int) -> None:

@@ -16,7 +16,7 @@ from emulators.distortion import Distortions
 from emulators.journal import HeldJournal
 from emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
 from emulators.signals import Signals
-from emulators.stated import bytes_of, cells_held
+from emulators.stated import bytes_of, cells_held, touches
 from gateway.core.clock import NS_PER_S
 from gateway.core.errors import FileInvalid
 from gateway.core.profile import DeviceProfile, Tag
@@ -156,8 +156,7 @@ class SampledSensor(RegisterBank):
     def _note_tags(self, table: Table, address: int, count: int, now_ns: int) -> None:
         """Journal what a master's write made of the tags that it touched."""
         for tag in self._tags.values():
-            at = tag.registers
-            if at.table == table and at.address < address + count and address < at.end:
+            if touches(tag, table, range(address, address + count)):
                 self._note(tag, now_ns)
 
     def _note(self, tag: Tag, now_ns: int) -> None:

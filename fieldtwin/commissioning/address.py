@@ -130,11 +130,7 @@ def with_care(tag: Tag, profile: DeviceProfile | None) -> Tag:
     if profile is None or tag.name in profile.tags or tag.at is None:
         return tag
     at = tag.at
-    there = [
-        t
-        for t in profile.tags.values()
-        if t.at is not None and t.at.table == at.table and t.at.address < at.end and at.address < t.at.end
-    ]
+    there = [t for t in profile.tags.values() if t.at is not None and t.at.overlaps(at)]
     dangers = " and ".join(dict.fromkeys(t.danger for t in there if t.danger))
     return replace(tag, danger=dangers, nonvolatile=any(t.nonvolatile for t in there))
 

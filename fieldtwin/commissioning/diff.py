@@ -312,7 +312,7 @@ def _diff_limits(out: Differences, dump: Dump, profile: DeviceProfile) -> None:
     sweep = ProfileSweep(profile, dumped_tags(profile)[0])
     for read in sweep.plan.reads:
         over = [h for h in holes if h.table == read.range.table and _within(h, read.range)]
-        if over and not any(_overlaps(h, t.registers) for h in over for t in read.tags):
+        if over and not any(h.overlaps(t.registers) for h in over for t in read.tags):
             first = over[0]
             missing = f"no read over {first}"
             out.found.append(
@@ -322,7 +322,3 @@ def _diff_limits(out: Differences, dump: Dump, profile: DeviceProfile) -> None:
 
 def _within(inner: RegisterRange, outer: RegisterRange) -> bool:
     return outer.address <= inner.address and inner.address < outer.end
-
-
-def _overlaps(one: RegisterRange, other: RegisterRange) -> bool:
-    return one.table == other.table and one.address < other.end and other.address < one.end

@@ -69,9 +69,7 @@ def _let_alone(profile: DeviceProfile, tags: Sequence[Tag]) -> list[RegisterRang
     """Where tags stand that are not asked for: a read over a gap between two others must not bring them along."""
     wanted = [t.registers for t in tags]
     others = [t.registers for t in profile.tags.values() if t.name not in {w.name for w in tags}]
-    return [
-        o for o in others if not any(w.table == o.table and w.address < o.end and o.address < w.end for w in wanted)
-    ]
+    return [o for o in others if not any(w.overlaps(o) for w in wanted)]
 
 
 def dumped_tags(profile: DeviceProfile) -> tuple[list[Tag], list[Tag]]:

@@ -10,7 +10,7 @@ from typing import Any
 
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.campaign import Campaign, broken_by, run_seed, schedule
-from fieldtwin.running.shrink import as_scenario, same_failure, smallest
+from fieldtwin.running.shrink import as_scenario, same_failure, shrunk_run
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import Scenario, load_scenario
 from fieldtwin.scenarios.runner import fault_id
@@ -31,21 +31,16 @@ class ShrunkSeed:
     without: ScenarioResult
 
 
-def shrink_seed(campaign: Campaign, found: ScenarioResult, most_runs: int = 60) -> ShrunkSeed:
+def shrink_seed(campaign: Campaign, found: ScenarioResult) -> ShrunkSeed:
     """Return the fewest random faults with which the seed of `found` breaks what it broke with all of them."""
     assert found.seed is not None
     seed, wanted = found.seed, broken_by(found)
     faults = schedule(campaign, campaign.check(), seed)
-    seen: dict[str, ScenarioResult] = {}
 
-    def ended(part: Sequence[dict[str, Any]]) -> ScenarioResult:
-        key = repr(list(part))
-        if key not in seen:
-            seen[key] = run_seed(campaign, seed, part)
-        return seen[key]
+    def run(part: Sequence[dict[str, Any]]) -> ScenarioResult:
+        return run_seed(campaign, seed, part)
 
-    left, minimal = smallest(faults, lambda part: same_failure(wanted, broken_by(ended(part))), most_runs)
-    return ShrunkSeed(seed, left, minimal, ended(left), ended(()))
+    return ShrunkSeed(seed, *shrunk_run(faults, run, lambda result: same_failure(wanted, broken_by(result))))
 
 
 def scenario_of(campaign: Campaign, small: ShrunkSeed, folder: Path) -> str:

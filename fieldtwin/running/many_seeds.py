@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fieldtwin.running.shrink import same_failure, smallest
+from fieldtwin.running.shrink import same_failure, shrunk_run
 from fieldtwin.running.virtual_network_run import VirtualNetworkOptions
 from fieldtwin.running.virtual_run import VirtualOptions
 from fieldtwin.running.workers import each
@@ -88,24 +88,17 @@ class Shrunk:
     scripted: list[tuple[float, int]]
 
 
-def shrunk(options: Options, found: SeedResult, most_runs: int = 60) -> Shrunk:
+def shrunk(options: Options, found: SeedResult) -> Shrunk:
     """Return the fewest faults with which the run of `found`'s seed still fails as it did with all of them."""
     options = replace(options, seed=found.seed)
     run = options.make()
     base = replace(options, random_faults=None, faults=())
-    seen: dict[str, SeedResult] = {}
 
     def ended(part: Sequence[dict[str, Any]]) -> SeedResult:
-        key = repr(part)
-        if key not in seen:
-            seen[key] = run_seed(replace(base, faults=tuple(part)))
-        return seen[key]
+        return run_seed(replace(base, faults=tuple(part)))
 
-    def fails(part: Sequence[dict[str, Any]]) -> bool:
-        return same_failure(found.errors, ended(list(part)).errors)
-
-    left, minimal = smallest(run.faults, fails, most_runs)
-    return Shrunk(left, minimal, ended(left), ended([]), run.scripted)
+    small = shrunk_run(run.faults, ended, lambda result: same_failure(found.errors, result.errors))
+    return Shrunk(*small, run.scripted)
 
 
 def run_seeds(

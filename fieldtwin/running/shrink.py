@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 T = TypeVar("T")
-MOST_RUNS = 200
+RESULT = TypeVar("RESULT")
+MOST_RUNS = 60
 BROKEN_AT = ": broken at "
 """What stands in an error between the text of a rule and what was known when it was broken."""
 _PLAIN = re.compile(r"[A-Za-z_]\w*")
@@ -46,6 +47,24 @@ def smallest(
                 break
             parts = min(2 * parts, len(left))
     return left, not left or runs > 0
+
+
+def shrunk_run(
+    items: Sequence[T], run: Callable[[Sequence[T]], RESULT], fails: Callable[[RESULT], bool]
+) -> tuple[list[T], bool, RESULT, RESULT]:
+    """Return the `smallest` part of `items` whose `run` still `fails`, whether no single item can be left out of it, and the
+    results of the runs with that part and without any item. Each part is run once.
+    """
+    seen: dict[str, RESULT] = {}
+
+    def ended(part: Sequence[T]) -> RESULT:
+        key = repr(list(part))
+        if key not in seen:
+            seen[key] = run(part)
+        return seen[key]
+
+    left, minimal = smallest(items, lambda part: fails(ended(part)))
+    return left, minimal, ended(left), ended(())
 
 
 def kind_of(error: str) -> str:

@@ -46,6 +46,10 @@ class RegisterRange:
         """One past the last address."""
         return self.address + self.count
 
+    def overlaps(self, other: RegisterRange) -> bool:
+        """Return whether the two have a register (or bit) in common."""
+        return self.table == other.table and self.address < other.end and other.address < self.end
+
     def __str__(self) -> str:
         """Both ways: ``30001 (input:0)``, with the count where it is not 1."""
         digit = dict(PRINTED)[self.table]
@@ -456,8 +460,7 @@ def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
                 got=str(tag.at.count),
             )
         for i, gap in enumerate(p.gaps):
-            at = tag.at
-            if at is not None and at.table == gap.table and at.address < gap.end and gap.address < at.end:
+            if tag.at is not None and tag.at.overlaps(gap):
                 raise file.error(("gaps", i), f"the gap {p.form.gaps[i]!r} is where the tag {tag.name!r} stands")
     for message in p.messages.values():
         if message.at.count > most:

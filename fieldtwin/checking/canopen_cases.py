@@ -13,7 +13,7 @@ from fieldtwin.checking import canopen_sdo_plays as sdo
 from fieldtwin.checking import canopen_write_plays as write
 from fieldtwin.checking.canopen_wire import CanopenWire
 from fieldtwin.checking.device_case import DeviceCase, Play
-from fieldtwin.conformance.case import Basis, Danger
+from fieldtwin.conformance.case import OWN, Basis, Danger
 
 CanopenCase = DeviceCase[CanopenWire]
 READ, WRITE, DISRUPT = Danger.READ, Danger.WRITE, Danger.DISRUPT
@@ -112,6 +112,6 @@ CASES: tuple[CanopenCase, ...] = (
          "no PDO", nmt.silent_outside),
     field("CO-057", "fastscan with only configured nodes", "py #226", DISRUPT, "the first step of a fastscan", "silence",
          nmt.fastscan),
-    robust("CO-060", "extended id with a CANopen number", "catalogue", READ, "1000h, asked for with a 29-bit identifier",
+    robust("CO-060", "extended id with a CANopen number", OWN, READ, "1000h, asked for with a 29-bit identifier",
          "ignore it", sdo.extended_identifier),
 )  # fmt: skip

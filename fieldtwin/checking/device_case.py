@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from fieldtwin.conformance.case import About, Basis, Finding
+from fieldtwin.conformance.case import About, Finding
 from fieldtwin.conformance.results import CaseResult
 from gateway.core.connection import Direction
 
@@ -26,15 +26,10 @@ class DeviceCase(About, Generic[W]):
     play: Play[W]
     wires: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()
-    basis: Basis = Basis.STANDARD
 
     @property
     def role(self) -> str:
         return "device"
-
-    @property
-    def weighs(self) -> Basis:
-        return self.basis
 
 
 @dataclass(frozen=True, slots=True)

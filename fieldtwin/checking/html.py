@@ -7,15 +7,14 @@ What failed comes first, with every byte; what passed is a line in the table, it
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
 from fieldtwin.checking.device_case import DeviceResult, Spoken
 from fieldtwin.checking.run import OTHER_WIRE
 from fieldtwin.checking.subject import Subject
-from fieldtwin.conformance.case import Basis
-from fieldtwin.conformance.results import called, summary
+from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, verdict_bar, verdict_pill
+from fieldtwin.conformance.results import summary
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
 from fieldtwin.report.markup import Markup, el
@@ -26,12 +25,6 @@ from gateway.core.connection import Direction
 
 MOST_LINES = 60
 """Of one case's bytes."""
-WEIGHT = {
-    Basis.STANDARD: "required by the standard",
-    Basis.ROBUSTNESS: "robustness: the standard does not require it",
-    Basis.FIELD: "known field problem: the standard does not require it",
-}
-ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Verdict.SKIPPED)
 
 
 def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str, path: Path) -> None:
@@ -41,8 +34,7 @@ def write_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str
 
 def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> str:
     """The whole page."""
-    bad = [r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE]
-    bad.sort(key=lambda r: not r.deviates)
+    bad = by_weight([r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE])
     body = [_header(subject, results, reproduce)]
     if bad:
         body += [el("h2", "What was found", id="found"), *(_finding(r) for r in bad)]
@@ -57,14 +49,6 @@ def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: st
     return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"
 
 
-def overall(results: Sequence[DeviceResult]) -> Verdict:
-    """The verdict of the whole check: failed if a required case failed, passed if some case passed and no required one failed."""
-    verdicts = {r.verdict for r in results}
-    if any(r.deviates or r.verdict is Verdict.ERROR for r in results):
-        return Verdict.FAILED
-    return Verdict.PASSED if Verdict.PASSED in verdicts else Verdict.INCONCLUSIVE
-
-
 def _header(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> Markup:
     facts = [
         ("device", subject.name),
@@ -75,14 +59,12 @@ def _header(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -
         ("reply timeout", f"{subject.timeout_s:g} s"),
         ("fieldtwin", subject.fieldtwin),
     ]
-    counts = Counter(_colour(r) for r in results)
-    bar = [el("i", cls=v.value, style=f"flex:{counts[v]}") for v in ORDER if counts[v]]
     rows = [[el("dt", name), el("dd", text)] for name, text in facts if text]
     title = el("div", el("h1", f"Conformance of {subject.name}"), el("p", summary(results), cls="small"))
     return el(
         "div",
         el("header", title, pill(overall(results), big=True), cls="top"),
-        el("div", bar, cls="bar"),
+        verdict_bar(results),
         el("dl", rows, cls="facts"),
         el("p", "Run again: ", el("code", reproduce), cls="small"),
     )
@@ -92,7 +74,7 @@ def _finding(result: DeviceResult) -> Markup:
     case = result.case
     facts = [
         ("source", case.clause),
-        ("weight", WEIGHT[case.weighs]),
+        ("basis", BASIS[case.basis]),
         ("danger", case.danger.value),
         ("sent", case.does),
         ("expected", case.must),
@@ -101,23 +83,11 @@ def _finding(result: DeviceResult) -> Markup:
     quiet = "" if result.deviates else " quiet"
     return el(
         "section",
-        el("h3", f"{case.id} {case.title} ", _pill(result)),
+        el("h3", f"{case.id} {case.title} ", verdict_pill(result)),
         el("dl", [[el("dt", name), el("dd", text)] for name, text in facts], cls="facts"),
         wire_table(result.spoken),
         cls=f"failure{quiet}",
     )
-
-
-def _pill(result: DeviceResult) -> Markup:
-    """The verdict; a failure that is no deviation has the colour of an inconclusive case and its own word."""
-    if _colour(result) is result.verdict:
-        return pill(result.verdict)
-    return el("span", f"! {called(result)}", cls=f"pill {_colour(result).value}")
-
-
-def _colour(result: DeviceResult) -> Verdict:
-    """The verdict whose colour the result has: a failure of a case that the standard does not require is never red."""
-    return Verdict.INCONCLUSIVE if result.verdict is Verdict.FAILED and not result.deviates else result.verdict
 
 
 def wire_table(spoken: Sequence[Spoken]) -> Markup:
@@ -154,8 +124,8 @@ def _row(result: DeviceResult) -> Markup:
     return el(
         "tr",
         el("td", f"{case.id} {case.title}", cls="name", id=case.id),
-        el("td", _pill(result)),
-        el("td", case.weighs.value),
+        el("td", verdict_pill(result)),
+        el("td", case.basis.value),
         el("td", case.danger.value),
         el("td", case.does),
         el("td", case.must),

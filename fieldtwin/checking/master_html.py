@@ -1,4 +1,7 @@
-"""The conformance report of a master as one HTML file: no network, no script, readable on paper."""
+"""The conformance report of a master as one HTML file: no network, no script, readable on paper.
+
+What failed or stayed open comes first, with its frames. All cases follow in a table, with the frames of passed ones folded away.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,16 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from fieldtwin.conformance.evidence import reproduce
+from fieldtwin.__about__ import __version__
+from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, verdict_bar, verdict_pill
+from fieldtwin.conformance.evidence import Line, reproduce
 from fieldtwin.conformance.results import CaseResult, summary
+from fieldtwin.conformance.run import OTHER_FRAMING
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.model import Verdict
 from fieldtwin.report.style import style
-
-ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Verdict.SKIPPED)
 
 
 def write_master_html(results: Sequence[CaseResult], title: str, argv: Sequence[str], started: str, path: Path) -> None:
@@ -23,31 +27,73 @@ def write_master_html(results: Sequence[CaseResult], title: str, argv: Sequence[
 
 
 def render_master_html(results: Sequence[CaseResult], title: str, argv: Sequence[str], started: str) -> str:
-    """The whole page: each case with its verdict, its frames, and the command that plays it again. Failures come first."""
-    ordered = sorted(results, key=lambda r: ORDER.index(r.verdict))
+    """The whole page. Each failed or open case comes with its frames and the command that plays it again."""
+    bad = by_weight([r for r in results if r.verdict.bad or r.verdict is Verdict.INCONCLUSIVE])
+    heading = el("div", el("h1", f"Conformance of {title}"), el("p", summary(results), cls="small"))
+    facts = [("checked", started), ("fieldtwin", __version__)]
     body = [
-        el("header", el("div", el("h1", f"Conformance of {title}"), el("p", summary(results), cls="small")), cls="top"),
-        el("p", started, cls="small"),
+        el("header", heading, pill(overall(results), big=True), cls="top"),
+        verdict_bar(results),
+        el("dl", [[el("dt", name), el("dd", text)] for name, text in facts], cls="facts"),
         el("p", "Run again: ", el("code", shlex.join(["fieldtwin", *argv])), cls="small"),
-        *(_case(r, argv) for r in ordered),
     ]
-    head = el("head", el("meta", charset="utf-8"), el("title", f"check of {title}"), el("style", style()))
+    if bad:
+        body += [el("h2", "What was found", id="found"), *(_finding(r, argv) for r in bad)]
+    body += [el("h2", "All cases", id="cases"), _table(results)]
+    head = el(
+        "head",
+        el("meta", charset="utf-8"),
+        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        el("title", f"check of {title}"),
+        el("style", style()),
+    )
     return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"
 
 
-def _case(result: CaseResult, argv: Sequence[str]) -> Markup:
+def _finding(result: CaseResult, argv: Sequence[str]) -> Markup:
     case = result.case
-    facts = [("source", case.clause), ("danger", case.danger.value), ("the device", case.does), ("expected", case.must),
-             ("found", result.reason)]  # fmt: skip
-    rows = [
-        el("tr", el("td", f"{w.t_ms:.1f} ms", cls="num"), el("td", w.by), el("td", w.data, cls="raw"), el("td", w.text))
-        for w in result.wire
-    ]
+    facts = [("source", case.clause), ("basis", BASIS[case.basis]), ("danger", case.danger.value), ("the device", case.does),
+             ("expected", case.must), ("found", result.reason)]  # fmt: skip
     return el(
         "section",
-        el("h3", f"{case.id} {case.title} ", pill(result.verdict)),
+        el("h3", f"{case.id} {case.title} ", verdict_pill(result)),
         el("dl", [[el("dt", name), el("dd", text)] for name, text in facts if text], cls="facts"),
-        el("div", el("table", rows, cls="frames", style="width:auto"), cls="wide") if rows else "",
+        _frames(result.wire),
         el("p", "Run again: ", el("code", reproduce(argv, case.id)), cls="small"),
-        cls="failure" if result.verdict.bad else "failure quiet",
+        cls="failure" if result.deviates else "failure quiet",
+    )
+
+
+def _frames(wire: Sequence[Line]) -> Markup:
+    if not wire:
+        return Markup("")
+    rows = [
+        el("tr", el("td", f"{w.t_ms:.1f} ms", cls="num"), el("td", w.by), el("td", w.data, cls="raw"), el("td", w.text))
+        for w in wire
+    ]
+    return el("div", el("table", rows, cls="frames", style="width:auto"), cls="wide")
+
+
+def _table(results: Sequence[CaseResult]) -> Markup:
+    elsewhere = [r for r in results if r.reason == OTHER_FRAMING]
+    columns = ("case", "verdict", "basis", "danger", "the device", "expected", "source", "found")
+    rows = [_row(r) for r in results if r not in elsewhere]
+    table = el("table", el("thead", el("tr", [el("th", name) for name in columns])), el("tbody", rows))
+    ids = ", ".join(r.case.id for r in elsewhere)
+    return el("div", table, el("p", f"For other wires: {ids}.", cls="small") if ids else "", cls="wide")
+
+
+def _row(result: CaseResult) -> Markup:
+    case = result.case
+    frames = el("details", el("summary", f"{len(result.wire)} on the wire"), _frames(result.wire))
+    return el(
+        "tr",
+        el("td", f"{case.id} {case.title}", cls="name", id=case.id),
+        el("td", verdict_pill(result)),
+        el("td", case.basis.value),
+        el("td", case.danger.value),
+        el("td", case.does),
+        el("td", case.must),
+        el("td", case.clause),
+        el("td", result.reason, frames if result.wire and result.verdict is Verdict.PASSED else "", cls="long"),
     )

@@ -14,7 +14,7 @@ from fieldtwin.checking import modbus_tcp_plays as tcp
 from fieldtwin.checking import modbus_write_plays as write
 from fieldtwin.checking.device_case import DeviceCase, Play
 from fieldtwin.checking.modbus_wire import ModbusWire
-from fieldtwin.conformance.case import Basis, Danger
+from fieldtwin.conformance.case import OWN, Basis, Danger, Elsewhere
 
 ModbusCase = DeviceCase[ModbusWire]
 READ, WRITE, DISRUPT = Danger.READ, Danger.WRITE, Danger.DISRUPT
@@ -38,8 +38,9 @@ def case(
     wires: tuple[str, ...] = (),
     needs: tuple[str, ...] = (),
     basis: Basis = Basis.STANDARD,
+    elsewhere: tuple[Elsewhere, ...] = (),
 ) -> ModbusCase:
-    return DeviceCase(id, title, clause, danger, does, must, play, wires, needs, basis)
+    return DeviceCase(id, title, clause, danger, does, must, play, wires, needs, basis=basis, elsewhere=elsewhere)
 
 
 robust = partial(case, basis=Basis.ROBUSTNESS)
@@ -64,17 +65,17 @@ CASES: tuple[ModbusCase, ...] = (
     field("MB-009", "trailing 00s", "HA #69742", READ, "a read, then 00 00",
          "take the frame (tolerant) or discard it with the noise (strict); go on",
          line.trailing_zeros, FRAMED),
-    case("MB-026", "broadcast write", "SL 2.4.1; libmodbus #372", DISRUPT, "FC 06 to unit 0", "execute it, keep silent",
+    case("MB-026", "broadcast write", "SL 2.1; libmodbus #372", DISRUPT, "FC 06 to unit 0", "execute it, keep silent",
          write.broadcast_write, ANY_LINE, ("holding", "i-know")),
     case("MB-027", "broadcast read", "SL 2.1; libmodbus #379", READ, "a read to unit 0", "silence",
          line.broadcast_read, ANY_LINE),
     case("MB-029", "request to another unit", "SL 2.4.2", READ, "reads to three other units", "silence", line.other_unit,
          ANY_LINE),
-    field("MB-030", "another unit's request and response, then ours", "libmodbus #18; pymodbus #674", READ,
+    case("MB-030", "another unit's request and response, then ours", "SL 2.4.2; libmodbus #18; pymodbus #674", READ,
          "another's read with its response, then ours", "answer ours", line.neighbours_talk, FRAMED),
-    field("MB-031", "another unit silent, then ours", "libmodbus #83, #86", READ, "a read to a unit that is not there, ours",
-         "answer ours", line.neighbour_silent, FRAMED),
-    field("MB-032", "unknown function to another unit", "nanoMODBUS PR #78", DISRUPT, "function 64 to another unit",
+    case("MB-031", "another unit silent, then ours", "SL 2.4.2; libmodbus #83, #86", READ,
+          "a read to a unit that is not there, ours", "answer ours", line.neighbour_silent, FRAMED),
+    case("MB-032", "unknown function to another unit", "SL 2.4.2; nanoMODBUS PR #78", DISRUPT, "function 64 to another unit",
          "silence", line.stranger_function, ANY_LINE),
     case("MB-033a", "unknown function", "AP 7", DISRUPT, "function 64 with two bytes", "exception 01", pdu.unknown_function),
     case("MB-033b", "unknown function without data", "AP 7", DISRUPT, "function 41, nothing else", "exception 01",
@@ -90,7 +91,7 @@ CASES: tuple[ModbusCase, ...] = (
     case("MB-037", "start + count > 65536", "AP 6", READ, "a read of two cells from FFFF on", "exception 02",
          pdu.beyond_the_table),
     case("MB-038", "count and address both wrong", "AP 6", READ, "a read of too many cells from FFFF on",
-         "exception 03: the count comes first", pdu.both_wrong),
+         "exception 03 or 02: both are wrong", pdu.both_wrong),
     case("MB-039a", "FC05 value 0001h", "AP 6.5", WRITE, "FC 05 with 0001", "exception 03, coil unchanged", write.coil_0001, (),
          COIL),
     case("MB-039b", "FC05 value FF01h", "AP 6.5", WRITE, "FC 05 with FF01", "exception 03, coil unchanged", write.coil_ff01, (),
@@ -123,14 +124,15 @@ CASES: tuple[ModbusCase, ...] = (
     case("MB-045d", "a category that there is not", "AP 6.21", READ, "FC 43/14, code 07", "exception 03", pdu.unknown_category),
     case("MB-046", "FC08/4 listen-only", "AP 6.8", DISRUPT, "08/04, a read, 08/01, a read", "silence until it is restarted",
          pdu.listen_only, ANY_LINE, ("i-know",)),
-    case("MB-047", "FC08 counters", "SL 2.4.2", DISRUPT, "08/0E before and after three reads", "count them", pdu.counters),
+    case("MB-047", "FC08 counters", "AP 6.8", DISRUPT, "08/0E before and after three reads", "count them", pdu.counters),
     case("MB-049", "padding bits", "AP 6.1", READ, "a read of a few bits", "padding is 0", pdu.padding),
     case("MB-050a", "a frame of 256 bytes", "SL 2.5.1", DISRUPT, "08/00 with 250 bytes", "answer it", line.frame_of_256, FRAMED),
     robust("MB-050b", "a frame of 257 bytes", "SL 2.5.1", DISRUPT, "08/00 with 251 bytes", "discard it",
            line.frame_of_257, FRAMED),
-    robust("MB-051", "byte by byte", "catalogue", READ, "a read, one byte a segment", "answer it", tcp.byte_by_byte, STREAM),
+    case("MB-051", "byte by byte", "TG 3.1.3", READ, "a read, one byte a segment", "answer it", tcp.byte_by_byte, STREAM,
+         elsewhere=(Elsewhere("rtu-stream", "RTU over TCP", Basis.ROBUSTNESS, OWN),)),
     field("MB-052", "several ADUs in one segment", "OpenPLC #253; pymodbus #1949", READ, "three reads in one segment",
-         "answer all, in order", tcp.several_at_once, TCP),
+         "answer each in order, or exception 06", tcp.several_at_once, TCP),
     case("MB-053", "more requests in flight than allowed", "TG 4.4.2.2", DISRUPT, "40 reads in one segment",
          "answer each, or exception 06", tcp.more_than_allowed, TCP),
     case("MB-054", "protocol id not 0", "TG 4.4.2.2", READ, "an ADU with protocol id 1, then a read",
@@ -152,7 +154,7 @@ CASES: tuple[ModbusCase, ...] = (
          "serve the next connection", tcp.half_and_gone, STREAM),
     robust("MB-065", "connection limit", "TG 4.2.1", DISRUPT, "20 connections that are not used, then one more",
          "serve the last one", tcp.many_connections, STREAM),
-    robust("MB-068", "wrong baud rate or parity", "catalogue", DISRUPT, "what another baud rate makes of a read",
+    robust("MB-068", "wrong baud rate or parity", OWN, DISRUPT, "what another baud rate makes of a read",
            "silence; go on", line.wrong_baud_rate, FRAMED),
     field("MB-069", "two masters on one line", "pymodbus #432", DISRUPT, "two reads at once", "silence; go on",
          line.two_masters, FRAMED),

@@ -75,10 +75,10 @@ async def beyond_the_table(wire: ModbusWire) -> Finding:
 
 
 async def both_wrong(wire: ModbusWire) -> Finding:
-    """MB-038: too many from FFFFh on: the count is looked at first."""
+    """MB-038: too many cells from FFFFh on. AP 6 checks the count first (exception 03); 02 names the other error."""
     function, _, _ = first_table(wire, ORDER)
     count = 126 if function in (0x03, 0x04) else 2001
-    return await must_refuse(wire, read_of(function, 0xFFFF, count), 0x03, may_lack=False)
+    return await must_refuse(wire, read_of(function, 0xFFFF, count), 0x03, 0x02, may_lack=False)
 
 
 async def padding(wire: ModbusWire) -> Finding:
@@ -192,7 +192,7 @@ def text_of(raw: bytes) -> str:
     return raw.decode("latin-1").strip("\0 ") or "(empty)"
 
 
-# -- diagnostics (AP 6.8, SL 2.4.2) -----------------------------------------------------------------------------------
+# -- diagnostics (AP 6.8) ---------------------------------------------------------------------------------------------
 
 
 async def counters(wire: ModbusWire) -> Finding:

@@ -9,8 +9,8 @@ from typing import Any
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.subject import Subject
 from fieldtwin.conformance.case import Basis
-from fieldtwin.conformance.results import ONLY_REQUIRED, called, counts_as_failed, summary
-from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
+from fieldtwin.conformance.results import ONLY_REQUIRED, for_build, summary
+from fieldtwin.report.model import CheckResult, Report, ScenarioResult
 from gateway.core.clock import NS_PER_MS
 from gateway.core.connection import Direction
 
@@ -26,7 +26,7 @@ def as_json(subject: Subject, results: Sequence[DeviceResult]) -> dict[str, Any]
         "version": VERSION,
         "about": subject.as_json(),
         "counts": dict(Counter(r.verdict.value for r in results)),
-        "findings": {basis.value: sum(r.verdict.bad and r.case.weighs is basis for r in results) for basis in Basis},
+        "findings": {basis.value: sum(r.verdict.bad and r.case.basis is basis for r in results) for basis in Basis},
         "cases": [_case(r) for r in results],
     }
 
@@ -37,7 +37,7 @@ def _case(result: DeviceResult) -> dict[str, Any]:
         "id": case.id,
         "title": case.title,
         "clause": case.clause,
-        "basis": case.weighs.value,
+        "basis": case.basis.value,
         "role": case.role,
         "danger": case.danger.value,
         "sent": case.does,
@@ -60,15 +60,10 @@ def _case(result: DeviceResult) -> dict[str, Any]:
 def as_report(
     subject: Subject, results: Sequence[DeviceResult], reproduce: str, fail_on: frozenset[Basis] = ONLY_REQUIRED
 ) -> Report:
-    """For JUnit: a scenario for each case, with its bytes in the output.
-
-    A failure that does not decide the exit code is reported as skipped, with its kind in front of the reason. So a build and its
-    test report agree.
-    """
+    """For JUnit: a scenario for each case, with its bytes in the output."""
     scenarios = []
     for r in results:
-        kept = not r.verdict.bad or counts_as_failed(r, fail_on)
-        verdict, reason = (r.verdict, r.reason) if kept else (Verdict.SKIPPED, f"{called(r)} finding: {r.reason}")
+        verdict, reason = for_build(r, fail_on)
         said = "; ".join(f"{'>' if s.direction is Direction.SENT else '<'} {s.text}" for s in r.spoken)
         check = CheckResult("1", f"{r.case.does}: {r.case.must}", verdict, expected=r.case.must, got=reason)
         wire = [CheckResult("wire", said, verdict)] if said else []
@@ -77,6 +72,7 @@ def as_report(
                 f"{r.case.id} {r.case.title}", verdict, [check, *wire], requirements=(r.case.row,), target=subject.name,
                 reason=reason, reproduce=f"{reproduce} --only {r.case.id}", took_s=r.took_s,
                 case=r.case.id, role=r.case.role, danger=r.case.danger.value,
+                basis=r.case.basis.value, clause=r.case.clause,
             )
         )  # fmt: skip
     versions = {"fieldtwin": subject.fieldtwin, **{f"device {name}": text for name, text in subject.identity.items()}}

@@ -125,7 +125,7 @@ async def play(
             finding, well = await _case(wire, case, transcript)
             lost = 0 if well else lost + 1
         took_s = (clock.monotonic_ns() - began_ns) / NS_PER_S
-        results.append(DeviceResult(case, finding, took_s, spoken=transcript.spoken))
+        results.append(DeviceResult(case.on_wire(wire.traits), finding, took_s, spoken=transcript.spoken))
         tell(results[-1])
     return results
 

@@ -17,13 +17,14 @@ import click
 
 from fieldtwin.cli.check_cases import only_of
 from fieldtwin.cli.check_device_command import canopen, modbus
+from fieldtwin.cli.fail_on import bases_of, fail_on_option, print_not_counted
 from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
     from emulators.modbus.bank import Table
-    from fieldtwin.conformance.case import Case
+    from fieldtwin.conformance.case import Basis, Case
     from fieldtwin.conformance.results import CaseResult
 
 FILE = click.Path(dir_okay=False, path_type=Path)
@@ -34,9 +35,10 @@ _OBJECT = re.compile(r"^([0-9A-Fa-f]{4}):([0-9A-Fa-f]{2})=((?:[0-9A-Fa-f]{2})+)$
 
 @click.group("check")
 def command() -> None:
-    """Judge a device from outside, or how a master bears devices that misbehave.
+    """Test a device from outside, or a master with devices that misbehave.
 
-    Exit code 0 when cases passed and none failed; SKIPPED and INCONCLUSIVE neither pass nor fail.
+    Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1. SKIPPED and INCONCLUSIVE neither
+    pass nor fail.
     """
 
 
@@ -58,6 +60,7 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
             help="How long the master may take to be back to good; above its longest pause.",
         ),
         click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
+        fail_on_option,
         click.option("--junit", type=click.Path(dir_okay=False, path_type=Path), help="Write the verdicts as JUnit XML."),
         junit_flavour_option,
         click.option("--html", type=FILE, help="Write a report with every frame."),
@@ -125,6 +128,7 @@ def modbus_master(
     wait_s: float,
     patience_s: float,
     waivers_path: Path | None,
+    fail_on: str,
     junit: Path | None,
     junit_flavour: str,
     html: Path | None,
@@ -168,6 +172,7 @@ def modbus_master(
         as_json,
         listen,
         plan.only,
+        bases_of(fail_on),
     )
 
 
@@ -207,6 +212,7 @@ def canopen_master(
     wait_s: float,
     patience_s: float,
     waivers_path: Path | None,
+    fail_on: str,
     junit: Path | None,
     junit_flavour: str,
     html: Path | None,
@@ -249,6 +255,7 @@ def canopen_master(
         as_json,
         listen,
         plan.only,
+        bases_of(fail_on),
     )
 
 
@@ -282,6 +289,7 @@ def _judged(
     as_json: bool,
     title: str,
     only: frozenset[str],
+    fail_on: frozenset[Basis],
 ) -> int:
     """Run it, show what was found, write the files. The exit code."""
     from fieldtwin.checking.master_log import MasterLog
@@ -302,15 +310,18 @@ def _judged(
         found: list[CaseResult] = run(judge(listener))
     results = [waive(result, waivers, started.date()) for result in found]
     document = json.dumps(data_of(results, argv), indent=2) + "\n"
-    _write(files, results, document, f"master on {title}", started)
+    _write(files, results, document, f"master on {title}", started, fail_on)
     if as_json:
         sys.stdout.write(document)
     else:
         print_results(results)
-    return exit_code(results)
+        print_not_counted(results, fail_on)
+    return exit_code(results, fail_on)
 
 
-def _write(files: Files, results: list[CaseResult], document: str, title: str, started: datetime) -> None:
+def _write(
+    files: Files, results: list[CaseResult], document: str, title: str, started: datetime, fail_on: frozenset[Basis]
+) -> None:
     from fieldtwin.checking.master_html import write_master_html
     from fieldtwin.conformance.results import as_report
     from fieldtwin.report.file import put
@@ -318,7 +329,7 @@ def _write(files: Files, results: list[CaseResult], document: str, title: str, s
 
     argv, began = sys.argv[1:], started.isoformat(timespec="seconds")
     if files.junit is not None:
-        write_junit(as_report(results, title, argv, began), files.junit, Flavour(files.junit_flavour))
+        write_junit(as_report(results, title, argv, began, fail_on), files.junit, Flavour(files.junit_flavour))
     if files.html is not None:
         write_master_html(results, title, argv, began, files.html)
     if files.out is not None:
@@ -326,11 +337,10 @@ def _write(files: Files, results: list[CaseResult], document: str, title: str, s
 
 
 def _list(cases: list[Case], as_json: bool) -> int:
-    from fieldtwin.cli.check_view import print_cases
+    from fieldtwin.cli.check_view import listed, print_cases
 
     if as_json:
-        keys = ("id", "title", "clause", "does", "must")
-        json.dump([{k: getattr(c, k) for k in keys} | {"danger": c.danger.value} for c in cases], sys.stdout, indent=2)
+        json.dump([listed(case) for case in cases], sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
         print_cases(cases)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from fieldtwin.cli.fail_on import bases_of, fail_on_option, print_not_counted
 from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
 from gateway.core.errors import NotAllowed, UsageError
 
@@ -36,8 +37,6 @@ MEANS = {
         "disrupt": "NMT, guarding, LSS, unknown commands: the node is stopped and restarted",
     },
 }
-FAIL_ON = {"standard": 1, "robustness": 2, "field": 3}
-"""How many of the bases, in the order of `Basis`, decide the exit code."""
 FILE = click.Path(dir_okay=False, path_type=Path)
 INTERRUPTED = 130
 F = TypeVar("F", bound=Callable[..., Any])
@@ -57,11 +56,7 @@ def shared(function: F) -> F:
                      help="Requests a second, at most."),
         click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time."),
         click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
-        click.option(
-            "--fail-on", type=click.Choice(tuple(FAIL_ON)), default="standard", show_default=True,
-            help="Which failed cases give exit code 1: those that the standard requires, also those of robustness, or also known "
-                 "field problems.",
-        ),
+        fail_on_option,
         click.option("--by", help="Who checks; stands in the reports.  [default: the name you are logged in by]"),
         click.option("--html", type=FILE, help="Write a report with every byte."),
         click.option("--junit", type=FILE, help="Write the verdicts as JUnit XML."),
@@ -125,10 +120,9 @@ class Check:
         from fieldtwin.checking.run import OTHER_WIRE
         from fieldtwin.cli.check_view import print_results
         from fieldtwin.cli.talk import talk
-        from fieldtwin.conformance.case import Basis
         from fieldtwin.conformance.results import exit_code, waive
 
-        fail_on = frozenset(list(Basis)[: FAIL_ON[self.options["fail_on"]]])
+        fail_on = bases_of(self.options["fail_on"])
         today = datetime.fromisoformat(subject.started).date()
         results: list[DeviceResult] = [waive(result, self.waivers, today) for result in checked.results]  # type: ignore[misc]
         document = as_json(subject, results)
@@ -151,11 +145,7 @@ class Check:
             print_results([r for r in results if r not in elsewhere], "what is asked")
             if elsewhere:
                 talk.print(f"{len(elsewhere)} more cases are for other wires", markup=False)
-            if any(r.verdict.bad and r.case.weighs not in fail_on for r in results):
-                talk.print(
-                    "The standard does not require what robustness and field problem cases ask. "
-                    "The exit code does not count them: see --fail-on.", markup=False, soft_wrap=True,
-                )  # fmt: skip
+            print_not_counted(results, fail_on)
         return INTERRUPTED if self.interrupted else exit_code(results, fail_on)
 
     def play(self, most: int, check: Callable[..., Any]) -> Checked:
@@ -228,16 +218,10 @@ class Check:
 
 
 def list_cases(cases: Sequence[DeviceCase[Any]], as_json: bool) -> int:
-    from fieldtwin.cli.check_view import print_cases
+    from fieldtwin.cli.check_view import listed, print_cases
 
     if as_json:
-        keys = ("id", "title", "clause", "does", "must")
-        listed = [
-            {k: getattr(c, k) for k in keys}
-            | {"basis": c.basis.value, "danger": c.danger.value, "wires": c.wires, "needs": c.needs}
-            for c in cases
-        ]
-        json.dump(listed, sys.stdout, indent=2)
+        json.dump([listed(c) | {"wires": c.wires, "needs": c.needs} for c in cases], sys.stdout, indent=2)
         sys.stdout.write("\n")
     else:
         print_cases(cases, "what is sent", "what the device must do")

@@ -51,7 +51,7 @@ def modbus(
     fieldtwin check modbus 'rtu:/dev/ttyUSB0?baudrate=9600&frame=8N1' --unit 17
     fieldtwin check modbus tcp://192.0.2.7:502 --write holding:100 --dry-run
 
-    Reads only, unless told otherwise. Exit code 0 when cases passed and none failed.
+    Reads only, unless told otherwise. Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
     """
     from fieldtwin.checking.modbus_cases import CASES
     from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus, traits_of
@@ -120,7 +120,7 @@ def canopen(
     fieldtwin check canopen can:socketcan/can0 --node 5 --eds inclinometer.eds
     fieldtwin check canopen can:fieldtwin/127.0.0.1:29536 --node 5 --write 1017:00
 
-    Uploads only, unless told otherwise. Exit code 0 when cases passed and none failed.
+    Uploads only, unless told otherwise. Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
     """
     from fieldtwin.checking.canopen_cases import CASES
     from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen

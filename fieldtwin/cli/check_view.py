@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Sequence
 from itertools import groupby
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich import box
 from rich.markup import escape
@@ -34,6 +34,7 @@ STYLE = {
 }  # fmt: skip
 FINDING = {Basis.ROBUSTNESS: "yellow", Basis.FIELD: "magenta"}
 """Colours of failures that are no deviation from the standard: never red."""
+BASIS = {Basis.STANDARD: "default", **FINDING}
 MARK = {
     Verdict.PASSED: "✓", Verdict.FAILED: "✗", Verdict.ERROR: "!", Verdict.INCONCLUSIVE: "?", Verdict.SKIPPED: "-",
 }  # fmt: skip
@@ -74,7 +75,7 @@ class Progress:
 
 def style_of(result: CaseResult) -> str:
     """The colour of a result: red only for a deviation from the standard."""
-    return FINDING.get(result.case.weighs, STYLE[result.verdict]) if result.verdict.bad else STYLE[result.verdict]
+    return FINDING.get(result.case.basis, STYLE[result.verdict]) if result.verdict.bad else STYLE[result.verdict]
 
 
 def print_results(results: Sequence[CaseResult], does: str = "the device") -> None:
@@ -114,14 +115,24 @@ def print_cases(
 ) -> None:
     """All cases, for `--list`."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for name in ("case", "danger", does, must, "source"):
-        table.add_column(name, overflow="fold")
+    for name in ("case", "basis", "danger", does, must, "source"):
+        table.add_column(name, overflow="fold", no_wrap=name == "case")
     for case in cases:
-        danger = case.danger.value
+        danger, basis = case.danger.value, BASIS[case.basis]
         table.add_row(
-            case.id, f"[{DANGER[danger]}]{danger}[/]", escape(case.does), escape(case.must), escape(case.clause)
-        )
+            case.id, f"[{basis}]{escape(case.bases)}[/]", f"[{DANGER[danger]}]{danger}[/]", escape(case.does),
+            escape(case.must), escape(case.sources),
+        )  # fmt: skip
     data.print(table)
+
+
+def listed(case: About) -> dict[str, Any]:
+    """The case for `--list --json`. `elsewhere` has its basis and clause on single kinds of wire, where they differ."""
+    keys = ("id", "title", "clause", "does", "must")
+    elsewhere = [{"wire": e.wire, "basis": e.basis.value, "clause": e.clause} for e in case.elsewhere]
+    return {k: getattr(case, k) for k in keys} | {
+        "basis": case.basis.value, "danger": case.danger.value, "role": case.role, "elsewhere": elsewhere,
+    }  # fmt: skip
 
 
 def print_paper(checked: Checked, *, as_json: bool) -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from itertools import pairwise
 
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
-from fieldtwin.conformance.judges import owes
+from fieldtwin.conformance.judges import accepts, owes, publishes_nothing_bad
 from fieldtwin.conformance.observation import Asked, Observation, Sent, Shown, Told, Word
+from fieldtwin.report.model import Verdict
 from gateway.core.clock import NS_PER_S
 
 ABORT, NMT, SYNC, SDO_REQUEST = 0x80, 0x000, 0x080, 0x600
+BLOCK_UPLOAD = 5
+"""Client command specifier of a block upload."""
 
 
 def aborts_with(code: int, *others: int) -> Judge:
@@ -84,6 +87,20 @@ def _waits_for_each(seen: Observation) -> Finding | None:
 
 
 waits_for_each = owes(_waits_for_each)
+
+
+def takes_the_switch(seen: Observation) -> Finding:
+    """As `accepts`, where the client allows the change from a block upload to an ordinary one.
+
+    A client that sends a protocol switch threshold of 0 forbids it (7.2.4.3.13). It may refuse each such reply; only a
+    wrong value would be a failure.
+    """
+    found = accepts(seen)
+    first = next(seen.of(Asked, seen.begun_ns), None)
+    forbidden = first is not None and first.target[1] >> 5 == BLOCK_UPLOAD and first.target[6:7] == b"\0"
+    if not forbidden or found.verdict is not Verdict.FAILED:
+        return found
+    return publishes_nothing_bad(seen) or skipped("its requests forbid the switch: the protocol switch threshold is 0")
 
 
 def _one_a_block(seen: Observation) -> Finding | None:

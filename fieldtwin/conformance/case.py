@@ -6,8 +6,9 @@ Protocols are elsewhere.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Self
 
 from fieldtwin.conformance.observation import Observation
 from fieldtwin.report.model import Verdict
@@ -39,10 +40,27 @@ class Basis(Enum):
     STANDARD = "standard"
     """The clause of the standard that the case names requires it: a failure is a deviation."""
     ROBUSTNESS = "robustness"
-    """No clause requires it. A device that fails is less tolerant than it could be, and still conforms."""
+    """No clause requires it. A device or master that fails is less tolerant than it could be, and still conforms."""
     FIELD = "field problem"
-    """Devices in the field are known to fail here; the case names the project to which that was reported. A device that fails
-    conforms, but may cause the same trouble."""
+    """Products in the field are known to fail here; the case names the project to which that was reported. A device or master
+    that fails conforms, but may cause the same trouble."""
+
+
+OWN = "fieldtwin"
+"""The source of a case that rests on no clause and on no report of another project."""
+
+
+@dataclass(frozen=True, slots=True)
+class Elsewhere:
+    """The basis and the source of a case on one kind of wire, where they differ from those on all other wires.
+
+    `trait` is the wire's name in the program (see `Stage` and `ModbusWire`), `wire` its name for users.
+    """
+
+    trait: str
+    wire: str
+    basis: Basis
+    clause: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +95,10 @@ Judge = Callable[[Observation], Finding]
 class About:
     """The part of a case that people see.
 
-    `id` is the catalogue's, with a letter behind it where a row is several cases. `clause` names the source as
-    the catalogue does. `does` is what the checker does, `must` what is expected of whom it judges, who has the `role`.
+    `id` is the catalogue's, with a letter behind it where a row is several cases. `clause` names the source: the clause of the
+    standard, or the project that reported the problem. `does` is what the checker does, a verb first ("inverts the CRC"), `must`
+    what the device or master, which has the `role`, is expected to do. `elsewhere` overrides `basis` and `clause` on single kinds
+    of wire.
     """
 
     id: str
@@ -87,6 +107,8 @@ class About:
     danger: Danger
     does: str
     must: str
+    basis: Basis = field(kw_only=True)
+    elsewhere: tuple[Elsewhere, ...] = field(default=(), kw_only=True)
 
     @property
     def row(self) -> str:
@@ -99,9 +121,23 @@ class About:
         return "master"
 
     @property
-    def weighs(self) -> Basis:
-        """How much a failure weighs. Cases for masters all weigh the same."""
-        return Basis.STANDARD
+    def bases(self) -> str:
+        """``standard``, or ``standard; TCP: robustness`` where a failure weighs differently on single kinds of wire."""
+        return "; ".join(
+            [self.basis.value, *(f"{e.wire}: {e.basis.value}" for e in self.elsewhere if e.basis is not self.basis)]
+        )
+
+    @property
+    def sources(self) -> str:
+        """`clause`, followed by the sources on single kinds of wire: ``SL 2.4.1; TCP: TG 4.4.1.3``."""
+        return "; ".join([self.clause, *(f"{e.wire}: {e.clause}" for e in self.elsewhere)])
+
+    def on_wire(self, traits: frozenset[str]) -> Self:
+        """Return the case with the basis and the source that it has on a wire with these traits."""
+        for each in self.elsewhere:
+            if each.trait in traits:
+                return replace(self, basis=each.basis, clause=each.clause, elsewhere=())
+        return replace(self, elsewhere=()) if self.elsewhere else self
 
     def chosen(self, only: frozenset[str]) -> bool:
         """Whether `only` names it, or its row; all are chosen by none."""

@@ -33,8 +33,8 @@ class CaseResult:
 
     @property
     def deviates(self) -> bool:
-        """Whether it failed a case that the standard requires. Cases for masters all count as required."""
-        return self.verdict.bad and self.case.weighs is Basis.STANDARD
+        """Whether it failed a case that the standard requires."""
+        return self.verdict.bad and self.case.basis is Basis.STANDARD
 
     @property
     def reason(self) -> str:
@@ -61,7 +61,7 @@ FOUND = {Basis.STANDARD: "failed", Basis.ROBUSTNESS: "robustness", Basis.FIELD: 
 
 def counts_as_failed(result: CaseResult, fail_on: frozenset[Basis] = ONLY_REQUIRED) -> bool:
     """Whether the result decides the exit code: it failed, and its case's basis is one of `fail_on`."""
-    return result.verdict is Verdict.ERROR or (result.verdict.bad and result.case.weighs in fail_on)
+    return result.verdict is Verdict.ERROR or (result.verdict.bad and result.case.basis in fail_on)
 
 
 def exit_code(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_REQUIRED) -> int:
@@ -73,7 +73,7 @@ def exit_code(results: Sequence[CaseResult], fail_on: frozenset[Basis] = ONLY_RE
 def called(result: CaseResult) -> str:
     """``passed``, ``failed``, ``robustness`` or ``field problem`` (failures that are no deviation), ``inconclusive``
     or ``skipped``."""
-    return FOUND[result.case.weighs] if result.verdict is Verdict.FAILED else result.verdict.value
+    return FOUND[result.case.basis] if result.verdict is Verdict.FAILED else result.verdict.value
 
 
 def summary(results: Sequence[CaseResult]) -> str:
@@ -90,6 +90,7 @@ def as_json(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str
             "id": r.case.id,
             "title": r.case.title,
             "clause": r.case.clause,
+            "basis": r.case.basis.value,
             "role": r.case.role,
             "danger": r.case.danger.value,
             "device": r.case.does,
@@ -105,17 +106,36 @@ def as_json(results: Sequence[CaseResult], argv: Sequence[str]) -> list[dict[str
     ]
 
 
-def as_report(results: Sequence[CaseResult], title: str, argv: Sequence[str], started: str) -> Report:
-    """For `fieldtwin.report`: a scenario a case."""
+def for_build(result: CaseResult, fail_on: frozenset[Basis]) -> tuple[Verdict, str]:
+    """Return the verdict and the reason that a build's test report shows.
+
+    A failure that does not decide the exit code is SKIPPED there, with its kind in front of the reason. So a build and its test
+    report agree.
+    """
+    if not result.verdict.bad or counts_as_failed(result, fail_on):
+        return result.verdict, result.reason
+    return Verdict.SKIPPED, f"{called(result)} finding: {result.reason}"
+
+
+def as_report(
+    results: Sequence[CaseResult],
+    title: str,
+    argv: Sequence[str],
+    started: str,
+    fail_on: frozenset[Basis] = ONLY_REQUIRED,
+) -> Report:
+    """For JUnit: a scenario for each case, with its frames."""
     again = shlex.join(["fieldtwin", *argv])
-    return Report(title, [_scenario(r, title, argv) for r in results], started=started, reproduce=again, target=title)
+    scenarios = [_scenario(r, title, argv, fail_on) for r in results]
+    return Report(f"{title}: {summary(results)}", scenarios, started=started, reproduce=again, target=title)
 
 
-def _scenario(result: CaseResult, target: str, argv: Sequence[str]) -> ScenarioResult:
+def _scenario(result: CaseResult, target: str, argv: Sequence[str], fail_on: frozenset[Basis]) -> ScenarioResult:
     case = result.case
-    check = CheckResult("1", f"{case.does}: {case.must}", result.verdict, expected=case.must, got=result.reason)
+    verdict, reason = for_build(result, fail_on)
+    check = CheckResult("1", f"{case.does}: {case.must}", verdict, expected=case.must, got=reason)
     return ScenarioResult(
-        f"{case.id} {case.title}", result.verdict, [check], requirements=(case.row,), target=target, reason=result.reason,
+        f"{case.id} {case.title}", verdict, [check], requirements=(case.row,), target=target, reason=reason,
         reproduce=reproduce(argv, case.id), took_s=result.took_s, case=case.id, role=case.role, danger=case.danger.value,
-        evidence=tuple(map(str, result.wire)),
+        basis=case.basis.value, clause=case.clause, evidence=tuple(map(str, result.wire)),
     )  # fmt: skip

@@ -23,6 +23,8 @@ from gateway.core.errors import Unreachable
 POLL_S = 0.01
 STEADY = 3
 """So many polls make a habit."""
+OTHER_FRAMING = "there is no such thing on this endpoint"
+"""Why a case for other wires is skipped."""
 MANY = 1_000_000
 """Strikes of a case that goes on until its value was seen."""
 
@@ -201,7 +203,7 @@ class MasterRun(Generic[C]):
 
     def _not_here(self, case: C) -> str:
         if not self.traits & set(case.framings):
-            return "there is no such thing on this endpoint"
+            return OTHER_FRAMING
         if case.needs and case.needs not in self.plan.has:
             return f"only with --{case.needs}"
         if case.about.danger.rank > self.plan.at_most.rank:
@@ -282,7 +284,9 @@ class MasterRun(Generic[C]):
         self._done(case, case.about.judge(Observation(events, 0, 0, now_ns, self.habit)), now_ns)
 
     def _done(self, case: C, finding: Finding, since_ns: int, wire: tuple[Line, ...] = ()) -> None:
-        result = CaseResult(case.about, finding, (self.stage.now_ns() - since_ns) / NS_PER_S, wire=wire)
+        result = CaseResult(
+            case.about.on_wire(self.traits), finding, (self.stage.now_ns() - since_ns) / NS_PER_S, wire=wire
+        )
         self.results.append(result)
         self.tell(result)
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from fieldtwin.conformance.case import TRAIL_S, Case
+from fieldtwin.conformance.case import TRAIL_S, Basis, Case, Elsewhere
 from fieldtwin.conformance.modbus_device import ModbusWire
 
 
@@ -118,3 +118,8 @@ class ModbusCase:
 
     def on(self, **changes: object) -> ModbusCase:
         return replace(self, **changes)  # type: ignore[arg-type]
+
+    def on_tcp(self, basis: Basis, clause: str) -> ModbusCase:
+        """Return the case with another basis and source on Modbus TCP."""
+        there = Elsewhere("tcp", "TCP", basis, clause)
+        return replace(self, about=replace(self.about, elsewhere=(there,)))

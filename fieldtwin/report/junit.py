@@ -77,7 +77,9 @@ def _case(suite: ET.Element, report: Report, scenario: ScenarioResult, flavour: 
         suite, "testcase", classname=clean(f"{system}.{target}" if target else system), name=clean(scenario.title),
         time=f"{scenario.took_s:.3f}",
     )  # fmt: skip
-    facts = [(name, value) for name in ("case", "role", "danger") if (value := getattr(scenario, name))]
+    facts = [
+        (name, value) for name in ("case", "role", "danger", "basis", "clause") if (value := getattr(scenario, name))
+    ]
     if scenario.file:  # no attribute: Jenkins' xUnit plugin skips whole files for that
         facts.append(("file", f"{scenario.file}:{scenario.line}" if scenario.line else scenario.file))
     if scenario.earlier:

@@ -102,7 +102,8 @@ class ScenarioResult:
     """One scenario against one target with one seed.
 
     `case` is the id that it goes by, `role` whom it judges (controller, master, device), `danger` what it may do to what is there
-    (observe, read, write, disrupt).
+    (observe, read, write, disrupt), `basis` why a conformance case asks what it asks (standard, robustness, field problem),
+    `clause` its source.
 
     `faults` says how often each fault struck that the scenario put in.
 
@@ -132,6 +133,8 @@ class ScenarioResult:
     case: str = ""
     role: str = ""
     danger: str = ""
+    basis: str = ""
+    clause: str = ""
     faults: Sequence[Struck] = ()
     evidence: Sequence[str] = ()
     """Lines of what was on the wire: before the check that failed, or where that is not in `trace`."""

@@ -47,7 +47,7 @@ TWISTS: dict[str, wrong.Twist] = {
     "MB-036c": wrong.instead(0x01, b"\x81\x04", where=lambda pdu: count(pdu) == 2001),
     "MB-036d": wrong.instead(0x10, b"\x10\x00\xbe\x00\x00", where=lambda pdu: len(pdu) == 6),
     "MB-037": wrong.instead(0x03, b"\x83\x03", where=lambda pdu: pdu[1:] == b"\xff\xff\x00\x02"),
-    "MB-038": wrong.instead(0x03, b"\x83\x02", where=lambda pdu: pdu[1:] == b"\xff\xff\x00\x7e"),
+    "MB-038": wrong.instead(0x03, b"\x83\x04", where=lambda pdu: pdu[1:] == b"\xff\xff\x00\x7e"),
     "MB-039a": wrong.written("coil", lambda pdu: 1, 0x05, lambda pdu: pdu[3:] == b"\x00\x01"),
     "MB-039b": wrong.instead(0x05, b"\x05\x00\x03\xff\x01", where=lambda pdu: pdu[3:] == b"\xff\x01"),
     "MB-040a": wrong.written(

@@ -14,7 +14,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from devices_in_memory import make_unit, on_modbus
+from wrong_devices import twisted
 
+from emulators.modbus.unit import ModbusUnit
 from emulators.virtual.clock import VirtualClock
 from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking import canopen_cases, modbus_cases
@@ -133,3 +135,48 @@ def test_the_text_of_the_repeated_toggle_shows_both_steps() -> None:
     case = next(case for case in canopen_cases.CASES if case.id == "CO-001a")
     assert case.does == "two segments asked for with the same toggle, then the next one"
     assert case.must == "abort 05030000 for the repeated toggle, then abort 05040001: the transfer is over"
+
+
+def test_a_request_with_two_errors_may_be_refused_for_either() -> None:
+    def refuse_the_address(unit: ModbusUnit, pdu: bytes, right: bytes | None) -> bytes | None:
+        return b"\x83\x02" if pdu == b"\x03\xff\xff\x00\x7e" else right
+
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
+        options = ModbusOptions(url, 1, Plan(frozenset({"MB-038"})), connector=net, clock=clock)
+        return (await check_modbus(options)).results
+
+    (found,) = on_modbus("rtu:/virtual/line?baudrate=19200&frame=8E1", use, twisted(refuse_the_address))
+    assert (found.verdict, found.reason) == (Verdict.PASSED, "exception 02 (illegal data address)")
+
+
+async def one_at_a_time(end: ByteConnection) -> None:
+    """A TCP server that refuses each request but the first of a segment with exception 06."""
+    unit = make_unit()
+    while True:
+        try:
+            data = await end.read()
+        except ConnectionLost:
+            return
+        for nth, at in enumerate(range(0, len(data), 12)):
+            adu = data[at : at + 12]
+            pdu = (unit.respond(adu[7:], 0) or b"") if nth == 0 else bytes((adu[7] | 0x80, 0x06))
+            await end.write(adu[:4] + (len(pdu) + 1).to_bytes(2) + adu[6:7] + pdu)
+
+
+def test_a_server_may_refuse_further_requests_of_a_segment_as_busy() -> None:
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
+        options = ModbusOptions(url, 1, Plan(frozenset({"MB-052"})), connector=net, clock=clock)
+        return (await check_modbus(options)).results
+
+    (found,) = on_modbus("tcp://127.0.0.1:0", use, serve=one_at_a_time)
+    assert (found.verdict, found.reason) == (Verdict.PASSED, "1 answered, 2 refused with 06")
+
+
+@pytest.mark.parametrize(("url", "basis"), [("tcp://127.0.0.1:0", "standard"), ("rtu+tcp://127.0.0.1:0", "robustness")])
+def test_a_request_byte_by_byte_must_be_answered_only_where_a_header_has_its_length(url: str, basis: str) -> None:
+    async def use(net: MemoryNet, url: str, clock: VirtualClock) -> list[DeviceResult]:
+        options = ModbusOptions(url, 1, Plan(frozenset({"MB-051"})), connector=net, clock=clock)
+        return (await check_modbus(options)).results
+
+    (found,) = on_modbus(url, use)
+    assert (found.verdict, found.case.basis.value) == (Verdict.PASSED, basis)

@@ -6,7 +6,7 @@ import pytest
 
 from fieldtwin.conformance import judges
 from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
-from fieldtwin.conformance.canopen_judges import legal_nmt, legal_sync
+from fieldtwin.conformance.canopen_judges import legal_nmt, legal_sync, takes_the_switch
 from fieldtwin.conformance.case import Judge
 from fieldtwin.conformance.habits import (
     bounded_addresses,
@@ -132,7 +132,9 @@ def test_requests_against_the_standard(judge: Judge, target: str, verdict: Verdi
     assert judge(_seen(Asked(_at(0), 1, bytes.fromhex(target)))).verdict is verdict
 
 
-@pytest.mark.parametrize(("pause_s", "verdict"), [(0.1, Verdict.PASSED), (0.09, Verdict.FAILED)])
+@pytest.mark.parametrize(
+    ("pause_s", "verdict"), [(0.1, Verdict.PASSED), (0.09, Verdict.INCONCLUSIVE), (0.009, Verdict.FAILED)]
+)
 def test_units_get_time_for_a_broadcast(pause_s: float, verdict: Verdict) -> None:
     broadcast = bytes.fromhex("00 06 00 00 00 01")
     assert broadcasts_wait(_seen(Asked(_at(0), 1, broadcast), Asked(_at(pause_s), 1, READ))).verdict is verdict
@@ -187,3 +189,16 @@ def test_connections_that_pile_up_are_counted() -> None:
     assert few_connections(_seen(*some)).reason == "at most 4 at once"
     assert few_connections(_seen(*some, Left(_at(5), 1), Came(_at(5), 9))).verdict is Verdict.PASSED
     assert few_connections(_seen(*some, Came(_at(5), 9))).verdict is Verdict.FAILED
+
+
+@pytest.mark.parametrize(
+    ("threshold", "word", "verdict"),
+    [("00", Word.NONE, Verdict.SKIPPED), ("00", Word.POISON, Verdict.FAILED), ("15", Word.NONE, Verdict.FAILED)],
+)
+def test_a_client_that_forbids_the_switch_may_refuse_an_ordinary_upload(
+    threshold: str, word: Word, verdict: Verdict
+) -> None:
+    request = bytes.fromhex(f"05 a4 00 20 00 7f {threshold} 00 00")
+    events: list[Event] = [Asked(_at(0.001 * n), 1, request) for n in range(1, 100)]
+    found = takes_the_switch(_seen(*events, Shown(_at(0.15), word, "?"), *_good()[2:]))
+    assert found.verdict is verdict, found.reason

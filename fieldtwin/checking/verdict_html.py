@@ -1,0 +1,52 @@
+"""Verdicts, bases and counts of a conformance report in HTML, for devices and masters alike."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TypeVar
+
+from fieldtwin.conformance.case import Basis
+from fieldtwin.conformance.results import CaseResult, called
+from fieldtwin.report.html import pill
+from fieldtwin.report.markup import Markup, el
+from fieldtwin.report.model import Verdict
+
+R = TypeVar("R", bound=CaseResult)
+BASIS = {
+    Basis.STANDARD: "required by the standard",
+    Basis.ROBUSTNESS: "robustness: the standard does not require it",
+    Basis.FIELD: "known field problem: the standard does not require it",
+}
+ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Verdict.SKIPPED)
+
+
+def overall(results: Sequence[CaseResult]) -> Verdict:
+    """The verdict of the whole check: failed if a required case failed, passed if some case passed and no required one failed."""
+    verdicts = {r.verdict for r in results}
+    if any(r.deviates or r.verdict is Verdict.ERROR for r in results):
+        return Verdict.FAILED
+    return Verdict.PASSED if Verdict.PASSED in verdicts else Verdict.INCONCLUSIVE
+
+
+def colour_of(result: CaseResult) -> Verdict:
+    """The verdict whose colour the result has: a failure of a case that the standard does not require is never red."""
+    return Verdict.INCONCLUSIVE if result.verdict is Verdict.FAILED and not result.deviates else result.verdict
+
+
+def verdict_pill(result: CaseResult) -> Markup:
+    """The verdict; a failure that is no deviation has the colour of an inconclusive case and its own word."""
+    if colour_of(result) is result.verdict:
+        return pill(result.verdict)
+    return el("span", f"! {called(result)}", cls=f"pill {colour_of(result).value}")
+
+
+def verdict_bar(results: Sequence[CaseResult]) -> Markup:
+    """How many cases have each colour, as a bar."""
+    counts = Counter(colour_of(r) for r in results)
+    return el("div", [el("i", cls=v.value, style=f"flex:{counts[v]}") for v in ORDER if counts[v]], cls="bar")
+
+
+def by_weight(results: Sequence[R]) -> list[R]:
+    """Deviations first, then other failures, inconclusive, passed and skipped cases."""
+    return sorted(results, key=lambda r: (ORDER.index(r.verdict), not r.deviates))

@@ -1,0 +1,174 @@
+"""What the standard requires, robustness, and known field problems are told apart for masters, as they are for devices.
+
+Defect: every failure of a master was red and gave exit code 1, although many cases ask for more than any clause does. A client on
+TCP that does not compare the unit id of a reply conforms (TG 4.4.1.3), and failed the check all the same.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import pytest
+from masters_in_memory import judge, ours
+from test_strange_masters_judged import environment
+
+from fieldtwin.checking import canopen_cases as canopen_devices
+from fieldtwin.checking import modbus_cases as modbus_devices
+from fieldtwin.checking.master_html import render_master_html
+from fieldtwin.cli.check_view import listed, style_of
+from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_MASTERS
+from fieldtwin.conformance.case import OWN, About, Basis, failed, passed
+from fieldtwin.conformance.modbus_cases import CASES as MODBUS_MASTERS
+from fieldtwin.conformance.results import CaseResult, as_json, as_report, exit_code
+from fieldtwin.report.junit import render_junit
+
+MASTERS: dict[str, About] = {case.about.id: case.about for case in (*MODBUS_MASTERS, *CANOPEN_MASTERS)}
+DEVICES: tuple[About, ...] = (*modbus_devices.CASES, *canopen_devices.CASES)
+CLAUSE = re.compile(r"^(?:(?:SL|AP|TG) )?\d+(?:\.\d+)*(?:$|[;,])")
+"""A source that begins with a clause: of a Modbus document, or of CiA 301."""
+REPORT = re.compile(r"(?:^|; )[\w-]+(?: PR)? #\d+")
+"""A source that names a report of another project."""
+
+
+@pytest.mark.parametrize("case", [*MASTERS.values(), *DEVICES], ids=lambda case: f"{case.role}-{case.id}")
+def test_every_case_has_a_basis_and_a_source_that_fits_it(case: About) -> None:
+    for basis, source in [(case.basis, case.clause), *((e.basis, e.clause) for e in case.elsewhere)]:
+        if basis is Basis.STANDARD:
+            assert CLAUSE.match(source), source
+        elif basis is Basis.FIELD:
+            assert REPORT.search(source), source
+        else:
+            assert CLAUSE.match(source) or REPORT.search(source) or source == OWN, source
+
+
+@pytest.mark.parametrize(
+    ("id", "on_a_line", "on_tcp"),
+    [
+        (
+            "MB-015a",
+            (Basis.STANDARD, "SL 2.4.1; libmodbus PR #860"),
+            (Basis.ROBUSTNESS, "TG 4.4.1.3; libmodbus PR #860"),
+        ),
+        ("MB-014", (Basis.ROBUSTNESS, OWN), (Basis.STANDARD, "TG 4.4.1.3")),
+        ("MB-021", (Basis.ROBUSTNESS, "AP 7"), (Basis.ROBUSTNESS, "AP 7")),
+    ],
+)
+def test_a_result_has_the_basis_and_the_clause_of_its_wire(
+    id: str, on_a_line: tuple[Basis, str], on_tcp: tuple[Basis, str]
+) -> None:
+    for url, expected in (("rtu:/line?baudrate=19200", on_a_line), ("tcp://127.0.0.1:0", on_tcp)):
+        case = judge(ours, url, id)[id].case
+        assert (case.basis, case.clause, case.elsewhere) == (*expected, ())
+
+
+def test_only_a_required_case_of_a_master_is_red_and_gives_exit_code_1() -> None:
+    good = CaseResult(MASTERS["MB-002"], passed())
+    robust = CaseResult(MASTERS["MB-021"], failed("waits out its timeout"))
+    field = CaseResult(MASTERS["MB-008"], failed("the value came only later"))
+    deviation = CaseResult(MASTERS["MB-011"], failed("published 3333"))
+    assert exit_code([good, robust, field]) == 0
+    assert exit_code([good, robust, field], frozenset({Basis.STANDARD, Basis.ROBUSTNESS})) == 1
+    assert exit_code([good, field], frozenset({Basis.STANDARD, Basis.ROBUSTNESS})) == 0
+    assert exit_code([good, field], frozenset(Basis)) == 1
+    assert exit_code([good, deviation]) == 1
+    assert "red" in style_of(deviation)
+    assert "red" not in style_of(robust) + style_of(field)
+    page = render_master_html([good, robust, field], "master on x", ["check"], "2027-01-01T00:00:00+00:00")
+    assert '<span class="pill inconclusive">! robustness</span>' in page
+    assert '<span class="pill inconclusive">! field problem</span>' in page
+    assert '"pill failed' not in page
+    assert "robustness: the standard does not require it" in page
+    page = render_master_html([good, robust, deviation], "master on x", ["check"], "2027-01-01T00:00:00+00:00")
+    assert "required by the standard" in page
+    assert page.index("MB-011") < page.index("MB-021"), "deviations come first"
+    junit = render_junit(as_report([good, robust, deviation], "x", ["check"], "2027-01-01T00:00:00+00:00"))
+    assert b'failures="1"' in junit
+    assert b"robustness finding: waits out its timeout" in junit
+    assert [case["basis"] for case in as_json([good, robust, field], ["check"])] == [
+        "standard", "robustness", "field problem",
+    ]  # fmt: skip
+
+
+def test_the_list_of_cases_has_the_basis_on_each_wire() -> None:
+    case = listed(MASTERS["MB-015a"])
+    assert case["basis"] == "standard"
+    assert case["elsewhere"] == [{"wire": "TCP", "basis": "robustness", "clause": "TG 4.4.1.3; libmodbus PR #860"}]
+
+
+TAKES_ANY_UNIT = """
+import os, socket, time
+link = socket.create_connection((os.environ["FIELDTWIN_HOST"], int(os.environ["FIELDTWIN_PORT"])))
+link.settimeout(1)
+number = 0
+while True:
+    number = number % 65535 + 1
+    link.sendall(number.to_bytes(2, "big") + bytes((0, 0, 0, 6, 1, 3, 0, 0, 0, 1)))
+    try:
+        while True:
+            reply = link.recv(100)
+            if reply[:4] == number.to_bytes(2, "big") + bytes(2):  # the unit id, reply[6], is not compared
+                break
+        print(int.from_bytes(reply[-2:], "big"), flush=True)
+    except TimeoutError:
+        print("no reply", flush=True)
+    time.sleep(0.02)
+"""
+
+
+def _check(folder: Path, fail_on: tuple[str, ...], *more: str) -> subprocess.CompletedProcess[str]:
+    (folder / "master.py").write_text(TAKES_ANY_UNIT)
+    words = ["check", "modbus-master", "--listen", "tcp://127.0.0.1:0", "--timeout", "1s", "--probe", "output"]
+    argv = [sys.executable, "-m", "fieldtwin", *words, "--only", "15a,56a", *fail_on, *more]
+    return subprocess.run(
+        [*argv, "--", sys.executable, "master.py"],
+        capture_output=True, text=True, timeout=120, env=environment(), cwd=folder, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("fail_on", "code"),
+    [((), 0), (("--fail-on", "standard"), 0), (("--fail-on", "robustness"), 1), (("--fail-on", "field"), 1)],
+)
+def test_fail_on_decides_whether_a_robustness_failure_of_a_client_gives_exit_code_1(
+    tmp_path: Path, fail_on: tuple[str, ...], code: int
+) -> None:
+    done = _check(tmp_path, fail_on, "--junit", "j.xml", "--html", "r.html", "-o", "r.json")
+    assert done.returncode == code, done.stderr
+    assert "robustness    MB-015a" in done.stdout
+    assert "! MB-015a a reply from an unexpected unit (robustness): published 3333" in done.stderr
+    assert ("The exit code does not count them: see --fail-on." in done.stderr) == (code == 0)
+    results: dict[str, Any] = {case["id"]: case for case in json.loads((tmp_path / "r.json").read_text())}
+    assert {id: (case["verdict"], case["basis"]) for id, case in results.items()} == {
+        "MB-015a": ("failed", "robustness"), "MB-056a": ("passed", "standard"),
+    }  # fmt: skip
+    suite = ET.parse(tmp_path / "j.xml").getroot().find("testsuite")
+    assert suite is not None
+    assert (suite.get("failures"), suite.get("skipped")) == (("1", "0") if code else ("0", "1"))
+    case = next(c for c in suite.iter("testcase") if "MB-015a" in c.attrib["name"])
+    facts = {p.attrib["name"]: p.attrib["value"] for p in case.iter("property")}
+    assert (facts["basis"], facts["clause"]) == ("robustness", "TG 4.4.1.3; libmodbus PR #860")
+    page = (tmp_path / "r.html").read_text()
+    assert '<span class="pill inconclusive">! robustness</span>' in page
+    assert '"pill failed' not in page
+
+
+def test_the_tables_of_known_failures_tell_required_cases_from_others() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "conformance.md").read_text()
+    devices = {case.id: case for case in DEVICES}
+    rows = re.findall(r"^\| ([^|]+ \|(?: [^|]+ \| \d+ \|)?) ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
+    judged = 0
+    for name, required, others in rows:
+        cases: dict[str, About] = MASTERS if name.count("|") > 1 else devices  # type: ignore[assignment]
+        for ids, wanted in ((required, True), (others, False)):
+            for id in re.findall(r"\b(?:MB|CO)-\d{3}\w?\b", ids):
+                case = cases[id].on_wire(frozenset({"tcp"} if "TCP" in name else {"rtu"}))
+                assert (case.basis is Basis.STANDARD) is wanted, f"{name}: {id}"
+                judged += 1
+    assert judged > 150

@@ -174,9 +174,22 @@ class CanopenWire:
             return f"{self._called(node)}: {done[-1].reply_text}", done
         if watch.open is not None and watch.open.request is data and not reply:
             return self._asked(node, watch.open), done
+        if seen.stray:
+            done.append(self._stray(node, seen.text, data, t_ns))
+            return done[-1].text, done
         opened = watch.open  # of its segments nothing is said but that they came, and of a secret's not even which
         hidden = opened is not None and self._secrets(node, (_span(opened),))
         return f"{self._called(node)}: {seen.text}" + (f" {SECRET}" if hidden else ""), done
+
+    def _stray(self, node: int, text: str, data: bytes, t_ns: int) -> Exchange:
+        hidden = node in self._nodes and self._nodes[node].tags.has_secrets
+        text = f"{self._called(node)}: {text}: " + (
+            f"{SECRET}: the device has secret tags" if hidden else data.hex(" ")
+        )
+        return Exchange(
+            t_ns, t_ns, self.bus, self._device(node), node, 0, "stray", reply=data, problem="stray", text=text, reply_text=text,
+            secrets=frozenset({""}) if hidden else frozenset(),
+        )  # fmt: skip
 
     def _asked(self, node: int, transfer: Transfer) -> str:
         """The request of a transfer, with the name of the object and what is written at once."""

@@ -190,14 +190,14 @@ class ModbusWire:
     def _stray(self, frame: Frame, done: list[Exchange]) -> str:
         if frame.bad:
             return f"{_bytes(len(frame.raw))} of noise ({frame.bad})"
-        unit = self._units.get(frame.unit)
+        unit = self._units.get(frame.unit) or self._sender_of(frame)
         name = unit.name if unit else ""
         late = frame.transaction in self._given_up
         why = "an answer that comes too late" if late else "a frame that answers nothing"
         transaction = frame.transaction if frame.transaction >= 0 else None
         hidden = unit is not None and unit.tags.has_secrets
         text = f"{name or f'unit {frame.unit}'}: {why}: {_identified(frame.unit, transaction)}, "
-        text += SECRET if hidden else _shortened(frame.raw)
+        text += f"{SECRET}: the device has secret tags" if hidden else _shortened(frame.raw)
         done.append(
             Exchange(
                 frame.t_ns, frame.t_ns, self.bus, name, frame.unit, frame.pdu[0] & 0x7F if frame.pdu else 0, "stray",
@@ -206,6 +206,13 @@ class ModbusWire:
             )
         )  # fmt: skip
         return text
+
+    def _sender_of(self, frame: Frame) -> Unit | None:
+        """Return the device that sent a frame with a unit ID that is not on the wire: the one that was asked, or the only one."""
+        opened = self._open.get(frame.transaction)
+        if opened is not None and opened.frame.unit in self._units:
+            return self._units[opened.frame.unit]
+        return next(iter(self._units.values())) if len(self._units) == 1 else None
 
     def _answered(self, opened: _Open, frame: Frame) -> Exchange:
         answer = parse_reply(opened.asked, opened.frame.pdu, frame.pdu)

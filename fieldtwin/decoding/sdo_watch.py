@@ -50,11 +50,13 @@ class Transfer:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What a frame was. `done`: the transfer that it ended. `dropped`: one that a new request left without an answer."""
+    """What a frame was. `done`: the transfer that it ended. `dropped`: one that a new request left without an answer. `stray`:
+    a frame of the server that answers no request."""
 
     text: str
     done: Transfer | None = None
     dropped: Transfer | None = None
+    stray: bool = False
 
 
 class SdoWatch:
@@ -97,11 +99,13 @@ class SdoWatch:
     def reply(self, data: bytes, t_ns: int) -> Seen:
         """A frame of the server's."""
         now = self.open
-        if now is None or len(data) < 4:
-            return Seen("an SDO reply that nobody waits for")
-        first, kind, ours = data[0], data[0] >> 5, data[1:4] == now.request[1:4]
-        if first == _ABORT:
+        if len(data) < 4:
+            return Seen(f"an SDO reply of {len(data)} byte{'s' * (len(data) != 1)}", stray=True)
+        if data[0] == _ABORT:
             return self._aborted(data, "server")
+        if now is None:
+            return Seen("an SDO reply that no request waits for", stray=True)
+        first, kind, ours = data[0], data[0] >> 5, data[1:4] == now.request[1:4]
         if now.in_segments and now.upload:
             return _segment_of_block(now, data)
         now.reply = data
@@ -117,7 +121,7 @@ class SdoWatch:
             return self._over(now) if first & 1 else Seen(f"{now.name}: segment")
         if now.block and kind == (6 if now.upload else 5):
             return self._block_reply(now, data, ours)
-        return Seen("an SDO reply to another request")
+        return Seen("an SDO reply to another request", stray=True)
 
     def _begin(self, data: bytes, kind: int, t_ns: int) -> Seen:
         dropped = self.drop()
@@ -168,7 +172,7 @@ class SdoWatch:
         code, now = int.from_bytes(data[4:8], "little"), self.open
         unnamed = by == "client" and data[1:4] == bytes(3)  # canopen-python leaves the multiplexer 0
         if now is None or not (unnamed or data[1:4] == now.request[1:4]):
-            return Seen(f"abort {code:08X}h {meaning(code)}, of no transfer")
+            return Seen(f"abort {code:08X}h {meaning(code)}, of no transfer", stray=by == "server")
         now.abort, now.aborted_by, now.reply = code, by, data
         return self._over(now)
 

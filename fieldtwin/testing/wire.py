@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from typing import Any
 
 from fieldtwin.testing.runner import Runner
@@ -64,6 +65,8 @@ class Exchange:
 
 
 _FIELDS = set(Exchange.__dataclass_fields__)
+PROBLEMS = ("", "pending", "no reply", "exception", "abort", "check sum", "stray", "malformed")
+ACCESSES = ("", "read", "write", "read and write")
 
 
 def _exchange(plain: dict[str, Any]) -> Exchange:
@@ -88,8 +91,11 @@ class Wire:
 
         `like` leaves those whose fields are equal: ``exchanges(function=16)``; ``tag="period"`` those that carry that tag.
         Frames that answer no request are left out, unless `strays` is true or ``problem="stray"`` is asked for.
+
+        Raises `TypeError` where no exchange can be like that: an unknown field, problem or access.
         """
         __tracebackhide__ = True
+        _check(like)
         strays = strays or like.get("problem") == "stray"
         found = [e for e in self._all() if self._is(e, like) and (strays or e.problem != "stray")]
         return sorted(found, key=lambda e: e.t_s)
@@ -197,6 +203,18 @@ class Wire:
             self._runner.call("clear", id=self._bench, fault=id)
 
 
+def _check(like: dict[str, Any]) -> None:
+    """Refuse what no exchange can be like: counted zero times it would hold for ever."""
+    __tracebackhide__ = True
+    for key in like.keys() - _FIELDS - {"tag"}:
+        near = get_close_matches(key, [*_FIELDS, "tag"], 1)
+        hint = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(sorted(_FIELDS | {'tag'}))}"
+        raise TypeError(f"an exchange has no {key!r}; {hint}")
+    for key, known in (("problem", PROBLEMS), ("access", ACCESSES)):
+        if key in like and like[key] not in known:
+            raise TypeError(f"no exchange has the {key} {like[key]!r}; expected one of {', '.join(map(repr, known))}")
+
+
 def _keys(more: dict[str, Any]) -> dict[str, Any]:
     """Keyword arguments as a fault file's keys: ``from_`` is a word of Python's."""
     return {key.removesuffix("_"): value for key, value in more.items()}
@@ -216,6 +234,8 @@ class _Wanted:
         __tracebackhide__ = True
         if times is not None and (at_least is not None or at_most is not None):
             raise TypeError("times is an exact number: give times, or at_least and at_most")
+        if at_least is not None and at_most is not None and at_least > at_most:
+            raise TypeError(f"at least {at_least} and at most {at_most} can never be met")
         if times is None and at_least is None and at_most is None:
             times = 1
         words = ", ".join(f"{key}={value!r}" for key, value in like.items()) or "exchanges"

@@ -105,8 +105,6 @@ class OutputImage:
         self._forced = False
         """Whether the last publication had forced outputs."""
         self._bind(programs, image.reader(INPUTS).shape)
-        layout = self.writer.shape.layout
-        self._reals = [o.index for o in self.outputs if layout.tags[o.index].kind is TagKind.REAL]
         self._by_tag = {o.tag: o for o in self.outputs}
         self._plain = [o for o in self.outputs if o.outbox is None]
         self._missing: dict[int, Reason] = {}

@@ -28,7 +28,6 @@ from twin.template import MANIFEST, DocumentKind, Kind, Manifest, Software, Temp
 MODEL = "model.json"
 OUR_PROGRAMS = "plc"
 """The package whose programs come with fieldtwin itself."""
-_ST = (".st", ".xml")
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,12 +23,12 @@ MODELS: dict[int, Callable[[], DeviceModel]] = {
 
 
 NO_MODEL = "none"
-CHOICES = (*(str(number) for number in MODELS), NO_MODEL)
-"""What a user may choose in place of what 1000h says."""
+"""What a user may choose, as well as a number of `MODELS`, in place of what 1000h says."""
 
 
 def model_for(dictionary: Dictionary, chosen: str | None = None) -> DeviceModel | None:
-    """A new model for the device that the data sheet describes; None for a profile without one. `chosen` is one of `CHOICES`."""
+    """A new model for the device that the data sheet describes; None for a profile without one. `chosen`: a number of `MODELS`
+    as text, or `NO_MODEL`."""
     if chosen is not None:
         return None if chosen == NO_MODEL else MODELS[int(chosen)]()
     entry = dictionary.entry(0x1000, 0)

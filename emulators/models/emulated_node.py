@@ -29,8 +29,8 @@ from gateway.core.profile import DeviceProfile
 
 @dataclass(frozen=True, slots=True)
 class NodeOptions:
-    """What a user may say of a node beyond its files. `model` is one of `by_profile.CHOICES`, None: as 1000h says. Without
-    `parameter_values` the node starts with the DefaultValues of its data sheet."""
+    """What a user may state about a node beyond its files. `model` is a number of `by_profile.MODELS` as text, or `NO_MODEL`;
+    with None, object 1000h decides. Without `parameter_values` the node starts with the DefaultValues of its data sheet."""
 
     model: str | None = None
     parameter_values: bool = True

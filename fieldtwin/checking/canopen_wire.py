@@ -96,12 +96,6 @@ class CanopenWire:
         self._sent_ns = clock.monotonic_ns() - round(spacing_s * NS_PER_S)
         self._pending: deque[CanFrame] = deque(maxlen=MOST_PENDING)
 
-    def is_mine(self, frame: CanFrame) -> bool:
-        """Whether the frame is the node's, or to it, or to all."""
-        if frame.extended or frame.can_id in (NMT, LSS_REPLY, LSS_REQUEST):
-            return True
-        return frame.can_id & 0x7F == self.node
-
     # -- frames ----------------------------------------------------------------------------------------------------
 
     async def send(self, frame: CanFrame, *, at_once: bool = False) -> None:

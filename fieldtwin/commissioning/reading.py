@@ -119,8 +119,6 @@ async def read_all(
     tags: Sequence[Tag],
     *,
     taps: Sequence[Tap] = (),
-    connector: Connector | None = None,
-    clock: Clock | None = None,
 ) -> dict[str, Answer]:
     """Read each of `tags` once, and return a value or a problem for each of them by name.
 
@@ -131,7 +129,7 @@ async def read_all(
     found: dict[str, Answer] = {}
     lost: Unreachable | None = None
     try:
-        async with point_at(target, taps=taps, connector=connector, clock=clock) as point:
+        async with point_at(target, taps=taps) as point:
             await point.read([t for t in tags if t.readable], found, alone=True)
     except Unreachable as e:
         if not found:

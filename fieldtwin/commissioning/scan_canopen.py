@@ -114,7 +114,6 @@ class CanScanner:
         self._facts = facts
         self._ear = BusEar()
         self._taps = (_EarTap(self._ear), *taps)
-        self._own_taps = tuple(taps)
         self.result = CanScan(url, heard=self._ear.heard)
 
     async def run(self) -> CanScan:

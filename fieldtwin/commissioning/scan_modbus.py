@@ -395,8 +395,3 @@ class ModbusScanner:
 
 def _counters(connection: ByteConnection) -> LineCounters | None:
     return connection.counters() if isinstance(connection, CountsErrors) else None
-
-
-async def scan_modbus(url: str, options: ScanOptions | None = None, *, clock: Clock | None = None) -> ModbusScan:
-    """Scan the Modbus wire at `url` and return what was found. Raises as `ModbusScanner.run`."""
-    return await ModbusScanner(url, options, clock=clock).run()

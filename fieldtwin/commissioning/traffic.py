@@ -48,7 +48,6 @@ class Heard:
     glitches: int = 0
     """Pieces of one or two bytes beside frames, as where a transceiver's direction is switched too early or too late."""
     longest_gap_ns: int = 0
-    bursts: int = 0
     values: dict[int, int] = field(default_factory=dict)
     """How often each byte value came."""
 
@@ -88,8 +87,6 @@ class LineEar:
             return
         self.settle(t_ns)
         heard = self.heard
-        if self._last_ns is None or t_ns - self._last_ns > SETTLE_NS:
-            heard.bursts += 1
         if self._last_ns is not None:
             heard.longest_gap_ns = max(heard.longest_gap_ns, t_ns - self._last_ns)
         self._last_ns = t_ns

@@ -16,7 +16,6 @@ READS = frozenset({0x01, 0x02, 0x03, 0x04})
 REGISTER_READS = frozenset({0x03, 0x04})
 WRITES = frozenset({0x05, 0x06, 0x0F, 0x10, 0x16})
 MAX_LENGTH = 254
-MAX_WRITTEN = 65_536
 
 
 class OneWord(RegisterBank):

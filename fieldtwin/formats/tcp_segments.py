@@ -9,7 +9,6 @@ Sources: RFC 791, 8200, 768, 9293; link types: https://www.tcpdump.org/linktypes
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 
@@ -31,7 +30,6 @@ MAX_CONVERSATIONS = 1024
 
 Side = tuple[bytes, int]
 """Address (4 or 16 bytes) and port."""
-IPV4_HEAD = struct.Struct(">BBHHHBBH4s4s")
 
 
 class Segments:

@@ -52,11 +52,6 @@ class LineSilence:
         """Other pauses from the next exchange on."""
         self._turnaround_ns, self._spacing_ns = turnaround_ns, spacing_ns
 
-    @property
-    def in_quarantine(self) -> bool:
-        """Whether an exchange ended badly and the line has not been silent long enough since."""
-        return self._in_quarantine
-
     def may_go(self, now_ns: int) -> bool:
         """Whether a request may go now, if nothing arrived since; the quarantine, if there was one, is over then."""
         if self._not_before_ns > now_ns or (

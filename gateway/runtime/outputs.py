@@ -265,9 +265,7 @@ class OutputWriter:
         by = {output.tag: output.by for output in group.outputs}
         for output in group.outputs:
             output.pending, output.untouched, output.waits_since_ns = True, False, None
-        group.submit(
-            commands, lambda output, error: self._done(output, wanted[output.tag], by[output.tag], error)
-        )
+        group.submit(commands, lambda output, error: self._done(output, wanted[output.tag], by[output.tag], error))
 
     def _wait(self, output: Output, value: float) -> None:
         """The device takes no write now. What waits for longer than a moment is reported, once."""

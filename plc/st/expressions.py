@@ -14,6 +14,7 @@ from plc.st.arguments import bind
 from plc.st.literals import Malformed, constant
 from plc.st.scope import COMPARISONS, Environment, Parameter, Signature, Symbol, Value, Writer, by_reference, wrapped
 from plc.st.standard import FUNCTIONS
+from plc.st.time_arithmetic import with_time
 
 MAX_DEEP = 80
 """Calls, parentheses and indices inside each other."""
@@ -181,7 +182,7 @@ class Expressions:
             return self._logic(expr, left, right)
         if expr.op in COMPARISONS:
             return self._comparison(expr, left, right)
-        timed = self._with_time(expr.op, left, right)
+        timed = with_time(expr.op, left, right)
         if timed is not None:
             return timed
         kind = ty.common(left.type, right.type)
@@ -238,36 +239,6 @@ class Expressions:
         else:
             a, b = self.coerced(left, kind, expr.pos), self.coerced(right, kind, expr.pos)
         return Value(f"({a} {COMPARISONS[expr.op]} {b})", ty.BOOL)
-
-    def _with_time(self, op: str, left: Value, right: Value) -> Value | None:
-        """Durations, dates and times of day (IEC 61131-3, Table 35); None where neither side is one."""
-        a, b = ty.plain(left.type), ty.plain(right.type)
-        ka, kb = _kind(a), _kind(b)
-        x, y = left.code, right.code
-        moments = ("dt", "tod", "date")
-        result: ty.Type | None = None
-        code = f"{x} {op} {y}"
-        if op in "+-" and ka == kb == "duration":
-            result = ty.common(a, b)
-        elif op in "+-" and ka in ("dt", "tod") and kb == "duration":
-            result = a
-        elif op == "-" and ka == kb and ka in moments:
-            result = ty.TIME
-        elif op in "*/" and ka == "duration" and kb in ("int", "real"):
-            result = a
-            if kb == "real":
-                code = f"_v.time_{'times' if op == '*' else 'over'}({x}, {y})"
-            elif op == "/":
-                code = f"_v.divide({x}, {y})"
-        elif op == "*" and kb == "duration" and ka in ("int", "real"):
-            result = b
-            code = f"_v.time_times({y}, {x})" if ka == "real" else code
-        if result is None:
-            return None
-        assert isinstance(result, ty.Elementary)
-        if result.kind == "tod":  # a day ends at midnight
-            return Value(f"(({code}) % {ty.DAY_NS})", result)
-        return Value(wrapped(code, result), result)
 
     def _folded(self, expr: t.Binary, left: Value, right: Value) -> Value:
         a, b = left.constant, right.constant
@@ -511,12 +482,6 @@ def _open(code: str) -> int:
 
 def _value_of(argument: t.Argument | None) -> t.Expr | None:
     return None if argument is None else argument.value
-
-
-def _kind(kind: ty.Type) -> str:
-    if isinstance(kind, ty.Elementary):
-        return kind.kind
-    return "int" if isinstance(kind, ty.AnyInt) else "real" if isinstance(kind, ty.AnyReal) else ""
 
 
 def _of_reals(op: str, a: str, b: str) -> str:

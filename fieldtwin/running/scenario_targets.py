@@ -28,7 +28,8 @@ from fieldtwin.running.with_controller import WithController
 from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.bench import Can, NothingKnown
 from fieldtwin.scenarios.form import Scenario
-from fieldtwin.scenarios.runner import Runner, gone, refusal
+from fieldtwin.scenarios.runner import Runner, gone
+from fieldtwin.scenarios.target_limits import refusal
 from fieldtwin.scenarios.trace import Trace, open_sink
 from gateway.core.errors import FieldtwinError
 from gateway.wallclock import WallClock

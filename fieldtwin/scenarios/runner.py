@@ -7,26 +7,26 @@ its host's lateness makes worthless INCONCLUSIVE, and neither ever passes.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 from emulators.faults.schema import seconds
-from fieldtwin.conformance.case import Danger
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.report.model import CheckResult, ScenarioResult, Struck, Verdict
-from fieldtwin.scenarios.about import dangers, result_of
+from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.bench import Bench, Can, NothingKnown
 from fieldtwin.scenarios.expectation import Watched, judge_tag, judge_wire, said
 from fieldtwin.scenarios.expression import Expression
-from fieldtwin.scenarios.form import Scenario, needs_of
+from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.invariants import Invariants
 from fieldtwin.scenarios.knowledge import Knowledge
 from fieldtwin.scenarios.last_exchanges import deciding, last_exchanges
 from fieldtwin.scenarios.lateness import Allowance, allowance
 from fieldtwin.scenarios.refused import RefusedOutputs
 from fieldtwin.scenarios.standing import Standing
+from fieldtwin.scenarios.target_limits import refusal
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.whole_run import WholeRun
 from fieldtwin.scenarios.words import Expect, Step, word_of
@@ -46,10 +46,6 @@ LAST_REACTION_MOST_S = 2.0
 """The longest time that a scenario goes on after its last step so that the PLC can react to what that step has seen."""
 LATE_SHARE = 0.1
 """A host that was late by more than this part of the time that a check is about has proved nothing."""
-NO_FRESH_START = (
-    "`start: fresh` begins PLC, simulation and devices anew, which is possible only where the devices are simulated "
-    "and the PLC is fieldtwin's"
-)
 
 
 @dataclass
@@ -86,25 +82,6 @@ def _too_late(expected: str, got: str, bound_s: float, allowed: Allowance) -> _B
         waited = f"; also not in {allowed.any_s:.3f} s more, by which this host was late" if allowed.any_s else ""
         return _Broken(Verdict.FAILED, expected, got + waited)
     return _Broken(Verdict.FAILED, expected, got, bound_s)
-
-
-def refusal(scenario: Scenario, target: str, can: Collection[Can], allowed: Danger) -> str:
-    """Why a target cannot do what the scenario is made of, or may not have it done to it; empty when all is well."""
-    lacking = [need.value for need in scenario.needs if need not in can]
-    if lacking:
-        steps = [
-            str(n)
-            for n, step in enumerate(scenario.form.steps, 1)
-            if any(need.value in lacking for need in needs_of(step))
-        ]
-        said = f" (step{'s' if len(steps) > 1 else ''} {', '.join(steps[:5])})" if steps else ""
-        why = f": {NO_FRESH_START}" if Can.FRESH_START.value in lacking else ""
-        return f"the target {target} cannot {', '.join(lacking)}{said}{why}"
-    for danger, what in dangers(scenario):
-        if danger.rank > allowed.rank:
-            said = f"{what} is of the class {danger.value}, and the target {target} allows {allowed.value}"
-            return f"{said} (--allow {danger.value})"
-    return ""
 
 
 def gone(error: FieldtwinError, t_ns: int) -> CheckResult:

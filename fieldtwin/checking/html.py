@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldtwin.checking.device_case import DeviceResult, Spoken
-from fieldtwin.checking.run import OTHER_WIRE
 from fieldtwin.checking.subject import Subject
 from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, verdict_bar, verdict_pill
+from fieldtwin.conformance.case import OTHER_WIRE
 from fieldtwin.conformance.results import summary
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill

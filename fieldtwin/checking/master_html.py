@@ -11,14 +11,17 @@ from pathlib import Path
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, verdict_bar, verdict_pill
+from fieldtwin.conformance.case import OTHER_WIRE
 from fieldtwin.conformance.evidence import Line, reproduce
 from fieldtwin.conformance.results import CaseResult, summary
-from fieldtwin.conformance.run import OTHER_FRAMING
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.model import Verdict
 from fieldtwin.report.style import style
+
+OPEN_LINES = 24
+"""Lines of a case's frames that are shown without a click."""
 
 
 def write_master_html(results: Sequence[CaseResult], title: str, argv: Sequence[str], started: str, path: Path) -> None:
@@ -65,17 +68,24 @@ def _finding(result: CaseResult, argv: Sequence[str]) -> Markup:
 
 
 def _frames(wire: Sequence[Line]) -> Markup:
+    """The first lines, with the others folded away: what went wrong is seldom far from the first odd answer."""
     if not wire:
         return Markup("")
+    more = wire[OPEN_LINES:]
+    folded = el("details", el("summary", f"{len(more)} more lines"), _lines(more)) if more else ""
+    return el("div", _lines(wire[:OPEN_LINES]), folded, cls="wide")
+
+
+def _lines(wire: Sequence[Line]) -> Markup:
     rows = [
         el("tr", el("td", f"{w.t_ms:.1f} ms", cls="num"), el("td", w.by), el("td", w.data, cls="raw"), el("td", w.text))
         for w in wire
     ]
-    return el("div", el("table", rows, cls="frames", style="width:auto"), cls="wide")
+    return el("table", rows, cls="frames", style="width:auto")
 
 
 def _table(results: Sequence[CaseResult]) -> Markup:
-    elsewhere = [r for r in results if r.reason == OTHER_FRAMING]
+    elsewhere = [r for r in results if r.reason == OTHER_WIRE]
     columns = ("case", "verdict", "basis", "danger", "the device", "expected", "source", "found")
     rows = [_row(r) for r in results if r not in elsewhere]
     table = el("table", el("thead", el("tr", [el("th", name) for name in columns])), el("tbody", rows))

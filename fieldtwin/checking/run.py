@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 from fieldtwin.checking.device_case import DeviceCase, DeviceResult, NotHere, Spoken, Unsaid
-from fieldtwin.conformance.case import Danger, Finding, failed, inconclusive, skipped
+from fieldtwin.conformance.case import OTHER_WIRE, Danger, Finding, failed, inconclusive, skipped
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_S, Clock
 from gateway.core.connection import Direction, Tap
@@ -74,7 +74,6 @@ class Transcript(Tap):
 
 
 W = TypeVar("W", bound=Settling)
-OTHER_WIRE = "not on this wire"
 
 
 def why_not(case: DeviceCase[W], plan: Plan, traits: frozenset[str]) -> str:

@@ -45,7 +45,7 @@ def command() -> None:
 def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
     """Options of every judgement."""
     options = [
-        click.option("--only", metavar="IDS", help="These cases or rows only, with commas: MB-013,MB-015a."),
+        click.option("--only", metavar="IDS", help="Play only these cases or rows, separated by commas: MB-013,MB-015a."),
         click.option(
             "--at-most",
             type=click.Choice(DANGERS),
@@ -53,20 +53,22 @@ def _shared(function: Callable[..., Any]) -> Callable[..., Any]:
             show_default=True,
             help="Skip cases of a higher danger.",
         ),
-        click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time."),
-        click.option("--wait", "wait_s", type=Duration(), default="30s", show_default=True, help="For the master to ask."),
+        click.option("--for", "for_s", type=Duration(), default="0", help="Begin no case after this time.  [default: no limit]"),
+        click.option("--wait", "wait_s", type=Duration(), default="30s", show_default=True,
+                     help="How long to wait for the master's first request."),
         click.option(
             "--patience", "patience_s", type=Duration(), default="10s", show_default=True,
-            help="How long the master may take to be back to good; above its longest pause.",
+            help="How long the master may take to recover; more than its longest pause.",
         ),
-        click.option("--waivers", "waivers_path", type=click.Path(path_type=Path), help="YAML: id, reason, expires."),
+        click.option("--waivers", "waivers_path", type=click.Path(path_type=Path),
+                     help="YAML file of accepted failures: id, reason, expires."),
         fail_on_option,
         click.option("--junit", type=click.Path(dir_okay=False, path_type=Path), help="Write the verdicts as JUnit XML."),
         junit_flavour_option,
         click.option("--html", type=FILE, help="Write a report with every frame."),
         click.option("-o", "--out", type=FILE, help="Write the JSON to a file."),
-        click.option("--log", "log_path", type=FILE, help="Append all that is sent and heard, as JSON lines."),
-        click.option("--list", "list_only", is_flag=True, help="Show the cases and end."),
+        click.option("--log", "log_path", type=FILE, help="Append all frames that are sent and received, as JSON lines."),
+        click.option("--list", "list_only", is_flag=True, help="Show the cases with their basis, and end."),
         json_option,
     ]  # fmt: skip
     return _with(options, function)
@@ -77,17 +79,18 @@ def _seen(what: str, timeout: str) -> Callable[[Callable[..., Any]], Callable[..
     options = [
         click.option(
             "--probe", default="", metavar="WHERE",
-            help="What it publishes: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], output (numbers that the program prints), or "
-            "output:TEXT (what it prints after TEXT).",
+            help="Where the master publishes the value: tcp://HOST:PORT/holding:100[+COUNT][@UNIT], output (numbers "
+            "that the program prints), or output:TEXT (what it prints after TEXT).",
         ),
         click.option(
-            "--timeout", "timeout_s", type=Duration(), default="0", help=f"The master's {timeout}, where you know it."
+            "--timeout", "timeout_s", type=Duration(), default="0", help=f"The master's {timeout}, if you know it."
         ),
         click.option(
             "--values", default="1111,2222,3333", show_default=True, metavar="A,B,BAD",
             help=f"What {what} hold: two good ones and a poison.",
         ),
-        click.option("--none", "none", multiple=True, metavar="VALUE", help="What the probe shows for no value; repeatable."),
+        click.option("--none", "none", multiple=True, metavar="VALUE",
+                     help="What the probe shows where there is no value; repeatable."),
     ]  # fmt: skip
     return lambda function: _with(options, function)
 
@@ -107,12 +110,15 @@ def _with(options: Sequence[Callable[..., Any]], function: Callable[..., Any]) -
 )
 @_seen("registers", "response timeout")
 @click.option(
-    "--hold", multiple=True, metavar="TABLE:ADDRESS=VALUE", help="A cell that always holds the same; repeatable."
+    "--hold",
+    multiple=True,
+    metavar="TABLE:ADDRESS=VALUE",
+    help="A register or bit that always holds this value; repeatable.",
 )
-@click.option("--echo", is_flag=True, help="The master is set up for a line that echoes.")
+@click.option("--echo", is_flag=True, help="The master is set up for a line that echoes its requests.")
 @click.option("--ascii", "in_ascii", is_flag=True, help="On pty:PATH: the master speaks Modbus ASCII.")
 @_shared
-@click.argument("argv", nargs=-1, type=click.UNPROCESSED)
+@click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="[-- PROGRAM [ARG]...]")
 def modbus_master(
     listen: str | None,
     probe: str,
@@ -138,14 +144,18 @@ def modbus_master(
     as_json: bool,
     argv: tuple[str, ...],
 ) -> int:
-    """Play the hostile device of each row of the Modbus catalogue against a master, and judge it.
+    """Test a Modbus client (master) with a device that misbehaves, one case after the other.
 
     \b
-    fieldtwin check modbus-master --listen tcp://127.0.0.1:5020 --probe tcp://plc:502/holding:100
-    fieldtwin check modbus-master --listen pty:/tmp/line --timeout 1s --probe output -- python my_master.py
+    fieldtwin check modbus-master --listen tcp://127.0.0.1:5020 \\
+        --probe tcp://plc:502/holding:100
+    fieldtwin check modbus-master --listen pty:/tmp/line --timeout 1s \\
+        --probe output -- python my_master.py
 
-    The master polls what it polls, and is left to it. A program behind -- finds the endpoint in FIELDTWIN_ENDPOINT,
-    FIELDTWIN_HOST and FIELDTWIN_PORT, or FIELDTWIN_TTY.
+    The master keeps its own polling. A program after -- finds the endpoint in FIELDTWIN_ENDPOINT, FIELDTWIN_HOST and
+    FIELDTWIN_PORT, or FIELDTWIN_TTY.
+
+    Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.case import Danger
     from fieldtwin.conformance.modbus_cases import CASES
@@ -194,7 +204,7 @@ def modbus_master(
 )
 @_seen("objects", "SDO timeout")
 @_shared
-@click.argument("argv", nargs=-1, type=click.UNPROCESSED)
+@click.argument("argv", nargs=-1, type=click.UNPROCESSED, metavar="[-- PROGRAM [ARG]...]")
 def canopen_master(
     listen: str | None,
     bitrate: int,
@@ -222,14 +232,18 @@ def canopen_master(
     as_json: bool,
     argv: tuple[str, ...],
 ) -> int:
-    """Play the hostile nodes of the CANopen catalogue against a master, and judge it.
+    """Test a CANopen master with nodes that misbehave, one case after the other.
 
     \b
-    fieldtwin check canopen-master --listen can:fieldtwin/127.0.0.1:29536 --probe output -- python my_master.py
-    fieldtwin check canopen-master --listen can:socketcan/vcan0 --node 5 --probe tcp://plc:502/holding:100
+    fieldtwin check canopen-master --listen can:fieldtwin/127.0.0.1:29536 \\
+        --probe output -- python my_master.py
+    fieldtwin check canopen-master --listen can:socketcan/vcan0 --node 5 \\
+        --probe tcp://plc:502/holding:100
 
-    Every node id answers SDO. A program behind -- finds the bus in FIELDTWIN_ENDPOINT, FIELDTWIN_INTERFACE and
+    Every node ID answers SDO requests. A program after -- finds the bus in FIELDTWIN_ENDPOINT, FIELDTWIN_INTERFACE and
     FIELDTWIN_CHANNEL, which are python-can's names.
+
+    Exit code 0 when cases passed and no case that --fail-on counts has failed, else 1.
     """
     from fieldtwin.conformance.canopen_cases import CASES
     from fieldtwin.conformance.case import Danger
@@ -314,7 +328,7 @@ def _judged(
     if as_json:
         sys.stdout.write(document)
     else:
-        print_results(results)
+        print_results(results, all_wires=bool(only))
         print_not_counted(results, fail_on)
     return exit_code(results, fail_on)
 

@@ -117,9 +117,7 @@ class Check:
     def done(self, subject: Subject, checked: Checked) -> int:
         """Waive, write the files, show the table. The exit code."""
         from fieldtwin.checking.results import as_json, as_report
-        from fieldtwin.checking.run import OTHER_WIRE
         from fieldtwin.cli.check_view import print_results
-        from fieldtwin.cli.talk import talk
         from fieldtwin.conformance.results import exit_code, waive
 
         fail_on = bases_of(self.options["fail_on"])
@@ -141,10 +139,7 @@ class Check:
             json.dump(document, sys.stdout, indent=2)
             sys.stdout.write("\n")
         else:
-            elsewhere = [] if self.options["only"] else [r for r in results if r.reason == OTHER_WIRE]
-            print_results([r for r in results if r not in elsewhere], "what is asked")
-            if elsewhere:
-                talk.print(f"{len(elsewhere)} more cases are for other wires", markup=False)
+            print_results(results, "what is asked", all_wires=bool(self.options["only"]))
             print_not_counted(results, fail_on)
         return INTERRUPTED if self.interrupted else exit_code(results, fail_on)
 

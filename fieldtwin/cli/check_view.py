@@ -17,7 +17,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from fieldtwin.cli.talk import data, talk
-from fieldtwin.conformance.case import Basis
+from fieldtwin.conformance.case import OTHER_WIRE, Basis
 from fieldtwin.conformance.results import FOUND, called
 from fieldtwin.report.model import Verdict
 from gateway.core.connection import Direction
@@ -67,9 +67,10 @@ class Progress:
         self._bar.update(self._task, advance=1, description=f"{result.case.id} {result.verdict.value}")
         if result.verdict.bad:
             mark = f"[{style_of(result)}]{MARK[result.verdict] if result.deviates else '!'}[/]"
-            kind = "" if result.deviates else f" ({called(result)})"
+            kind = why(result)
             talk.print(
-                f"{mark} {result.case.id} {escape(result.case.title)}{kind}: {escape(result.reason)}", soft_wrap=True
+                f"{mark} {result.case.id} {escape(result.case.title)} ({escape(kind)}): {escape(result.reason)}",
+                soft_wrap=not talk.is_terminal,
             )
 
 
@@ -78,11 +79,33 @@ def style_of(result: CaseResult) -> str:
     return FINDING.get(result.case.basis, STYLE[result.verdict]) if result.verdict.bad else STYLE[result.verdict]
 
 
-def print_results(results: Sequence[CaseResult], does: str = "the device") -> None:
-    """The table on stdout, with what a case is about below `does`; without a terminal one line a case, nothing cut."""
+def why(result: CaseResult) -> str:
+    """Why a failure counts, or that it does not: ``required by TG 4.4.1.3``, ``robustness`` or ``field problem``."""
+    return f"required by {result.case.required_by}" if result.deviates else called(result)
+
+
+def print_results(results: Sequence[CaseResult], does: str = "the device", *, all_wires: bool = False) -> None:
+    """The table on stdout, with what a case is about below `does`; without a terminal one line a case, nothing cut.
+
+    Cases for other wires are only counted, unless `all_wires`.
+    """
+    elsewhere = [] if all_wires else [r for r in results if r.reason == OTHER_WIRE]
+    results = [r for r in results if r not in elsewhere]
+    _print_each(results, does)
+    styles = {called(r): style_of(r) for r in results}
+    counts = Counter(called(r) for r in results)
+    order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
+    parts = [f"[{styles[word]}]{counts[word]} {word}[/]" for word in order if counts[word]]
+    data.print(", ".join(parts) or "no case was chosen")
+    if elsewhere:
+        talk.print(f"{len(elsewhere)} more cases are for other wires", markup=False)
+
+
+def _print_each(results: Sequence[CaseResult], does: str) -> None:
     if not data.is_terminal:
         for r in results:
             reason = f": {r.reason}" if r.reason else ""
+            reason += f" ({why(r)})" if r.deviates else ""
             line = f"{called(r):<13} {r.case.id:<7} {r.case.danger.value:<8} {r.case.title}{reason}"
             data.print(line, markup=False, soft_wrap=True)
     else:
@@ -98,22 +121,25 @@ def print_results(results: Sequence[CaseResult], does: str = "the device") -> No
             mark = MARK[r.verdict]
             if r.verdict.bad and not r.deviates:
                 found, mark = f"{called(r)}: {found}", "!"
+            elif r.verdict.bad:
+                found = f"{found} ({why(r)})"
             table.add_row(
                 f"[{style}]{mark}[/]", f"[{style}]{r.case.id}[/]", f"[{DANGER[danger]}]{danger}[/]",
                 escape(r.case.title), f"[{style}]{escape(found)}[/]",
             )  # fmt: skip
         data.print(table)
-    styles = {called(r): style_of(r) for r in results}
-    counts = Counter(called(r) for r in results)
-    order = ("passed", *FOUND.values(), "error", "inconclusive", "skipped")
-    parts = [f"[{styles[word]}]{counts[word]} {word}[/]" for word in order if counts[word]]
-    data.print(", ".join(parts) or "no case was chosen")
 
 
 def print_cases(
     cases: Sequence[About], does: str = "what the device does", must: str = "what the master must do"
 ) -> None:
-    """All cases, for `--list`."""
+    """All cases, for `--list`: a table, or without a terminal one line for each case."""
+    if not data.is_terminal:
+        for case in cases:
+            words = f"{case.title}: {case.does}; expected: {case.must} [{case.sources}]"
+            line = f"{case.id:<7} {case.bases:<25} {case.danger.value:<8} {words}"
+            data.print(line, markup=False, soft_wrap=True)
+        return
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
     for name in ("case", "basis", "danger", does, must, "source"):
         table.add_column(name, overflow="fold", no_wrap=name == "case")

@@ -35,5 +35,5 @@ def print_not_counted(results: Sequence[CaseResult], fail_on: frozenset[Basis]) 
     if any(r.verdict.bad and not counts_as_failed(r, fail_on) for r in results):
         talk.print(
             "The standard does not require what robustness and field problem cases ask. "
-            "The exit code does not count them: see --fail-on.", markup=False, soft_wrap=True,
+            "The exit code does not count them: see --fail-on.", markup=False, soft_wrap=not talk.is_terminal,
         )  # fmt: skip

@@ -46,6 +46,8 @@ class Basis(Enum):
     that fails conforms, but may cause the same trouble."""
 
 
+OTHER_WIRE = "not on this wire"
+"""Why a case for other wires is skipped."""
 OWN = "fieldtwin"
 """The source of a case that rests on no clause and on no report of another project."""
 
@@ -119,6 +121,14 @@ class About:
     def role(self) -> str:
         """Whom the case judges."""
         return "master"
+
+    @property
+    def required_by(self) -> str:
+        """The clauses that require what the case asks, such as ``TG 4.4.1.3, AP 6.3``; empty where none does."""
+        if self.basis is not Basis.STANDARD:
+            return ""
+        clauses = self.clause.split(";")[0]
+        return f"CiA 301, {clauses}" if clauses[:1].isdigit() else clauses
 
     @property
     def bases(self) -> str:

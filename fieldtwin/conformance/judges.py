@@ -134,7 +134,7 @@ def took_odd_answer(seen: Observation) -> Finding | None:
     first = next((s for s in seen.of(Shown, seen.begun_ns) if s.word is seen.after), None)
     plain = next((t.t_ns for t in seen.of(Told, seen.over_ns + 1) if t.good), seen.until_ns)
     if first is None or first.t_ns >= plain:
-        return failed("answers that it has to accept were not taken: the value came only with the plain ones")
+        return failed("the odd answers were not taken, although they hold the value: it came only with the plain ones")
     return None
 
 

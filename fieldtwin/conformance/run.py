@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
-from fieldtwin.conformance.case import TRAIL_S, Case, Danger, Finding, inconclusive, skipped
+from fieldtwin.conformance.case import OTHER_WIRE, TRAIL_S, Case, Danger, Finding, inconclusive, skipped
 from fieldtwin.conformance.evidence import Line, lines
 from fieldtwin.conformance.observation import Asked, Ended, Event, Habit, Observation, Shown, Told, Word
 from fieldtwin.conformance.probe import Probe
@@ -23,8 +23,6 @@ from gateway.core.errors import Unreachable
 POLL_S = 0.01
 STEADY = 3
 """So many polls make a habit."""
-OTHER_FRAMING = "there is no such thing on this endpoint"
-"""Why a case for other wires is skipped."""
 MANY = 1_000_000
 """Strikes of a case that goes on until its value was seen."""
 
@@ -203,7 +201,7 @@ class MasterRun(Generic[C]):
 
     def _not_here(self, case: C) -> str:
         if not self.traits & set(case.framings):
-            return OTHER_FRAMING
+            return OTHER_WIRE
         if case.needs and case.needs not in self.plan.has:
             return f"only with --{case.needs}"
         if case.about.danger.rank > self.plan.at_most.rank:

@@ -21,9 +21,9 @@ from test_strange_masters_judged import environment
 from fieldtwin.checking import canopen_cases as canopen_devices
 from fieldtwin.checking import modbus_cases as modbus_devices
 from fieldtwin.checking.master_html import render_master_html
-from fieldtwin.cli.check_view import listed, style_of
+from fieldtwin.cli.check_view import listed, print_results, style_of, why
 from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_MASTERS
-from fieldtwin.conformance.case import OWN, About, Basis, failed, passed
+from fieldtwin.conformance.case import OTHER_WIRE, OWN, About, Basis, failed, passed, skipped
 from fieldtwin.conformance.modbus_cases import CASES as MODBUS_MASTERS
 from fieldtwin.conformance.results import CaseResult, as_json, as_report, exit_code
 from fieldtwin.report.junit import render_junit
@@ -99,6 +99,40 @@ def test_the_list_of_cases_has_the_basis_on_each_wire() -> None:
     case = listed(MASTERS["MB-015a"])
     assert case["basis"] == "standard"
     assert case["elsewhere"] == [{"wire": "TCP", "basis": "robustness", "clause": "TG 4.4.1.3; libmodbus PR #860"}]
+
+
+@pytest.mark.parametrize(
+    ("id", "said"),
+    [
+        ("MB-015b", "required by SL 2.4.1"),
+        ("MB-027", "required by SL 2.1"),
+        ("CO-016", "required by CiA 301, 7.2.4"),
+        ("CO-022", "robustness"),
+        ("MB-008", "field problem"),
+    ],
+)
+def test_a_failure_names_the_clause_that_requires_it_or_its_kind(id: str, said: str) -> None:
+    assert why(CaseResult(MASTERS[id], failed("seen"))) == said
+
+
+def test_the_printed_results_name_clauses_and_leave_out_cases_for_other_wires(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    results = [
+        CaseResult(MASTERS["MB-016"], failed("published 3333")),
+        CaseResult(MASTERS["MB-021"], failed("waits")),
+        CaseResult(MASTERS["MB-070a"], skipped(OTHER_WIRE)),
+    ]
+    print_results(results)
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == [
+        "failed        MB-016  read     wrong function code in a reply: published 3333 (required by SL 2.4.1, AP 4.1)",
+        "robustness    MB-021  read     exception frame of 5 bytes: waits",
+        "1 failed, 1 robustness",
+    ]
+    assert "1 more cases are for other wires" in printed.err
+    print_results(results, all_wires=True)
+    assert "MB-070a" in capsys.readouterr().out
 
 
 TAKES_ANY_UNIT = """

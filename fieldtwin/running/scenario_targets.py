@@ -36,8 +36,6 @@ from gateway.wallclock import WallClock
 from twin.field_process import FieldConfig
 from twin.instance import Instance, runtime_root
 
-TARGETS = ("virtual", "local", "compose", "real")
-
 
 @dataclass(frozen=True)
 class Target:

@@ -24,7 +24,6 @@ QUALITIES = tuple(str(quality) for quality in Quality)
 WORDS = {"quality": QUALITIES, "reason": tuple(str(reason).replace(" ", "_") for reason in Reason)}
 """What these functions can say."""
 NO_WORDS: Mapping[str, Collection[str]] = {}
-OWN = ("plc.late", "command pending")
 _OWN = ("plc.late", "command_pending")
 """``plc.late``: by how many seconds the last scan was late; ``command pending``: the far end commanded within 5 s."""
 LONGEST = 1000

@@ -29,7 +29,6 @@ import msgspec
 from gateway.core.errors import Bug, FileInvalid
 from gateway.core.input_file import open_input
 
-VERSION = 1
 MAX_LINE_BYTES = 65_536
 """Longer lines are refused: the longest Modbus exchange takes about 1,100."""
 

@@ -17,7 +17,6 @@ from gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictiona
 _COUNT = struct.Struct("<I")
 _HEAD = struct.Struct("<HBI")
 MAX_SETTINGS = 65_535
-MAX_BYTES = 1 << 20
 
 CONFIGURATION_DATE = 0x1020
 _NEVER = frozenset({0x1003, 0x1010, 0x1011, CONFIGURATION_DATE, *range(0x1F50, 0x1F58)})

@@ -225,6 +225,9 @@ def _read_object(index: int, section: Section, sections: dict[str, Section]) -> 
         return None
     entries: dict[int, Entry] = {}
     count = section.number("CompactSubObj", 0)
+    if count == 255:  # the subindices go up to 254 (CiA 306, 4.7.2); several public files count one more
+        section.note(f"CompactSubObj 255 of [{section.name}] is taken as 254, the highest subindex", "CompactSubObj")
+        count = 254
     if not 0 <= count <= 254:
         raise section.error("CompactSubObj", "CompactSubObj", expected="0 to 254", got=str(count))
     if count:

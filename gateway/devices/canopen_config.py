@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from gateway.core.clock import NS_PER_MS
 from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
 from gateway.protocols.canopen.configure import PdoConfig
 from gateway.protocols.canopen.lss import LssAddress
@@ -50,3 +52,13 @@ class CanopenNodeConfig:
     rpdo1: RpdoConfig | None = None
     rpdos: tuple[PdoConfig, ...] | None = None
     adopt_rpdos: bool = False
+
+
+def cycle_period_ns(bus: CanopenBusConfig, nodes: Iterable[CanopenNodeConfig]) -> int:
+    """Return the communication cycle period of a bus in ns: how often its master produces SYNC, else the shortest period that a
+    node's DCF sets (1006h); 0 where neither says it."""
+    if bus.sync_ms:
+        return bus.sync_ms * NS_PER_MS
+    settings = (setting for node in nodes if node.configuration for setting in node.configuration.settings)
+    periods = (int.from_bytes(s.data, "little") for s in settings if (s.index, s.subindex) == (0x1006, 0))
+    return min((period_us * 1000 for period_us in periods if period_us), default=0)

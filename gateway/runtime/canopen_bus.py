@@ -20,6 +20,7 @@ from gateway.core.errors import ConnectionLost, FieldtwinError, NotAllowed, Repl
 from gateway.core.latency import Latencies
 from gateway.core.nursery import Nursery
 from gateway.core.values import COMMAND, Reason
+from gateway.devices.canopen_config import cycle_period_ns
 from gateway.devices.canopen_device import CanopenDriver
 from gateway.devices.canopen_rpdo import Rpdo
 from gateway.devices.config import BusConfig
@@ -226,7 +227,9 @@ class CanopenBus:
             self._master, self._lss = master, LssMaster(master.send, self._clock)
             master.listen(LSS_REPLY, self._lss.on_reply)
             if not self.sync_watch.verdict:
-                self.sync_watch = SyncWatch(own=bool(self.config.canopen.sync_ms and self._allow_writes))
+                produces = bool(self.config.canopen.sync_ms and self._allow_writes)
+                nodes = [status.driver.config.canopen for status in self.nodes.values()]
+                self.sync_watch = SyncWatch(own=produces, period_ns=cycle_period_ns(self.config.canopen, nodes))
             master.on_sync = self.sync_watch.feed
             self.connected, self.error = True, ""
             self.locals.append(connection.local)

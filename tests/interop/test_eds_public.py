@@ -23,10 +23,12 @@ from eds_agreement import NODE, differences
 
 pytestmark = [pytest.mark.interop, pytest.mark.long]
 
+PIP = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", ":all:"]
+OLDER = ("1.2.1", "2.0.0", "2.2.0")
+"""Releases of the package whose data sheets differ from today's."""
 SOURCES = {
-    "canopen from PyPI": [
-        sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", ":all:", f"canopen=={version('canopen')}",
-    ],
+    "canopen from PyPI": [*PIP, f"canopen=={version('canopen')}"],
+    **{f"canopen {older} from PyPI": [*PIP, f"canopen=={older}"] for older in OLDER},
     "canopen from npm": ["npm", "pack", "--silent", "canopen@6.2.1"],
 }  # fmt: skip
 

@@ -24,6 +24,9 @@ from fieldtwin.commissioning.identify_canopen import identify_canopen
 from gateway.core.canframe import CanFrame
 from gateway.core.clock import NS_PER_MS
 from gateway.core.nursery import Nursery
+from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, cycle_period_ns
+from gateway.protocols.canopen.boot import Configuration
+from gateway.protocols.canopen.concise_dcf import Setting
 from gateway.protocols.canopen.master import CanopenMaster
 from gateway.protocols.canopen.sync_watch import SyncWatch
 
@@ -148,3 +151,41 @@ def test_a_producer_that_restarts_its_counter_is_still_one(restarts: int) -> Non
     for number in range(60):
         watch.feed(bytes([number % (60 // (restarts + 1)) + 1]), number * 10 * NS_PER_MS)
     assert watch.verdict == ""
+
+
+EVENLY = st.tuples(st.integers(2, 1000), st.integers(2, 4), st.lists(st.floats(-0.05, 0.05), min_size=40, max_size=40))
+
+
+@given(EVENLY)
+def test_evenly_spaced_producers_are_noticed_where_the_cycle_period_is_known(
+    given_: tuple[int, int, list[float]],
+) -> None:
+    period_ms, producers, jitter = given_
+    told, untold = SyncWatch(period_ns=period_ms * NS_PER_MS), SyncWatch()
+    for number, late in enumerate(jitter):
+        for watch in (told, untold):
+            watch.feed(b"", round((number + late) * period_ms * NS_PER_MS / producers))
+    assert f"{producers} producers" in told.verdict
+    assert f"the communication cycle period is {period_ms} ms" in told.verdict
+    assert untold.verdict == "", "listening alone cannot tell it from one producer"
+
+
+@given(st.integers(2, 1000), st.floats(0.8, 3.0), st.lists(st.floats(-0.2, 0.2), min_size=40, max_size=40))
+def test_one_producer_that_keeps_the_cycle_period_or_is_slower_is_one(
+    period_ms: int, slower: float, jitter: list[float]
+) -> None:
+    watch = SyncWatch(period_ns=period_ms * NS_PER_MS)
+    for number, late in enumerate(jitter):
+        watch.feed(b"", round((number + late) * slower * period_ms * NS_PER_MS))
+    assert watch.verdict == ""
+
+
+def test_the_cycle_period_is_the_masters_or_the_shortest_that_a_dcf_sets() -> None:
+    def of(*periods_us: int) -> CanopenNodeConfig:
+        settings = [Setting(0x1006, 0, us.to_bytes(4, "little")) for us in periods_us]
+        return CanopenNodeConfig(configuration=Configuration((Setting(0x1005, 0, bytes(4)), *settings)))
+
+    silent = CanopenBusConfig()
+    assert cycle_period_ns(CanopenBusConfig(sync_ms=20), [of(5000)]) == 20 * NS_PER_MS
+    assert cycle_period_ns(silent, [of(10_000), of(5000), of(0), CanopenNodeConfig()]) == 5 * NS_PER_MS
+    assert cycle_period_ns(silent, [of(0), of()]) == cycle_period_ns(silent, []) == 0

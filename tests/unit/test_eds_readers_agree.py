@@ -62,6 +62,8 @@ UNREADABLE = {
     "an object of an unknown kind": one(7, "[2001]", "ParameterName=s", "ObjectType=0x55"),
     "values of a compact array that has fewer": HEAD
     + "[2000]\nParameterName=A\nObjectType=8\nDataType=5\nAccessType=rw\nCompactSubObj=2\n[2000Value]\n3=1\n",
+    "a compact array of 255 entries": HEAD
+    + "[2000]\nParameterName=A\nObjectType=8\nDataType=7\nAccessType=ro\nCompactSubObj=255\n",
     "a key that is given twice with one value": one(7, "DefaultValue=5", "DefaultValue=5"),
     "a DOMAIN whose file is missing": one(0xF, "DownloadFile=none.bin", object_type="2"),
     "no name": HEAD + "[2000]\nDataType=5\nAccessType=rw\n",

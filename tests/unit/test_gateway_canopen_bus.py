@@ -178,6 +178,19 @@ def test_a_second_sync_producer_is_noticed(tmp_path: Path) -> None:
     run(main())
 
 
+def test_syncs_that_come_twice_in_a_cycle_are_noticed_by_a_gateway_that_produces_none(tmp_path: Path) -> None:
+    """Without --allow-writes the gateway only listens, and the system file still says how often SYNC is to come."""
+
+    async def main() -> None:
+        async with rig(tmp_path, allow_writes=False, canopen=CanopenBusConfig(sync_ms=50)) as r:
+            await eventually(lambda: r.bus.connected)
+            for number in range(20):
+                r.bus.sync_watch.feed(b"", number * 25_000_000)
+            assert "SYNC comes every 25 ms, and the communication cycle period is 50 ms" in r.bus.sync_watch.verdict
+
+    run(main())
+
+
 def test_what_no_tpdo_brings_is_read_once(tmp_path: Path) -> None:
     async def main() -> None:
         async with rig(tmp_path, serial="") as r:

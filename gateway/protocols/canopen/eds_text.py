@@ -280,8 +280,13 @@ def _mend_object(section: Section, sections: dict[str, Section], path: str, mend
         kept.values["DataType"] = _data_type(section, kept, sections, path, mended)
         kept.values["AccessType"] = _access(section, path, mended)
     if "CompactSubObj" in kept.values:
+        if int(kept.values["CompactSubObj"], 0) == _MOST_ENTRIES + 1:
+            kept.values["CompactSubObj"] = str(_MOST_ENTRIES)
+            mended.append(
+                f"[{section.name}] CompactSubObj: {_MOST_ENTRIES + 1}, taken as {_MOST_ENTRIES}, the highest subindex"
+            )
         if int(kept.values["CompactSubObj"], 0) > _MOST_ENTRIES:
-            raise invalid("cannot be", section, "CompactSubObj", path, expected=f"0 to {_MOST_ENTRIES}")
+            raise invalid("is too large", section, "CompactSubObj", path, expected=f"0 to {_MOST_ENTRIES}")
         kept.values["ObjectType"] = "0x8"  # `canopen` knows compact arrays, but no compact records
     return kept
 

@@ -104,7 +104,11 @@ def command(recording: Path, other: str, as_json: bool, everything: bool, **opti
         json.dump(
             _headed(recording, other, live, options)
             | asdict(result)
-            | {"values": result.values, "met": result.met, "inconclusive": result.inconclusive},
+            | {
+                "values": result.values if result.compared else None,
+                "met": result.met,
+                "inconclusive": result.inconclusive,
+            },
             sys.stdout,
         )
         sys.stdout.write("\n")
@@ -339,7 +343,8 @@ def _show(result: Comparison, recording: Path, other: str, everything: bool) -> 
     _show_shifts(result)
     timing = "not known" if result.timing is None else f"{100 * result.timing:.1f} %"
     verdict = "met" if result.met else "INCONCLUSIVE" if result.inconclusive else "NOT met"
-    data.print(f"fidelity: values {100 * result.values:.1f} %, timing {timing}: {verdict}", soft_wrap=True)
+    alike = f"{100 * result.values:.1f} %" if result.compared else "not known"
+    data.print(f"fidelity: values {alike}, timing {timing}: {verdict}", soft_wrap=True)
 
 
 def _show_shifts(result: Comparison) -> None:

@@ -384,6 +384,8 @@ def print_summary(summary: dict[str, Any]) -> None:
         if error in told:  # beside the device, above
             continue
         data.print(f"  [red]error[/red]          {escape(error)}", soft_wrap=True)
+    for what in summary["not_judged"]:
+        data.print(f"  [yellow]not judged[/yellow]     {what}", soft_wrap=True, highlight=False)
     data.print("[bold green]ok[/bold green]" if summary["ok"] else "[bold red]not ok[/bold red]")
 
 

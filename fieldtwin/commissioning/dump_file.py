@@ -36,6 +36,7 @@ from fieldtwin.commissioning.coverage import (
     READABLE,
     REFUSED,
     SILENT,
+    STATE_KEYS,
     Coverage,
     describe,
     joined,
@@ -120,6 +121,11 @@ class Dump:
         """How many addresses or objects are unknown, and how many were to be asked for."""
         counts = [line["counts"] for line in self.maps.values() if "counts" in line]
         return sum(c["unknown"] for c in counts), sum(n for c in counts for key, n in c.items() if key != "unknown")
+
+    @property
+    def not_asked(self) -> int:
+        """How many addresses no request named, those between samples included."""
+        return sum(line["counts"].get(STATE_KEYS[NOT_ASKED], 0) for line in self.maps.values() if "counts" in line)
 
     @property
     def is_mostly_unknown(self) -> bool:

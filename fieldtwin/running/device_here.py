@@ -54,7 +54,7 @@ from gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
 from gateway.core.errors import UsageError
 from gateway.core.nursery import Nursery
 from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import shown
+from gateway.core.recording import looks_like_another_file, shown
 from gateway.wallclock import WallClock
 from twin.data_files import find_recording
 from twin.field import unit_limits
@@ -206,12 +206,14 @@ class DeviceHost:
 
     @staticmethod
     def _recording_of(profile: DeviceProfile) -> str | None:
-        """What a shipped device plays when nothing else is said: the recording under its profile's name."""
+        """What a shipped device plays when nothing else is said: the recording under its profile's name. A dump that has this
+        name, from which `infer` drafted the profile, is no recording."""
         name = DEFAULT_RECORDINGS.get(profile.name, f"{Path(profile.path).stem}.jsonl")
         try:
-            return str(find_recording(name))
+            found = find_recording(name)
         except UsageError:
             return None
+        return None if looks_like_another_file(found) else str(found)
 
     def _player(self, profile: DeviceProfile, recording: Path | None) -> SignalPlayer:
         name = recording or self._recording_of(profile)

@@ -112,6 +112,10 @@ class Run(Protocol):
         ...
 
 
+NOT_CALM = "whether devices and outputs were good at the end, because faults were put in"
+"""What a run says that had faults until its end, or until shortly before."""
+
+
 def summarise(run: Run) -> dict[str, Any]:
     """Plain data for `--json` and for people. `ok` is False when any check failed; `errors` says which and why."""
     gateway = run.gateway_status or {}
@@ -174,6 +178,7 @@ def summarise(run: Run) -> dict[str, Any]:
         },
         "tags": gateway.get("tags", {}),
         "errors": errors,
+        "not_judged": [] if run.calm else [NOT_CALM],
         "ok": not errors,
     }
 

@@ -176,7 +176,8 @@ def _device(device: Device) -> Markup:
 
 
 def _piece(piece: Piece) -> Markup:
-    said = el("span", piece.verdict, cls=f"verdict {'good' if piece.verdict in ('passed', 'whole', 'met') else 'bad'}")
+    good = piece.verdict in ("passed", "whole", "sampled", "met")
+    said = el("span", piece.verdict, cls=f"verdict {'good' if good else 'bad'}")
     facts = [("when", day(piece.when)), ("by", piece.by), ("found", piece.summary), *piece.facts]
     return el(
         "div", el("h4", HEADINGS[piece.kind], ": ", said), _facts(facts), [_table(t) for t in piece.tables if t.rows]

@@ -39,6 +39,8 @@ def dump_piece(path: Path) -> Piece:
         ("times through", str(len(dump.passes))),
         ("values", str(cells)),
     ]
+    if dump.not_asked:
+        facts.append(("not asked", f"{dump.not_asked} of {asked_for} addresses; those beside them were"))
     return Piece(
         "dump", dump.protocol, int(header.get("address", 0)), str(header.get("endpoint", "")), str(header.get("started", "")),
         str(header.get("by", "")), _verdict(dump), f"{cells} values in {len(dump.passes)} times through",
@@ -47,12 +49,15 @@ def dump_piece(path: Path) -> Piece:
 
 
 def _verdict(dump: Dump) -> str:
-    """``whole`` only of a dump that ended and knows something definite about everything it was to ask for."""
+    """``whole`` only of a dump that ended and asked for each address with a definite answer. ``sampled``: it left out addresses
+    between others that were answered alike."""
     if not dump.ended:
         return "broken off"
     if dump.is_mostly_unknown:
         return "mostly unknown"
-    return "partly unknown" if dump.unknown[0] else "whole"
+    if dump.unknown[0]:
+        return "partly unknown"
+    return "sampled" if dump.not_asked else "whole"
 
 
 def identity(dump: Dump) -> dict[str, str]:

@@ -40,6 +40,7 @@ _OTHER_FILES = (
     (b'{"started"', " but raw traffic: fieldtwin import makes a recording of it"),
 )
 """What people give instead, by how it begins."""
+
 BLOCK_BYTES = 4 * MAX_LINE_BYTES
 """What is read at once of a recording of exchanges."""
 
@@ -47,6 +48,13 @@ Kind = Literal["exchanges", "signals"]
 Source = Literal["measured", "synthetic", "imported"]
 ExchangeError = Literal["timeout", "crc", "desync", "lost"]
 """Why an exchange has no reply: silence, a broken check sum, a frame that was no answer, a connection that ended."""
+
+
+def looks_like_another_file(path: Path) -> bool:
+    """Whether a file begins as one that people take for a recording: a dump, or raw traffic. Raises `OSError`."""
+    with open_input(path) as file:
+        begins = file.read(max(len(other) for other, _ in _OTHER_FILES))
+    return any(begins.startswith(other) for other, _ in _OTHER_FILES)
 
 
 class SignalInfo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

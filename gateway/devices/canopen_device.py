@@ -182,6 +182,20 @@ class CanopenDriver(DeviceDriver):
                 except SdoAborted:
                     self.sink.put_bad([f"{self.config.name}.{tag.name}"], Reason.REFUSED)
 
+    @property
+    def to_configure(self) -> str:
+        """What `configure` may write, in words; empty where the system file says nothing that is written."""
+        canopen, parts = self.config.canopen, []
+        if canopen.configuration is not None:
+            parts.append(f"{canopen.dcf} unless it holds that")
+        if self.config.heartbeat is not None and self.config.heartbeat.producer_ms is not None:
+            parts.append("heartbeat")
+        if self.config.tpdo1 is not None:
+            parts.append("TPDO1")
+        if canopen.rpdo1 is not None:
+            parts.append("RPDO1")
+        return f"{', '.join(parts)} as in the system file" if parts else ""
+
     async def configure(self) -> None:
         """Write the DCF, unless the node holds it, then heartbeat and TPDO1 as the system file says, and listen.
 

@@ -416,9 +416,8 @@ class CanopenBus:
             self._audit.note("nmt", name, by="start-up", result="asked", what="pre-operational")
             driver.consumer.observe(COMMAND(b"", "nmt_preoperational"))
             await driver.send()
-        dcf = f"{driver.config.canopen.dcf} unless it holds that, " if driver.config.canopen.configuration else ""
-        what = f"{dcf}heartbeat, TPDO1 and RPDO1 as in the system file"
-        self._audit.note("sdo", name, by="start-up", result="asked", what=what)
+        if what := driver.to_configure:
+            self._audit.note("sdo", name, by="start-up", result="asked", what=what)
         await driver.configure()
         if driver.config.start:
             self._audit.note("nmt", name, by="start-up", result="asked", what="start")

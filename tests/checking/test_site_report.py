@@ -25,6 +25,7 @@ from fieldtwin.conformance.case import failed, inconclusive, passed, skipped
 from fieldtwin.report.junit import render_junit
 from fieldtwin.sitereport.html import render_html
 from fieldtwin.sitereport.reading import read_site
+from fieldtwin.sitereport.reading_dump import dump_piece
 from gateway.core.connection import Direction
 from gateway.core.errors import FileInvalid, UsageError
 
@@ -175,6 +176,27 @@ def test_a_dump_that_was_broken_off_is_an_open_point(dump: Path, tmp_path: Path)
     dump.write_text("".join(dump.read_text().splitlines(keepends=True)[:-1]))
     result = report(dump, "-o", tmp_path / "site.html")
     assert "no deviation, 1 open point" in result.output
+
+
+def test_a_dump_that_left_out_addresses_between_others_is_called_sampled(tmp_path: Path) -> None:
+    """Observed: "whole" for a dump that had not asked for 29 of 101 addresses."""
+    lines = [
+        {
+            "fieldtwin_dump": 2, "protocol": "modbus", "address": 1, "ranges": ["holding:0..9"], "profile": None,
+            "endpoint": "tcp://192.0.2.9:502", "started": "2026-11-21T11:00:00.000+00:00",
+        },
+        {"pass": 0, "at": "2026-11-21T11:00:00.000+00:00"},
+        {"read": "holding:0..9", "code": 2, "us": 900},
+        {"read": "holding:0..3", "hex": "0001000200030004", "us": 900},
+        {"read": "holding:8", "code": 2, "us": 900},
+        {"read": "holding:9", "code": 2, "us": 900},
+        {"ended": "2026-11-21T11:00:09.000+00:00", "requests": 4},
+    ]  # fmt: skip
+    path = tmp_path / "sampled.jsonl"
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    piece = dump_piece(path)
+    assert piece.verdict == "sampled"
+    assert ("not asked", "4 of 10 addresses; those beside them were") in piece.facts
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,52 @@
+"""What the terminal and the audit log claim without having seen it.
+
+Observed: "ok" for a run whose sensor was silent to the end, without a word that a run with faults does not judge devices; a line in the audit log that a heartbeat had been written to a node whose
+heartbeat is only listened to; and an emulator that refused the draft of a profile because the dump beside it is no recording.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from click.testing import CliRunner
+from support import eventually, run
+from test_gateway_canopen_bus import rig
+
+from fieldtwin.cli.run_command import command as run_system
+from gateway.core.recording import looks_like_another_file
+from gateway.devices.config import Heartbeat
+
+SILENT = "faults: [{name: silence, device: ctd}]\n"
+VIRTUAL = ["observatory", "--prototype", "--virtual", "--for", "5s"]
+
+
+def test_a_run_with_faults_says_that_it_did_not_judge_devices(tmp_path: Path) -> None:
+    (tmp_path / "faults.yaml").write_text(SILENT)
+    done = CliRunner().invoke(run_system, [*VIRTUAL, "--faults", str(tmp_path / "faults.yaml")], standalone_mode=False)
+    assert "not judged     whether devices and outputs were good at the end, because faults were put in" in done.stdout
+    assert "not judged" not in CliRunner().invoke(run_system, VIRTUAL, standalone_mode=False).stdout
+
+
+def test_the_audit_log_names_only_what_start_up_writes(tmp_path: Path) -> None:
+    async def main() -> None:
+        for number, heartbeat in enumerate((Heartbeat(None, 150), Heartbeat(50, 150))):
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            async with rig(folder, heartbeat=heartbeat) as r:
+                r.plug_node()
+                await eventually(lambda r=r: r.status.online)
+            lines = [json.loads(line) for line in (folder / "audit").read_text().splitlines()]
+            assert [line["what"] for line in lines if line["action"] == "sdo"] == [
+                ("heartbeat, " if heartbeat.producer_ms else "") + "TPDO1 as in the system file"
+            ]
+
+    run(main())
+
+
+def test_a_dump_is_not_taken_for_the_recording_of_the_profile_beside_it(tmp_path: Path) -> None:
+    dump, recording = tmp_path / "dump.jsonl", tmp_path / "recording.jsonl"
+    dump.write_text('{"fieldtwin_dump":2,"protocol":"modbus"}\n')
+    recording.write_text('{"fieldtwin_recording": 1, "device": "x", "kind": "exchanges", "source": "measured"}\n')
+    assert looks_like_another_file(dump)
+    assert not looks_like_another_file(recording)

@@ -1,7 +1,8 @@
 """What the terminal and the audit log claim without having seen it.
 
-Observed: "ok" for a run whose sensor was silent to the end, without a word that a run with faults does not judge devices; a line in the audit log that a heartbeat had been written to a node whose
-heartbeat is only listened to; and an emulator that refused the draft of a profile because the dump beside it is no recording.
+Observed: "ok" for a run whose sensor was silent to the end, without a word that a run with faults does not judge devices; a line
+in the audit log that a heartbeat had been written to a node whose heartbeat is only listened to; and an emulator that refused
+the draft of a profile because the dump beside it is no recording.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fieldtwin.checking.device_case import DeviceResult, Spoken
 from fieldtwin.checking.subject import Subject
-from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, verdict_bar, verdict_pill
+from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, sources_note, verdict_bar, verdict_pill
 from fieldtwin.conformance.case import OTHER_WIRE
 from fieldtwin.conformance.results import summary
 from fieldtwin.report.file import put
@@ -38,7 +38,7 @@ def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: st
     body = [_header(subject, results, reproduce)]
     if bad:
         body += [el("h2", "What was found", id="found"), *(_finding(r) for r in bad)]
-    body += [el("h2", "All cases", id="cases"), _table(results)]
+    body += [el("h2", "All cases", id="cases"), _table(results), sources_note(results)]
     head = el(
         "head",
         el("meta", charset="utf-8"),

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, verdict_bar, verdict_pill
+from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, sources_note, verdict_bar, verdict_pill
 from fieldtwin.conformance.case import OTHER_WIRE
 from fieldtwin.conformance.evidence import Line, reproduce
 from fieldtwin.conformance.results import CaseResult, summary
@@ -42,7 +42,7 @@ def render_master_html(results: Sequence[CaseResult], title: str, argv: Sequence
     ]
     if bad:
         body += [el("h2", "What was found", id="found"), *(_finding(r, argv) for r in bad)]
-    body += [el("h2", "All cases", id="cases"), _table(results)]
+    body += [el("h2", "All cases", id="cases"), _table(results), sources_note(results)]
     head = el(
         "head",
         el("meta", charset="utf-8"),

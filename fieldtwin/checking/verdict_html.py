@@ -18,6 +18,15 @@ BASIS = {
     Basis.ROBUSTNESS: "robustness: the standard does not require it",
     Basis.FIELD: "known field problem: the standard does not require it",
 }
+MODBUS_SOURCES = (
+    "SL: MODBUS over Serial Line V1.02. TG: MODBUS Messaging on TCP/IP Implementation Guide V1.0b. AP: MODBUS Application "
+    "Protocol V1.1b3."
+)
+CANOPEN_SOURCES = "A number alone is a clause of CiA 301 v4.2.0. CN: CANopenNode. py: canopen for Python."
+ALL_SOURCES = (
+    "A name with a number is an issue or pull request (PR) of that project (HA: Home Assistant). fieldtwin: neither a clause nor "
+    "a report of another project."
+)
 ORDER = (Verdict.ERROR, Verdict.FAILED, Verdict.INCONCLUSIVE, Verdict.PASSED, Verdict.SKIPPED)
 
 
@@ -45,6 +54,12 @@ def verdict_bar(results: Sequence[CaseResult]) -> Markup:
     """How many cases have each colour, as a bar."""
     counts = Counter(colour_of(r) for r in results)
     return el("div", [el("i", cls=v.value, style=f"flex:{counts[v]}") for v in ORDER if counts[v]], cls="bar")
+
+
+def sources_note(results: Sequence[CaseResult]) -> Markup:
+    """What the sources of the cases stand for."""
+    canopen = any(r.case.id.startswith("CO-") for r in results)
+    return el("p", f"Sources. {CANOPEN_SOURCES if canopen else MODBUS_SOURCES} {ALL_SOURCES}", cls="small")
 
 
 def by_weight(results: Sequence[R]) -> list[R]:

@@ -245,7 +245,7 @@ class MasterRun(Generic[C]):
         fits = await self._until(lambda: stage.struck > 0, min(self.plan.patience_s, 4 * self.habit.longest_gap_s + 1))
         if not fits:
             stage.end()
-            return skipped(f"it sent no {case.wants} to answer so"), ()
+            return skipped(f"the master sent no {case.wants}"), ()
         done = (
             (lambda: self._seen(after, start_ns) and stage.struck >= case.least)
             if case.holds_good and self.probe

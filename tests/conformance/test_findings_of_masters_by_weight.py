@@ -84,6 +84,11 @@ def test_only_a_required_case_of_a_master_is_red_and_gives_exit_code_1() -> None
     assert '<span class="pill inconclusive">! field problem</span>' in page
     assert '"pill failed' not in page
     assert "robustness: the standard does not require it" in page
+    assert "SL: MODBUS over Serial Line V1.02" in page
+    can = render_master_html(
+        [CaseResult(MASTERS["CO-001"], passed())], "master on x", ["check"], "2027-01-01T00:00:00+00:00"
+    )
+    assert "A number alone is a clause of CiA 301 v4.2.0" in can
     page = render_master_html([good, robust, deviation], "master on x", ["check"], "2027-01-01T00:00:00+00:00")
     assert "required by the standard" in page
     assert page.index("MB-011") < page.index("MB-021"), "deviations come first"

@@ -12,12 +12,19 @@ from pathlib import Path
 
 from fieldtwin.checking.device_case import DeviceResult, Spoken
 from fieldtwin.checking.subject import Subject
-from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, sources_note, verdict_bar, verdict_pill
-from fieldtwin.conformance.case import OTHER_WIRE
+from fieldtwin.checking.verdict_html import (
+    BASIS,
+    by_weight,
+    case_table,
+    overall,
+    sources_note,
+    verdict_bar,
+    verdict_pill,
+)
 from fieldtwin.conformance.results import summary
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
-from fieldtwin.report.markup import Markup, el
+from fieldtwin.report.markup import Markup, el, page
 from fieldtwin.report.model import Verdict
 from fieldtwin.report.style import style
 from gateway.core.clock import NS_PER_MS
@@ -38,15 +45,8 @@ def render_html(subject: Subject, results: Sequence[DeviceResult], reproduce: st
     body = [_header(subject, results, reproduce)]
     if bad:
         body += [el("h2", "What was found", id="found"), *(_finding(r) for r in bad)]
-    body += [el("h2", "All cases", id="cases"), _table(results), sources_note(results)]
-    head = el(
-        "head",
-        el("meta", charset="utf-8"),
-        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        el("title", f"check of {subject.name}"),
-        el("style", style()),
-    )
-    return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"
+    body += [el("h2", "All cases", id="cases"), case_table(results, "sent", _folded_bytes), sources_note(results)]
+    return page(f"check of {subject.name}", style(), body)
 
 
 def _header(subject: Subject, results: Sequence[DeviceResult], reproduce: str) -> Markup:
@@ -108,27 +108,7 @@ def wire_table(spoken: Sequence[Spoken]) -> Markup:
     return el("div", table, el("p", f"and {more} more", cls="small") if more > 0 else "", cls="wide")
 
 
-def _table(results: Sequence[DeviceResult]) -> Markup:
-    elsewhere = [r for r in results if r.reason == OTHER_WIRE]
-    results = [r for r in results if r.reason != OTHER_WIRE]
-    columns = ("case", "verdict", "basis", "danger", "sent", "expected", "source", "found")
-    head = el("tr", [el("th", name) for name in columns])
-    table = el("table", el("thead", head), el("tbody", [_row(r) for r in results]))
-    ids = ", ".join(r.case.id for r in elsewhere)
-    return el("div", table, el("p", f"For other wires: {ids}.", cls="small") if elsewhere else "", cls="wide")
-
-
-def _row(result: DeviceResult) -> Markup:
-    case = result.case
-    said = el("details", el("summary", f"{len(result.spoken)} on the wire"), wire_table(result.spoken))
-    return el(
-        "tr",
-        el("td", f"{case.id} {case.title}", cls="name", id=case.id),
-        el("td", verdict_pill(result)),
-        el("td", case.basis.value),
-        el("td", case.danger.value),
-        el("td", case.does),
-        el("td", case.must),
-        el("td", case.clause),
-        el("td", result.reason, said if result.spoken and not result.verdict.bad else "", cls="long"),
-    )
+def _folded_bytes(result: DeviceResult) -> Markup | str:
+    if not result.spoken or result.verdict.bad:
+        return ""
+    return el("details", el("summary", f"{len(result.spoken)} on the wire"), wire_table(result.spoken))

@@ -10,13 +10,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.checking.verdict_html import BASIS, by_weight, overall, sources_note, verdict_bar, verdict_pill
-from fieldtwin.conformance.case import OTHER_WIRE
+from fieldtwin.checking.verdict_html import (
+    BASIS,
+    by_weight,
+    case_table,
+    overall,
+    sources_note,
+    verdict_bar,
+    verdict_pill,
+)
 from fieldtwin.conformance.evidence import Line, reproduce
 from fieldtwin.conformance.results import CaseResult, summary
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
-from fieldtwin.report.markup import Markup, el
+from fieldtwin.report.markup import Markup, el, page
 from fieldtwin.report.model import Verdict
 from fieldtwin.report.style import style
 
@@ -42,15 +49,12 @@ def render_master_html(results: Sequence[CaseResult], title: str, argv: Sequence
     ]
     if bad:
         body += [el("h2", "What was found", id="found"), *(_finding(r, argv) for r in bad)]
-    body += [el("h2", "All cases", id="cases"), _table(results), sources_note(results)]
-    head = el(
-        "head",
-        el("meta", charset="utf-8"),
-        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        el("title", f"check of {title}"),
-        el("style", style()),
-    )
-    return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"
+    body += [
+        el("h2", "All cases", id="cases"),
+        case_table(results, "the device", _folded_frames),
+        sources_note(results),
+    ]
+    return page(f"check of {title}", style(), body)
 
 
 def _finding(result: CaseResult, argv: Sequence[str]) -> Markup:
@@ -84,26 +88,7 @@ def _lines(wire: Sequence[Line]) -> Markup:
     return el("table", rows, cls="frames", style="width:auto")
 
 
-def _table(results: Sequence[CaseResult]) -> Markup:
-    elsewhere = [r for r in results if r.reason == OTHER_WIRE]
-    columns = ("case", "verdict", "basis", "danger", "the device", "expected", "source", "found")
-    rows = [_row(r) for r in results if r not in elsewhere]
-    table = el("table", el("thead", el("tr", [el("th", name) for name in columns])), el("tbody", rows))
-    ids = ", ".join(r.case.id for r in elsewhere)
-    return el("div", table, el("p", f"For other wires: {ids}.", cls="small") if ids else "", cls="wide")
-
-
-def _row(result: CaseResult) -> Markup:
-    case = result.case
-    frames = el("details", el("summary", f"{len(result.wire)} on the wire"), _frames(result.wire))
-    return el(
-        "tr",
-        el("td", f"{case.id} {case.title}", cls="name", id=case.id),
-        el("td", verdict_pill(result)),
-        el("td", case.basis.value),
-        el("td", case.danger.value),
-        el("td", case.does),
-        el("td", case.must),
-        el("td", case.clause),
-        el("td", result.reason, frames if result.wire and result.verdict is Verdict.PASSED else "", cls="long"),
-    )
+def _folded_frames(result: CaseResult) -> Markup | str:
+    if not result.wire or result.verdict is not Verdict.PASSED:
+        return ""
+    return el("details", el("summary", f"{len(result.wire)} on the wire"), _frames(result.wire))

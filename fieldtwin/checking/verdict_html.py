@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from fieldtwin.conformance.case import Basis
+from fieldtwin.conformance.case import OTHER_WIRE, Basis
 from fieldtwin.conformance.results import CaseResult, called
 from fieldtwin.report.html import pill
 from fieldtwin.report.markup import Markup, el
@@ -65,3 +65,31 @@ def sources_note(results: Sequence[CaseResult]) -> Markup:
 def by_weight(results: Sequence[R]) -> list[R]:
     """Deviations first, then other failures, inconclusive, passed and skipped cases."""
     return sorted(results, key=lambda r: (ORDER.index(r.verdict), not r.deviates))
+
+
+def case_table(results: Sequence[R], does: str, folded: Callable[[R], Markup | str]) -> Markup:
+    """Return the table of all cases; cases for other wires are only named below it.
+
+    `does` is the heading of what was done in a case, and `folded` returns what follows the reason in its last column.
+    """
+    elsewhere = [r for r in results if r.reason == OTHER_WIRE]
+    columns = ("case", "verdict", "basis", "danger", does, "expected", "source", "found")
+    rows = [_case_row(r, folded(r)) for r in results if r.reason != OTHER_WIRE]
+    table = el("table", el("thead", el("tr", [el("th", name) for name in columns])), el("tbody", rows))
+    ids = ", ".join(r.case.id for r in elsewhere)
+    return el("div", table, el("p", f"For other wires: {ids}.", cls="small") if ids else "", cls="wide")
+
+
+def _case_row(result: CaseResult, folded: Markup | str) -> Markup:
+    case = result.case
+    return el(
+        "tr",
+        el("td", f"{case.id} {case.title}", cls="name", id=case.id),
+        el("td", verdict_pill(result)),
+        el("td", case.basis.value),
+        el("td", case.danger.value),
+        el("td", case.does),
+        el("td", case.must),
+        el("td", case.clause),
+        el("td", result.reason, folded, cls="long"),
+    )

@@ -14,7 +14,7 @@ from pathlib import Path
 from fieldtwin.report.coverage_tables import coverage_section
 from fieldtwin.report.diagram import timing_diagram
 from fieldtwin.report.file import put
-from fieldtwin.report.markup import Markup, el, join
+from fieldtwin.report.markup import Markup, el, join, page
 from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, SystemKey, Verdict, key_of
 from fieldtwin.report.requirements import requirement_section
 from fieldtwin.report.style import style
@@ -46,7 +46,6 @@ def write_html(report: Report, path: Path) -> None:
 def render_html(report: Report) -> str:
     """The whole page."""
     parts, failures = _study(report)
-    verdict = report.verdict
     body = [
         _header(report),
         el("h2", "Verdicts", id="verdicts"),
@@ -57,15 +56,7 @@ def render_html(report: Report) -> str:
     if failures:
         body += [el("h2", "Failures", id="failures"), *failures]
     body += [el("h2", "Coverage", id="coverage"), _coverage(parts), _checks(report)]
-    head = el(
-        "head",
-        el("meta", charset="utf-8"),
-        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        el("title", f"{verdict.value}: {report.title}"),
-        el("style", style()),
-    )
-    page = el("html", head, el("body", el("main", body)), lang="en")
-    return f"<!doctype html>\n{page}\n"
+    return page(f"{report.verdict.value}: {report.title}", style(), body)
 
 
 def pill(verdict: Verdict, *, big: bool = False) -> Markup:

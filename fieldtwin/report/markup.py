@@ -59,3 +59,15 @@ def el(name: str, /, *children: Child, **attributes: object) -> Markup:
     if name in _SVG_EMPTY and not children:
         return Markup(f"<{head}/>")
     return Markup(f"<{head}>{join(children)}</{name}>")
+
+
+def page(title: str, style: Markup, body: Child) -> str:
+    """Return a whole HTML document with the style sheet `style`; the parts of `body` follow each other in its main element."""
+    head = el(
+        "head",
+        el("meta", charset="utf-8"),
+        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        el("title", title),
+        el("style", style),
+    )
+    return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"

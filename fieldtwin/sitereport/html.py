@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fieldtwin.report.file import put
-from fieldtwin.report.markup import Markup, el, join
+from fieldtwin.report.markup import Markup, el, join, page
 from fieldtwin.sitereport.document import Deviation, Device, Document, Piece, Source, Table, Weight
 from fieldtwin.sitereport.style import STYLE
 
@@ -42,14 +42,7 @@ def render_html(document: Document) -> str:
         _files(document),
         el("section", el("h2", "5 Signatures"), _signatures(document), cls="signatures"),
     ]
-    head = el(
-        "head",
-        el("meta", charset="utf-8"),
-        el("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        el("title", f"Site acceptance: {document.site}"),
-        el("style", Markup(STYLE)),
-    )
-    return f"<!doctype html>\n{el('html', head, el('body', el('main', body)), lang='en')}\n"
+    return page(f"Site acceptance: {document.site}", Markup(STYLE), body)
 
 
 def day(when: str) -> str:

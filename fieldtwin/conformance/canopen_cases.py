@@ -1,7 +1,9 @@
 """The rows of the CANopen catalogue that concern masters and can be judged from the bus. Clauses are CiA 301 v4.2 unless said.
 
-A case is REQUIRED only where a clause demands what it asks. What a master does about the loss or the restart of a node is the
-application's decision: such cases are ROBUST.
+A case is REQUIRED only where a clause demands what it asks. A client has to refuse a value that was transferred wrongly, but it
+may leave out the abort that tells the node (7.2.4: client and server "may" execute it): a case that asks for an abort is ROBUST.
+Only the end of a block upload has to be confirmed or aborted. What a master does about the loss or the restart of a node is the
+application's decision: such cases are ROBUST as well.
 """
 
 from __future__ import annotations
@@ -48,11 +50,11 @@ BLOCK: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block 
 DOWN: Callable[[CanopenCase], CanopenCase] = lambda case: case.on(wants="block download")  # noqa: E731
 
 CASES: tuple[CanopenCase, ...] = (
-    _case("CO-001", "toggle bit repeated in a segment", REQUIRED, "7.2.4", READ, plays.same_toggle, aborts_with(0x05030000),
+    _case("CO-001", "toggle bit repeated in a segment", ROBUST, "7.2.4", READ, plays.same_toggle, aborts_with(0x05030000),
           "repeats the toggle bit in the second segment", "abort with 05030000").on(strikes=1),
     _case("CO-002", "abort amid segments", REQUIRED, "7.2.4", READ, plays.aborts_amid, judges.rejects,
           "sends one segment of a value and then an abort", "not take part of a value; go on").on(strikes=1),
-    _case("CO-004", "unknown command specifier", REQUIRED, "7.2.4", READ, plays.unknown_command, aborts_with(0x05040001,
+    _case("CO-004", "unknown command specifier", ROBUST, "7.2.4", READ, plays.unknown_command, aborts_with(0x05040001,
           0x05040000), "answers with E0h", "abort with 05040001, or with 05040000 once it has waited").on(strikes=1),
     _case("CO-005", "a reply for another object", REQUIRED, "7.2.4; canopen-stack #132", READ, plays.other_object, judges.rejects,
           "answers for another index", "never take it for the one that was asked for"),
@@ -73,9 +75,9 @@ CASES: tuple[CanopenCase, ...] = (
           takes_the_switch,
           "answers a block upload by an expedited one", "take it, where its request allows the switch (pst above 0)"
           ).on(holds_good=True)),
-    DOWN(_case("CO-014a", "block size 0", REQUIRED, "7.2.4; CN PR #42", READ, plays.block_size(0), aborts_with(0x05040002),
+    DOWN(_case("CO-014a", "block size 0", ROBUST, "7.2.4; CN PR #42", READ, plays.block_size(0), aborts_with(0x05040002),
           "allows no segment of a block download", "abort with 05040002").on(strikes=1)),
-    DOWN(_case("CO-014b", "block size 128", REQUIRED, "7.2.4; CN PR #42", READ, plays.block_size(128), aborts_with(0x05040002),
+    DOWN(_case("CO-014b", "block size 128", ROBUST, "7.2.4; CN PR #42", READ, plays.block_size(128), aborts_with(0x05040002),
           "allows 128 segments of a block download at once", "abort with 05040002").on(strikes=1)),
     DOWN(_case("CO-018", "early acknowledge of a sub-block", FIELD, "CN #426", READ, plays.honest, completes,
           "acknowledges a sub-block after its second segment", "send the rest, renumbered from 1").on(strikes=1, early=2)),

@@ -42,6 +42,10 @@ class Expected:
     pdu_bytes: int
 
 
+_READS = (1, 2, 3, 4, 23)
+"""Functions whose reply begins with its byte count."""
+
+
 class Splitter(ABC):
     """One direction. `feed` gives what is complete, `flush` what will never be."""
 
@@ -118,6 +122,8 @@ class RtuSplitter(Splitter):
         if head[0] > _LAST_UNIT:
             return 0, ""
         size = self._expected_size(head, expected)
+        if own := _by_its_byte_count(head, size, expected):
+            return own, ""
         if size > len(head):
             return (0, "") if settled else (-1, "")
         if size > 0:
@@ -144,6 +150,20 @@ class RtuSplitter(Splitter):
         if head[1] == expected.function | 0x80:
             return 5
         return expected.pdu_bytes + 3 if head[1] == expected.function and expected.pdu_bytes else 0
+
+
+def _by_its_byte_count(head: bytearray, size: int, expected: Expected | None) -> int:
+    """The size of a reply to a read whose byte count is not the one that was asked for, and whose check sum is right; else 0."""
+    if (
+        expected is None
+        or expected.function not in _READS
+        or size < MIN_FRAME
+        or len(head) < 3
+        or head[1] != expected.function
+    ):
+        return 0
+    own = head[2] + 5
+    return own if own != size and own <= min(len(head), MAX_FRAME) and crc16(head[:own]) == 0 else 0
 
 
 class AsciiSplitter(Splitter):

@@ -13,8 +13,10 @@ from collections.abc import Iterator
 
 import pytest
 
+from emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.decoding.modbus_wire import ModbusWire
 from fieldtwin.testing.handles import Device
 from fieldtwin.testing.runner import Runner
 from gateway.core.canframe import CanFrame
@@ -81,6 +83,29 @@ def test_a_question_that_nothing_can_match_is_refused(device: Device, like: dict
 def test_bounds_that_no_number_meets_are_refused(device: Device) -> None:
     with pytest.raises(TypeError, match="at least 3 and at most 2 can never be met"):
         device.wire.expect(at_least=3, at_most=2, within_s=0.0)
+
+
+def _answers(*replies: str) -> list[tuple[str, str]]:
+    """Problem and reply of each exchange where one RTU request for two registers is answered by `replies`, in hex."""
+    wire = ModbusWire("line1", "rtu", {})
+    wire.feed(True, with_crc(bytes((1,)) + READ), 0)
+    done = [e for n, reply in enumerate(replies) for e in wire.feed(False, bytes.fromhex(reply), n)[1]]
+    return [(e.problem, e.reply_text) for e in [*done, *wire.pending()]]
+
+
+def test_an_rtu_reply_with_another_byte_count_and_a_right_check_sum_is_malformed_at_once() -> None:
+    """pymodbus took the short reply, and the log said that none came; of the long one it said that its check sum is wrong."""
+    short = with_crc(bytes.fromhex("010402 4366")).hex()
+    long = with_crc(bytes.fromhex("010406 436680000000")).hex()
+    assert _answers(short) == _answers(short[:4], short[4:]) == [("malformed", "4 bytes that answer something else")]
+    assert _answers(long) == [("malformed", "8 bytes that answer something else")]
+
+
+def test_a_whole_reply_and_a_part_of_one_are_what_they_were() -> None:
+    good = with_crc(bytes.fromhex("010404 43668000")).hex()
+    assert [problem for problem, _ in _answers(good)] == [""]
+    assert [problem for problem, _ in _answers(good[:14])] == ["pending"]
+    assert [problem for problem, _ in _answers(good[:-2] + "00")] == ["check sum"]
 
 
 REQUEST = CanFrame(0x605, bytes.fromhex("4000100000000000"))

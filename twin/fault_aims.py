@@ -5,7 +5,6 @@ Pure: what makes no sense is found before anything runs. The physical twin knows
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ from emulators.faults.fault import Aim, Kind
 from emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
 from emulators.faults.value_ranges import check_fault
 from emulators.faults.wrong_aim import WrongAim
+from gateway.core.nearest import did_you_mean
 from gateway.core.profile import Tag
 from twin.system import System
 
@@ -69,8 +69,7 @@ def known(what: str, name: str, names: Iterable[str], key: str = "") -> None:
     """Raises `WrongAim` for a name that is none of `names`, with the nearest."""
     names = list(names)
     if name not in names:
-        near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(name, names)
         raise WrongAim(key, f"no {what} {name!r}", expected=", ".join(names), hint=hint)
 
 

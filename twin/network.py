@@ -6,13 +6,13 @@ wanted (a scenario, a report) `Network.whole` is one: every name with its system
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from emulators.wires.acoustic import AcousticMedium, Spoils, Water
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 from gateway.core.profile import DeviceProfile
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.data_files import find, search_path
@@ -71,7 +71,7 @@ class Network:
             raise UsageError(
                 f"no system of the network in {name!r}",
                 expected=", ".join(self.members),
-                hint=_near(member, self.members),
+                hint=did_you_mean(member, self.members),
             )
         return member, local
 
@@ -143,7 +143,9 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
     try:
         system = load_system(str(find("systems", said.system, beside=path, extra=profiles)), profiles)
     except UsageError as e:
-        near = _near(said.system, [p.name for folder in (path.parent, *search_path(profiles)) for p in _files(folder)])
+        near = did_you_mean(
+            said.system, [p.name for folder in (path.parent, *search_path(profiles)) for p in _files(folder)]
+        )
         raise file.error((*loc, "system"), e.message, expected=e.expected, hint=near or e.hint) from e
     other = path.parent / said.prototype if said.prototype is not None else None
     if other is not None and not other.is_file():
@@ -155,7 +157,7 @@ def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: 
             (*loc, "modem"),
             f"{said.modem!r} is no modem of {system.name}",
             expected=", ".join(modems) or "a device with `model: mailbox` in its prototype file",
-            hint=_near(said.modem, modems),
+            hint=did_you_mean(said.modem, modems),
         )
     return Member(name, system, prototype, said.modem, tuple(said.at_m))
 
@@ -201,8 +203,3 @@ def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> Non
                 expected="one of its own",
             )
         seen[address] = name
-
-
-def _near(word: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else ""

@@ -6,13 +6,13 @@ overlap, buses that are none, ranges that make no sense. Nothing is opened here.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from gateway.connections.tls_listen import check_files
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 from gateway.core.profile import Tag
 from gateway.core.yaml_file import Key, YamlFile
 from gateway.devices.config import BusConfig, DeviceConfig
@@ -134,13 +134,13 @@ def _tag(
     device = devices.get(device_name)
     if device is None:
         raise file.error(
-            loc, f"no device {device_name!r}", expected=", ".join(devices), hint=_near(device_name, devices)
+            loc, f"no device {device_name!r}", expected=", ".join(devices), hint=did_you_mean(device_name, devices)
         )
     tag = device.profile.tags.get(local)
     if tag is None:
         known = device.profile.tags
         raise file.error(
-            loc, f"{device_name!r} has no tag {local!r}", expected=", ".join(known), hint=_near(local, known)
+            loc, f"{device_name!r} has no tag {local!r}", expected=", ".join(known), hint=did_you_mean(local, known)
         )
     return device, tag
 
@@ -218,7 +218,9 @@ def _bridge(file: YamlFile, name: str, form: BridgeForm, buses: Mapping[str, Bus
 def _modbus_bus(file: YamlFile, loc: tuple[Key, ...], name: str, buses: Mapping[str, BusConfig]) -> None:
     known = [b.name for b in buses.values() if not b.endpoint.is_can]
     if name not in known:
-        raise file.error(loc, f"no Modbus bus {name!r}", expected=", ".join(known) or "none", hint=_near(name, known))
+        raise file.error(
+            loc, f"no Modbus bus {name!r}", expected=", ".join(known) or "none", hint=did_you_mean(name, known)
+        )
 
 
 def _route(file: YamlFile, loc: tuple[Key, ...], unit: int, text: str, buses: Mapping[str, BusConfig]) -> Route:
@@ -298,8 +300,3 @@ def _endpoint(file: YamlFile, loc: tuple[Key, ...], url: str, schemes: tuple[str
     except UsageError as e:
         raise file.error((*loc, "url"), e.message, expected=e.expected, got=e.got) from e
     return endpoint
-
-
-def _near(word: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else ""

@@ -6,7 +6,6 @@ devices on one address, tags that no profile has, programs bound to nothing. Not
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -14,6 +13,7 @@ from pathlib import Path
 
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 from gateway.core.profile import DeviceProfile, Tag, load_profile
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
@@ -115,7 +115,7 @@ def _device(
     loc: tuple[Key, ...] = ("devices", name)
     if d.bus not in buses:
         raise file.error(
-            (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=_near(d.bus, buses)
+            (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=did_you_mean(d.bus, buses)
         )
     try:
         found = find("devices", d.profile, beside=path, extra=profiles)
@@ -158,7 +158,10 @@ def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: D
     for group in d.poll:
         if group not in groups:
             raise file.error(
-                (*loc, "poll", group), f"no poll group {group!r}", expected=", ".join(groups), hint=_near(group, groups)
+                (*loc, "poll", group),
+                f"no poll group {group!r}",
+                expected=", ".join(groups),
+                hint=did_you_mean(group, groups),
             )
     for tag in d.expect:
         _known(file, (*loc, "expect", tag), profile, tag)
@@ -188,7 +191,7 @@ def _safe_outputs(
                 f"the safe value of {tag!r}",
                 expected=" or ".join(["true or false" if described.is_bit else "a number", *names]),
                 got=str(given).lower() if isinstance(given, bool) else repr(given),
-                hint=_near(value, names) if isinstance(value, str) else "",
+                hint=did_you_mean(value, names) if isinstance(value, str) else "",
             )
         limits = described.limits
         if limits and not limits[0] <= value <= limits[1]:
@@ -202,7 +205,10 @@ def _safe_outputs(
 def _known(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, tag: str) -> Tag:
     if tag not in profile.tags:
         raise file.error(
-            loc, f"{profile.name} has no tag {tag!r}", expected=", ".join(profile.tags), hint=_near(tag, profile.tags)
+            loc,
+            f"{profile.name} has no tag {tag!r}",
+            expected=", ".join(profile.tags),
+            hint=did_you_mean(tag, profile.tags),
         )
     return profile.tags[tag]
 
@@ -271,7 +277,7 @@ def _check_write_groups(system: System) -> None:
                         at,
                         f"{tag!r} is no output of a program, so it cannot be in a group",
                         expected=", ".join(outputs) or "outputs of programs; this device has none",
-                        hint=_near(tag, outputs),
+                        hint=did_you_mean(tag, outputs),
                     )
                 if tag in seen:
                     raise system.file.error(at, f"{tag!r} is in the group {seen[tag]!r} already")
@@ -282,7 +288,7 @@ def _split(system: System, loc: tuple[Key, ...], tag: str) -> tuple[DeviceConfig
     device, _, local = tag.partition(".")
     if device not in system.devices:
         raise system.file.error(
-            loc, f"no device {device!r}", expected=", ".join(system.devices), hint=_near(device, system.devices)
+            loc, f"no device {device!r}", expected=", ".join(system.devices), hint=did_you_mean(device, system.devices)
         )
     return system.devices[device], local
 
@@ -293,10 +299,5 @@ def _in(file: YamlFile, loc: tuple[Key, ...], device: DeviceConfig, local: str, 
             loc,
             f"{device.name!r} has no {local!r} for this use",
             expected=", ".join(names) or "none",
-            hint=_near(local, names),
+            hint=did_you_mean(local, names),
         )
-
-
-def _near(word: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}?" if near else ""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from importlib import import_module
 
 from emulators.faults.fault import Fault
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 
 _FILES = """
 drop delay jitter duplicate reorder split pause coalesce corrupt_bits corrupt_crc corrupt_length wrong_unit wrong_function
@@ -35,7 +35,6 @@ def fault_class(name: str) -> type[Fault]:
     """Raises `UsageError` that names the nearest."""
     found = FAULTS.get(name)
     if found is None:
-        near = difflib.get_close_matches(name, FAULTS, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else "`fieldtwin faults` lists them"
+        hint = did_you_mean(name, FAULTS, otherwise="`fieldtwin faults` lists them")
         raise UsageError(f"no fault {name!r}", expected=", ".join(FAULTS), hint=hint)
     return found

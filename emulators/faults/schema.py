@@ -7,7 +7,6 @@ faults:
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from emulators.faults.fault import Aim, Fault, Kind
 from emulators.faults.registry import fault_class
 from emulators.faults.wrong_aim import WrongAim
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.nearest import did_you_mean
 from gateway.core.yaml_file import Key, YamlFile, expected_value, load
 
 _AIM_KEYS = tuple(info.alias or name for name, info in Aim.model_fields.items())
@@ -90,8 +90,7 @@ def parse_fault(
     known = ("id", "name", *aims_of(kind), *own)
     for key in said:
         if key not in known:
-            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(str(key), known)
             raise wrong(str(key), f"unknown key {key!r} in fault {name}", expected=", ".join(known), hint=hint)
     try:
         aim = Aim.model_validate({k: v for k, v in said.items() if k in _AIM_KEYS})
@@ -101,8 +100,7 @@ def parse_fault(
         first = e.errors()[0]
         key = str(first["loc"][0]) if first["loc"] else ""
         words = re.findall(r"'([^']+)'", str(first.get("ctx", {}).get("expected", "")))
-        near = difflib.get_close_matches(str(first["input"]), words, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(str(first["input"]), words)
         expected = expected_value(first)
         what = key if expected else f"{key}: {first['msg']}"
         raise wrong(key, what, expected=expected, got=repr(first["input"])[:60], hint=hint) from e

@@ -8,13 +8,13 @@ zero, the root of a negative number) is NaN, which is "no value".
 from __future__ import annotations
 
 import ast
-import difflib
 import math
 import operator
 from collections.abc import Callable, Collection, Mapping
 from random import Random
 
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 
 Values = Mapping[str, float]
 Compute = Callable[[Values], float]
@@ -171,7 +171,7 @@ class Formula:
             raise UsageError(
                 f"nothing is called {name!r}",
                 expected=", ".join([TIME, STEP, *self._known]),
-                hint=_near(name, [TIME, STEP, *self._known, *CONSTANTS]),
+                hint=did_you_mean(name, [TIME, STEP, *self._known, *CONSTANTS]),
             )
         self.names.append(name)
         return operator.itemgetter(name)
@@ -189,7 +189,7 @@ class Formula:
             count, plain = PLAIN[name]
             _count(name, count, args)
             return lambda values: plain(*(arg(values) for arg in args))
-        raise UsageError(f"no function {name!r}", expected=", ".join(FUNCTIONS), hint=_near(name, FUNCTIONS))
+        raise UsageError(f"no function {name!r}", expected=", ".join(FUNCTIONS), hint=did_you_mean(name, FUNCTIONS))
 
 
 def _constant(number: float) -> Compute:
@@ -216,8 +216,3 @@ def _all_or_any(every: bool, parts: list[Compute]) -> Compute:
 def _count(name: str, count: int, args: list[Compute]) -> None:
     if len(args) != count:
         raise UsageError(f"{name}() in a formula", expected=f"{count} argument(s)", got=str(len(args)))
-
-
-def _near(name: str, known: Collection[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean {near[0]!r}?" if near else ""

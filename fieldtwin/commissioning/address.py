@@ -6,12 +6,12 @@ only and decodes them with the gateway's codec.
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 from gateway.core.profile import INTEGER_RANGES, REGISTERS_OF, DeviceProfile, RegisterRange, Tag, resolve_address
 from gateway.protocols.canopen.datatypes import DataType
 from gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
@@ -107,12 +107,11 @@ def _tags(
         entry = dictionary.find(item)
         return [tag_of_entry(entry)]
     names = list(profile.tags) if profile is not None else []
-    near = difflib.get_close_matches(item, names, n=1)
     raw = "holding:100 or 40101" if protocol == "modbus" else "6041h:00"
     raise UsageError(
         f"nothing is called {item!r}",
         expected=f"{'a tag of the profile, or ' if names else ''}an address such as {raw}",
-        hint=f"did you mean {near[0]!r}?" if near else "",
+        hint=did_you_mean(item, names),
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from random import Random
@@ -14,6 +13,7 @@ from emulators.faults.schema import parse_fault
 from emulators.faults.value_ranges import numbers
 from gateway.core.endpoint import Endpoint
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 from twin.fault_aims import target
 from twin.network import WATER, Network
 from twin.system import System
@@ -57,8 +57,7 @@ class RandomFaults:
         for aim in self.aims:
             if aim in known or (network is not None and aim == WATER):
                 continue
-            near = difflib.get_close_matches(aim, known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(aim, known)
             raise UsageError(
                 f"no device, bus or tag {aim!r} to aim random faults at",
                 expected="DEVICE, BUS or DEVICE.TAG",

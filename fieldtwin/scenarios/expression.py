@@ -7,7 +7,6 @@ programs' variables; numbers may have a unit of time and are then seconds.
 from __future__ import annotations
 
 import ast
-import difflib
 import operator
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -16,6 +15,7 @@ from math import isnan
 from typing import Any
 
 from gateway.core.errors import UsageError
+from gateway.core.nearest import did_you_mean
 from gateway.core.values import Quality, Reason
 
 FUNCTIONS = ("quality", "age", "value", "updates", "reason")
@@ -167,8 +167,7 @@ class Expression:
     def _check_call(self, node: ast.Call) -> None:
         name = self._name(node.func)
         if name not in FUNCTIONS or len(node.args) != 1 or node.keywords:
-            near = difflib.get_close_matches(name, FUNCTIONS, n=1)
-            hint = f"did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(name, FUNCTIONS)
             raise NotUnderstood(
                 f"no function {name!r}", self._at(node), expected=", ".join(f"{f}(TAG)" for f in FUNCTIONS), hint=hint
             )
@@ -185,12 +184,11 @@ class Expression:
             value = asked.func.id == "value" and isinstance(asked.args[0], ast.Name | ast.Attribute)
             words = self._words.get(self._name(asked.args[0]), ()) if value else WORDS.get(asked.func.id, ())
         if words and text.value not in words:
-            near = difflib.get_close_matches(text.value, words, n=1, cutoff=0.5)
             raise NotUnderstood(
                 f"{ast.unparse(asked)} is never {text.value!r}",
                 self._at(text),
                 expected=", ".join(words),
-                hint=f"did you mean {near[0]!r}?" if near else "",
+                hint=did_you_mean(text.value, words),
             )
 
     def _name(self, node: ast.expr) -> str:
@@ -204,8 +202,7 @@ class Expression:
             self.asks_lateness |= name == "plc.late"
             return
         if name not in self._known:
-            near = difflib.get_close_matches(name, self._known, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else ""
+            hint = did_you_mean(name, self._known)
             expected = "DEVICE.TAG or PROGRAM.VARIABLE"
             raise NotUnderstood(f"no tag or variable {name!r}", self._at(node), expected=expected, hint=hint)
         self.names.append(self._prefix + name)

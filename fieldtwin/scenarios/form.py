@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from fieldtwin.scenarios.invariants import Invariants, load_invariants
 from fieldtwin.scenarios.probe_form import Probe, read_probe
 from fieldtwin.scenarios.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
 from gateway.core.errors import FileInvalid, UsageError
+from gateway.core.nearest import did_you_mean
 from gateway.core.yaml_file import Key, YamlFile, load, validate
 from twin.data_files import network_file
 from twin.fault_aims import target
@@ -195,8 +195,7 @@ def _system(file: YamlFile, form: ScenarioForm, profiles: tuple[Path, ...]) -> t
         raise file.error(("system",), e.message, expected=e.expected, got=e.got, hint=e.hint) from e
     if form.prototype is not None and not (folder / form.prototype).is_file():
         there = [one.name for one in sorted(folder.glob("*.yaml"))]
-        near = difflib.get_close_matches(form.prototype, there, n=1)
-        hint = f"did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(form.prototype, there)
         raise file.error(("prototype",), f"no file {form.prototype!r} beside it", hint=hint)
     return system, None
 
@@ -407,6 +406,5 @@ def _time(file: YamlFile, loc: tuple[Key, ...], text: Time) -> float:
 def _known(file: YamlFile, loc: tuple[Key, ...], what: str, name: str, known: Sequence[str]) -> None:
     if name in known:
         return
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]!r}?" if near else ""
+    hint = did_you_mean(name, known)
     raise file.error(loc, f"no {what} {name!r}", expected=", ".join(known) if len(known) < 30 else "", hint=hint)

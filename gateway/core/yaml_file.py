@@ -10,7 +10,6 @@ column of every key and value are kept, so that a validation error can name them
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Iterable
@@ -24,6 +23,7 @@ from pydantic_core import ErrorDetails
 
 from gateway.core.errors import FileInvalid
 from gateway.core.input_file import read_input
+from gateway.core.nearest import did_you_mean
 
 MAX_BYTES = 8 * 1024 * 1024
 """A configuration file larger than this is a mistake (a recording given as a system file, say)."""
@@ -250,9 +250,8 @@ def _translate_one(file: YamlFile, model: type[BaseModel], error: ErrorDetails) 
     name = ".".join(str(part) for part in loc)
     if error["type"] == "extra_forbidden":
         known = _known_keys(model, error["loc"][:-1])
-        near = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.5)
         expected = "one of " + ", ".join(sorted(known))
-        hint = f"did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(str(loc[-1]), known)
         return file.error(loc, f"unknown key {str(loc[-1])!r}{_inside(loc)}", expected=expected, hint=hint)
     if error["type"] == "missing":
         missing = str(error["loc"][-1])
@@ -262,8 +261,7 @@ def _translate_one(file: YamlFile, model: type[BaseModel], error: ErrorDetails) 
     got = "" if error["type"] == "value_error" else repr(error["input"])[:80]
     if error["type"] == "literal_error":
         known = re.findall(r"'([^']*)'", str(error["ctx"]["expected"]))
-        near = difflib.get_close_matches(str(error["input"]), known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(str(error["input"]), known)
         return file.error(loc, name, expected=" or ".join(known), got=got, hint=hint)
     return file.error(loc, f"{name}: {error['msg'].removeprefix('Value error, ')}", got=got)
 

@@ -8,7 +8,6 @@ talks to a node.
 from __future__ import annotations
 
 import configparser
-import difflib
 import io
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -20,6 +19,7 @@ from canopen.objectdictionary.eds import import_eds
 
 from gateway.core.errors import FileInvalid, UsageError
 from gateway.core.input_file import read_input
+from gateway.core.nearest import did_you_mean
 from gateway.core.values import Scalar
 from gateway.protocols.canopen.cob_id import check_node
 from gateway.protocols.canopen.datatypes import DataType
@@ -98,8 +98,7 @@ class ObjectDictionary:
         if found:
             several = ", ".join(entry.name for entry in found[:4])
             raise UsageError(f"{name!r} names several objects", got=several).at(self.path or "the EDS")
-        near = difflib.get_close_matches(name, [entry.name for entry in self], n=1)
-        hint = f"did you mean {near[0]!r}?" if near else ""
+        hint = did_you_mean(name, [entry.name for entry in self])
         raise UsageError(f"no object is called {name!r}", hint=hint).at(self.path or "the EDS")
 
 

@@ -6,6 +6,7 @@ worth more than one. It must never know live values (`emulators.canopen.node_dat
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -341,7 +342,10 @@ def _limit(section: Section, key: str, data_type: int) -> int | float | None:
     if not text or not codec.is_number(data_type) or _NODE_ID.search(text):
         return None
     try:
-        return codec.decode(data_type, codec.encode_text(data_type, text))
+        limit = codec.decode(data_type, codec.encode_text(data_type, text))
+        if math.isnan(limit):
+            raise ValueError("no value is above or below it")
+        return limit
     except ValueError:
         section.note(f"{key} of [{section.name}] is no number of its type, left out: {text[:40]}", key)
         return None

@@ -50,6 +50,7 @@ UNREADABLE = {
     "a time that is no number": one(0xC, "DefaultValue=noon"),
     "a ParameterValue that is no number": one(7, "ParameterValue=none"),
     "a limit that is no number": one(7, "LowLimit=none", "HighLimit=5"),
+    "a limit that is not a number": one(8, "LowLimit=0", "HighLimit=NaN"),
     "a limit too large for its type": one(5, "HighLimit=300"),
     "limits the wrong way round": one(7, "LowLimit=3", "HighLimit=1"),
     "a real type's limits the wrong way round": one(8, "LowLimit=3.5", "HighLimit=1.5"),

@@ -6,6 +6,7 @@ written by their bits, and it does not report a value that it cannot read. Pure;
 
 from __future__ import annotations
 
+import math
 import re
 import struct
 
@@ -61,6 +62,8 @@ def read_limit(data_type: int, text: str) -> int | float | None:
         return _held(_whole(text), 1, signed=False)
     value = read_value(data_type, text)
     assert isinstance(value, int | float)
+    if math.isnan(value):
+        raise ValueError("no value is above or below it")
     return value
 
 

@@ -450,6 +450,7 @@ def _exchange_text(row: dict[str, Any]) -> str:
     if "emulators" in row:
         text += f"; emulators {row['emulators']['requests']} / {row['emulators']['replies']}"
         text += f", with those of {row['shared']}" if "shared" in row else ""
+        text += f", and {row['others']['requests']} requests of other clients" if "others" in row else ""
     if row["timeouts"] or row["crc_errors"]:
         text += f"; {row['timeouts']} timeouts, {row['crc_errors']} CRC errors"
     return text

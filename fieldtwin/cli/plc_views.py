@@ -121,7 +121,7 @@ def _width() -> int:
 
 
 def _print_table(table: Table) -> None:
-    console = data if data.is_terminal else Console(file=data.file, width=IN_A_PIPE, highlight=False)
+    console = data if data.is_terminal else Console(file=data.file, width=IN_A_PIPE, highlight=False, emoji=False)
     console.print(table)
 
 

@@ -15,8 +15,9 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-talk = _Console(stderr=True, highlight=False)
-data = _Console(highlight=False)
+# emoji=False: `model.py:Boom:` in a text is a user's class, and no picture of an explosion.
+talk = _Console(stderr=True, highlight=False, emoji=False)
+data = _Console(highlight=False, emoji=False)
 
 
 def show_warnings(warnings: Iterable[str]) -> None:

@@ -10,11 +10,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
+from rich.console import Console
 from support import eventually, run
 from test_gateway_canopen_bus import rig
 
 from fieldtwin.cli.run_command import command as run_system
+from fieldtwin.cli.talk import data, talk
 from gateway.core.recording import looks_like_another_file
 from gateway.devices.config import Heartbeat
 
@@ -51,3 +54,11 @@ def test_a_dump_is_not_taken_for_the_recording_of_the_profile_beside_it(tmp_path
     recording.write_text('{"fieldtwin_recording": 1, "device": "x", "kind": "exchanges", "source": "measured"}\n')
     assert looks_like_another_file(dump)
     assert not looks_like_another_file(recording)
+
+
+@pytest.mark.parametrize("console", [talk, data])
+def test_a_name_between_colons_stays_a_name(console: Console) -> None:
+    """Observed: `boom.py💥 step() failed` for the class `Boom` of a model."""
+    with console.capture() as seen:
+        console.print("boom.py:Boom: step() failed", soft_wrap=True)
+    assert seen.get() == "boom.py:Boom: step() failed\n"

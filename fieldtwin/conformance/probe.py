@@ -31,6 +31,7 @@ MAX_FORMS = 1_000
 """Forms of lines that a probe remembers."""
 SHOWN_CHARACTERS = 80
 PERIOD_S = 0.05
+"""How often a `tcp://` probe reads; docs/conformance.md names it, because a value that lasts for less may be missed."""
 TIMEOUT_S = 2.0
 
 

@@ -131,7 +131,8 @@ def encode_text(data_type: int, text: str) -> bytes:
     if not text.strip():
         return bytes(size)
     if data_type in _TIME_BYTES:
-        return _hex_bytes(text) if len(text.strip()) == 2 * size else _fit(parse_number(text), size)
+        octets = len(text.strip()) == 2 * size and not text.strip().lower().startswith("0x")
+        return _hex_bytes(text) if octets else _fit(parse_number(text), size)
     if data_type in _REAL and not text.strip().lower().startswith("0x"):
         return encode(data_type, float(text))
     if data_type in _REAL:  # a hexadecimal number is the bit pattern

@@ -193,6 +193,7 @@ TEXTS = st.one_of(
 @given(KINDS, TEXTS, TEXTS, TEXTS, TEXTS, st.sampled_from(["7", "2"]))
 @example(0xF, "@ABCD", "", "", "", "7")
 @example(0xC, "0", "", "", "", "7")
+@example(0xC, "", "0x1000000000", "", "", "7")  # a number, as long as six octets
 def test_both_readers_agree_on_any_value(
     kind: int, default: str, parameter: str, low: str, high: str, object_type: str
 ) -> None:

@@ -31,7 +31,7 @@ def read_value(data_type: int, text: str, node_id: int | None = None) -> Scalar 
     if data_type in _TEXTS:
         return text.encode("latin-1", "replace").decode("ascii", "backslashreplace") if data_type == 9 else text
     size = size_of(data_type)
-    if size is None or (data_type in _TIMES and len(text) == 2 * size):
+    if size is None or (data_type in _TIMES and len(text) == 2 * size and text[:2].lower() != "0x"):
         return _octets(text)
     if data_type in _TIMES:
         return _whole(text).to_bytes(size, "little")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NoReturn
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+
+from gateway.core.visible import visible
 
 
 class _Console(Console):
@@ -13,6 +16,12 @@ class _Console(Console):
         """rich ends the program with exit code 1. Who reads with `head` has what it wanted: see `LazyGroup.invoke`."""
         self.quiet = True
         raise BrokenPipeError
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """As rich does, but control characters in a text are shown and never sent: a name in a stranger's file could otherwise
+        clear the screen or retitle the terminal."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control is not None else Segment(visible(segment.text), segment.style)
 
 
 # emoji=False: `model.py:Boom:` in a text is a user's class, and no picture of an explosion.

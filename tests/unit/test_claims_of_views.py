@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
+from rich.table import Table
 from support import eventually, run
 from test_gateway_canopen_bus import rig
 
@@ -62,3 +63,17 @@ def test_a_name_between_colons_stays_a_name(console: Console) -> None:
     with console.capture() as seen:
         console.print("boom.py:Boom: step() failed", soft_wrap=True)
     assert seen.get() == "boom.py:Boom: step() failed\n"
+
+
+@pytest.mark.parametrize("console", [talk, data])
+def test_control_characters_of_a_name_are_shown_and_not_sent(console: Console) -> None:
+    """Observed: the name of a scenario with ESC [31m made the rest of the terminal red."""
+    table = Table("name")
+    table.add_row("\x1b[31mred\x07")
+    with console.capture() as seen:
+        console.print("\x1b]0;title\x07 and so on", markup=False)
+        console.print(table)
+        console.print("two\nlines")
+    assert "\x1b" not in seen.get()
+    assert "\x07" not in seen.get()
+    assert "two\nlines\n" in seen.get()

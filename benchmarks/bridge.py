@@ -30,8 +30,8 @@ from statistics import median
 
 from peers import HERE, Goals, cpu_s, free_port, python, ratio, row
 
-from gateway.core.endpoint import SerialSettings
-from gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
 BAUD, GOAL = 115_200, 0.9
 PEER_SILENCE_US = 1000 + round(2e7 / BAUD)

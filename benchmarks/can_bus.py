@@ -33,8 +33,8 @@ PEER_FRAMES = 10_000
 
 
 async def serve_bus() -> None:
-    from emulators.endpoints.bus_server import SoftBusServer
-    from gateway.core.endpoint import Endpoint
+    from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+    from fieldtwin.gateway.core.endpoint import Endpoint
 
     server = await SoftBusServer.open(Endpoint.parse("can:fieldtwin/127.0.0.1:0"), 1_000_000, paced=False)
     print("ready", flush=True)
@@ -53,7 +53,7 @@ class _HubClient(asyncio.Protocol):
         self.inbound = b""
 
     def data_received(self, data: bytes) -> None:
-        from emulators.endpoints.bus_hello import Hello
+        from fieldtwin.emulators.endpoints.bus_hello import Hello
 
         data = self.inbound + data
         if not self.welcome and len(data) >= 24:
@@ -83,9 +83,9 @@ async def serve_hub() -> None:
 
 async def device(port: int) -> None:
     """The other program: counts the stream and tells when it was whole, echoes what it is asked."""
-    from emulators.endpoints.can_end import open_can_end
-    from gateway.core.canframe import CanFrame
-    from gateway.core.endpoint import Endpoint
+    from fieldtwin.emulators.endpoints.can_end import open_can_end
+    from fieldtwin.gateway.core.canframe import CanFrame
+    from fieldtwin.gateway.core.endpoint import Endpoint
 
     end = await open_can_end(Endpoint.parse(f"can:fieldtwin/127.0.0.1:{port}"), 0)
     print("ready", flush=True)
@@ -107,9 +107,9 @@ async def device(port: int) -> None:
 
 async def measure(port: int, frames: int, trips: int) -> tuple[float, float, float, int]:
     """Frames/s to the other process, median and 99th percentile of a round trip in us, and frames lost or out of order."""
-    from gateway.connections.soft_bus import SoftBusConnection
-    from gateway.core.canframe import CanFrame
-    from gateway.core.endpoint import Endpoint
+    from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
+    from fieldtwin.gateway.core.canframe import CanFrame
+    from fieldtwin.gateway.core.endpoint import Endpoint
 
     loop = asyncio.get_running_loop()
     end = await SoftBusConnection.open(Endpoint.parse(f"can:fieldtwin/127.0.0.1:{port}"), 0)

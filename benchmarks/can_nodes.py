@@ -60,14 +60,14 @@ def report(times_s: dict[int, list[float]], nodes: int, seconds: float, cpu_s: f
 
 async def ours(nodes: int, seconds: float) -> None:
     """Every node with its recording and model on the paced bus; a watcher counts what really went over it."""
-    from emulators.canopen.serve import serve_node
-    from emulators.endpoints.bus_runner import BusRunner
-    from emulators.models.emulated_node import emulated_node
-    from emulators.signals import SignalPlayer, SignalTrack
-    from gateway.core.canframe import CanFrame
-    from gateway.core.endpoint import Endpoint
-    from gateway.core.profile import load_profile
-    from gateway.wallclock import WallClock
+    from fieldtwin.emulators.canopen.serve import serve_node
+    from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+    from fieldtwin.emulators.models.emulated_node import emulated_node
+    from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+    from fieldtwin.gateway.core.canframe import CanFrame
+    from fieldtwin.gateway.core.endpoint import Endpoint
+    from fieldtwin.gateway.core.profile import load_profile
+    from fieldtwin.gateway.wallclock import WallClock
 
     clock, here = WallClock(), Endpoint.parse("can:fieldtwin/127.0.0.1:1")
     bus = BusRunner(BITRATE, max_nodes=nodes + 1)

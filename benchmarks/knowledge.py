@@ -23,10 +23,10 @@ from statistics import median
 
 from peers import Goals, ratio
 
-from gateway.store.event import Event
-from gateway.store.sqlite_knowledge import SqliteKnowledge
-from gateway.wallclock import WallClock
-from twin.knowledge import BATCH, KnowledgeWriter, known_at
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.knowledge import BATCH, KnowledgeWriter, known_at
 
 WRITES_PER_S = 50_000
 REPLAY_S = 2.0

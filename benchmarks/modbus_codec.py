@@ -28,14 +28,14 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from pymodbus.transport import NULLMODEM_HOST
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.protocols.modbus.mbap import MbapFramer
-from gateway.protocols.modbus.requests import ReadRegisters
-from gateway.protocols.modbus.rtu import RtuFramer
-from gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer
+from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 VALUES = [(i * 257) & 0xFFFF for i in range(125)]
 TIMEOUT_NS = 1_000_000_000

@@ -27,14 +27,14 @@ from typing import Any
 import msgspec
 from peers import HERE, Goals, cpu_s, peak_mb, python, ratio, rss_mb, start, stop
 
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.running.children import Child
-from gateway.core.control import ControlClient
-from gateway.core.endpoint import Endpoint
-from twin.controller import ControllerConfig
-from twin.field_process import FieldConfig
-from twin.mapping import mapped_endpoint, mapping_to_json
-from twin.physical import image_layout, make_image
-from twin.system import System, load_system
+from fieldtwin.twin.controller import ControllerConfig
+from fieldtwin.twin.field_process import FieldConfig
+from fieldtwin.twin.mapping import mapped_endpoint, mapping_to_json
+from fieldtwin.twin.physical import image_layout, make_image
+from fieldtwin.twin.system import System, load_system
 
 PROFILE, RECORDING, UNIT, REGISTERS, RECORDED = "meter.yaml", "meter.jsonl", 1, 20, 100
 METER = f"""
@@ -57,7 +57,7 @@ RECOVER_S = 3.0
 HALF_PERIOD_S = PERIOD_S / 2
 """The window is so much longer than whole periods: a poll that is less than that late still falls into it."""
 PROGRAM = '''
-from plc.program import Program
+from fieldtwin.plc.program import Program
 
 class Idle(Program):
     """A gateway has a PLC; this one commands nothing."""
@@ -106,7 +106,7 @@ async def emulators_up(folder: Path, system: Path) -> tuple[Child, ControlClient
     config = folder / "field.json"
     config.write_bytes(msgspec.json.encode(FieldConfig(str(system), str(folder))))
     began = time.perf_counter()
-    child = Child("field", "twin.field_process", config, folder)
+    child = Child("field", "fieldtwin.twin.field_process", config, folder)
     client = await child.connect()
     return child, client, Up(time.perf_counter() - began, rss_mb(child.pid))
 
@@ -162,7 +162,7 @@ async def poll(devices: int, seconds: float, goals: Goals) -> None:
             }
             config = ControllerConfig(str(path), str(folder), False, mapping_to_json(mapping))
             (folder / "gateway.json").write_bytes(msgspec.json.encode(config))
-            gateway = Child("gateway", "twin.controller", folder / "gateway.json", folder)
+            gateway = Child("gateway", "fieldtwin.twin.controller", folder / "gateway.json", folder)
             try:
                 await watch(field, field_client, gateway, system, seconds, goals)
             finally:

@@ -23,8 +23,8 @@ from statistics import median
 
 from peers import Goals
 
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 from fieldtwin.recording.from_packets import PacketImport
-from gateway.protocols.modbus.crc import with_crc
 
 PACKETS_PER_S = 50_000
 SERVERS = 4

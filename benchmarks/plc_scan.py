@@ -20,14 +20,14 @@ from typing import Any
 
 from peers import Goals
 
-from gateway.core.image import INPUTS, TagKind, TagSpec
-from gateway.core.values import Quality, TagValue
-from plc.binding import BoundProgram, InputBinding, image_for
-from plc.blocks import CTU, MS, TON
-from plc.program import Program, ScanInfo, var_input, var_output
-from plc.scan import Scan
-from twin.physical import image_layout, programs_of
-from twin.system import load_system
+from fieldtwin.gateway.core.image import INPUTS, TagKind, TagSpec
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.blocks import CTU, MS, TON
+from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
+from fieldtwin.plc.scan import Scan
+from fieldtwin.twin.physical import image_layout, programs_of
+from fieldtwin.twin.system import load_system
 
 GOAL_OBSERVATORY_US = 25.0
 GOAL_BLOCKS_US = 1000.0

@@ -22,8 +22,8 @@ from statistics import median
 
 from peers import Goals, ratio
 
-from emulators.replay.replay import ExchangeReplay
-from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
 
 WRITES_PER_S = 100_000
 LOAD_S = 3.0

@@ -21,22 +21,22 @@ from statistics import median
 
 from peers import Goals, python, ratio
 
-from emulators.wires.serial_line import SerialPacer
 from fieldtwin.commissioning.scan_modbus import ModbusScanner, ScanOptions
-from gateway.core.endpoint import SerialSettings
-from gateway.wallclock import run as run_precise
+from fieldtwin.emulators.wires.serial_line import SerialPacer
+from fieldtwin.gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.wallclock import run as run_precise
 
 LINE, LATENCY_S, PRESENT, GOAL = SerialSettings(9600, "8N1"), 0.005, (3, 100, 247), 1.1
 DEVICE = f"""
 import asyncio, sys
 from pathlib import Path
-from emulators.endpoints.pty import PtyEnd
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_rtu
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.wallclock import WallClock, run
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import serve_rtu
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.wallclock import WallClock, run
 
 async def main():
     end = await PtyEnd.open(Path(sys.argv[1]), Endpoint.parse("pty:x"), SerialSettings(9600, "8N1"))

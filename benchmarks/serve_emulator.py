@@ -5,13 +5,13 @@ from __future__ import annotations
 import asyncio
 import sys
 
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.endpoint import Endpoint
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.wallclock import WallClock
 
 
 async def main(port: int) -> None:

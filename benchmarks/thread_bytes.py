@@ -20,8 +20,8 @@ import sys
 
 from peers import Goals
 
-from gateway.store.event import Event
-from twin.thread_frames import Data, FrameCodec, Hello, Schema
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.thread_frames import Data, FrameCodec, Hello, Schema
 
 MTU = 64
 LINK_BYTES_PER_S, OVERHEAD = 80, 8

@@ -21,8 +21,8 @@ from statistics import median
 
 from peers import Goals
 
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 
 ROOT = Path(__file__).resolve().parents[1]

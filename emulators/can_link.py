@@ -11,15 +11,15 @@ import asyncio
 from collections.abc import Coroutine, Sequence
 from typing import Any
 
-from emulators.faults.can_engine import struck
-from emulators.faults.can_fault import CanFault, CanPiece
-from emulators.faults.engine import WireFaults, in_time
-from emulators.faults.fault import Active
-from emulators.faults.frames import Way
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CanConnection
-from gateway.core.errors import FieldtwinError, WireError
+from fieldtwin.emulators.faults.can_engine import struck
+from fieldtwin.emulators.faults.can_fault import CanFault, CanPiece
+from fieldtwin.emulators.faults.engine import WireFaults, in_time
+from fieldtwin.emulators.faults.fault import Active
+from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.errors import FieldtwinError, WireError
 
 MOST_WAITING = 10_000
 """Frames that wait for their time; what is more is lost and counted."""

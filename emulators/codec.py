@@ -20,7 +20,7 @@ import math
 import struct
 from collections.abc import Sequence
 
-from gateway.core.errors import Bug
+from fieldtwin.gateway.core.errors import Bug
 
 NUMBERS = {
     "int16": ("h", 1),

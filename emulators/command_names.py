@@ -5,8 +5,8 @@ The names are those of the command list (SPEC ruling 12). Pure; decodes for itse
 
 from __future__ import annotations
 
-from emulators.replay.requests import CellRequest, parse_request
-from gateway.core.profile import DeviceProfile, RegisterRange
+from fieldtwin.emulators.replay.requests import CellRequest, parse_request
+from fieldtwin.gateway.core.profile import DeviceProfile, RegisterRange
 
 
 class CommandNames:

@@ -1,7 +1,7 @@
 """The paper's virtual context: a collection of recordings from which an emulator answers (SPEC row Emulator).
 
 Ordered, time-stamped, duplicates kept, bounded (rulings 2 and 3): of what was recorded for a command, the oldest is
-returned first and removed. Pure; it knows neither protocols nor files. `emulators.replay` stands on it and makes a
+returned first and removed. Pure; it knows neither protocols nor files. `fieldtwin.emulators.replay` stands on it and makes a
 command of each register that a request asks for.
 """
 
@@ -13,8 +13,8 @@ from enum import Enum
 
 import msgspec
 
-from gateway.core.errors import Bug, FileInvalid, UnknownCommand, UsageError
-from gateway.core.values import COMMAND, RECORDING
+from fieldtwin.gateway.core.errors import Bug, FileInvalid, UnknownCommand, UsageError
+from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 MAX_ENTRIES = 500_000
 """Recordings that a context keeps: about 100 MB at most."""

@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from emulators.distortion import Distortions
-from emulators.journal import HeldJournal
-from emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
-from emulators.stated import Peek, bytes_of, cells_of, merged, raw_of, touches
-from gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.modbus.bank import BIT_TABLES, RegisterBank, Table
+from fieldtwin.emulators.stated import Peek, bytes_of, cells_of, merged, raw_of, touches
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
 
 
 class DistortedRegisters(RegisterBank):

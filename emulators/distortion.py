@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from emulators.faults.engine import in_time
-from emulators.faults.fault import Active, ValueFault
-from gateway.core.clock import NS_PER_S
+from fieldtwin.emulators.faults.engine import in_time
+from fieldtwin.emulators.faults.fault import Active, ValueFault
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 
 @dataclass

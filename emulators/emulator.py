@@ -1,9 +1,9 @@
 """The paper's emulators: devices that answer from their virtual context instead of the world.
 
 An emulator is a Device and no Sensor: the real one is a black box, of which only the conversation is known. Between the frames
-of a line (emulators.modbus.rtu, mbap) and what a unit does with a request (emulators.modbus.unit, emulators.replay), here is
-the device that the paper speaks of: it reads a command from its own end of a wire, requires it to be in its list,
-answers from its context and sends the response. It never knows its driver.
+of a line (fieldtwin.emulators.modbus.rtu, mbap) and what a unit does with a request (fieldtwin.emulators.modbus.unit,
+fieldtwin.emulators.replay), here is the device that the paper speaks of: it reads a command from its own end of a wire, requires
+it to be in its list, answers from its context and sends the response. It never knows its driver.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from collections.abc import Callable, Sized
 from dataclasses import dataclass
 from functools import lru_cache
 
-from emulators.command_names import CommandNames
-from emulators.modbus.bank import RegisterBank
-from emulators.modbus.unit import ModbusUnit, UnitLimits, UnitParts
-from gateway.core.connection import PROTOCOL, Connection
-from gateway.core.device import Communication, Device, End, wire
-from gateway.core.errors import UnknownCommand
-from gateway.core.profile import DeviceProfile
-from gateway.core.values import COMMAND, RECORDING
+from fieldtwin.emulators.command_names import CommandNames
+from fieldtwin.emulators.modbus.bank import RegisterBank
+from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits, UnitParts
+from fieldtwin.gateway.core.connection import PROTOCOL, Connection
+from fieldtwin.gateway.core.device import Communication, Device, End, wire
+from fieldtwin.gateway.core.errors import UnknownCommand
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 Answer = Callable[[bytes, int], bytes | None]
 """``(request, now_ns) -> response``, None for silence: what a unit does with a request PDU."""
@@ -30,8 +30,8 @@ Answer = Callable[[bytes, int], bytes | None]
 class Emulator(Device, ABC):
     """SPEC row Emulator. `virtual_context` is a collection of recordings, empty where a simulation stands for it.
 
-    Recorded responses are returned in order and removed (`emulators.context.VirtualContext`); recorded signals are read at the
-    emulator's clock and stay (SPEC ruling 3).
+    Recorded responses are returned in order and removed (`fieldtwin.emulators.context.VirtualContext`); recorded signals are
+    read at the emulator's clock and stay (SPEC ruling 3).
     """
 
     def __init__(self, connection: End[bytes], profile: DeviceProfile, virtual_context: Sized) -> None:
@@ -115,5 +115,6 @@ class EmulatedUnit(ModbusUnit):
 class EmulatedCommunication(Communication):
     """SPEC row EmulatedCommunication: the same agreement, with an emulator in the device's place.
 
-    What lies between the two is an EmulatedConnection (`emulators.link`), which belongs to neither and is asked for nothing here.
+    What lies between the two is an EmulatedConnection (`fieldtwin.emulators.link`), which belongs to neither and is asked for
+    nothing here.
     """

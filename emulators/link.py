@@ -17,13 +17,13 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from emulators.endpoints.faulty import FaultyEnd
-from emulators.endpoints.link_ends import TcpDoor, TcpEnd, TtyEnd
-from emulators.endpoints.pty import PtyEnd
-from emulators.faults.engine import WireFaults
-from gateway.core.connection import PROTOCOL, ByteConnection, TCPConnection
-from gateway.core.endpoint import SOCKET_SCHEMES, Endpoint
-from gateway.core.errors import Bug, FieldtwinError, Unreachable, UsageError
+from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.link_ends import TcpDoor, TcpEnd, TtyEnd
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection, TCPConnection
+from fieldtwin.gateway.core.endpoint import SOCKET_SCHEMES, Endpoint
+from fieldtwin.gateway.core.errors import Bug, FieldtwinError, Unreachable, UsageError
 
 CARRIERS = ("tcp", "rtu+tcp")
 

@@ -10,21 +10,21 @@ import math
 from collections.abc import Mapping
 from pathlib import Path
 
-from emulators.codec import encode
-from emulators.context import WhenUsedUp
-from emulators.distortion import Distortions
-from emulators.emulator import emulator_kind
-from emulators.journal import HeldJournal
-from emulators.replay.counters import CounterSpan
-from emulators.replay.profiled import ProfiledReplay
-from emulators.replay.replay import ExchangeReplay
-from emulators.replay.requests import parse_request
-from emulators.stated import bytes_of, cells_of, merged, raw_of
-from gateway.core.connection import Connection
-from gateway.core.device import wire
-from gateway.core.errors import FileInvalid, UnknownCommand
-from gateway.core.profile import DeviceProfile, Tag
-from gateway.core.recording import RecordingReader
+from fieldtwin.emulators.codec import encode
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.emulator import emulator_kind
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.replay.counters import CounterSpan
+from fieldtwin.emulators.replay.profiled import ProfiledReplay
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.replay.requests import parse_request
+from fieldtwin.emulators.stated import bytes_of, cells_of, merged, raw_of
+from fieldtwin.gateway.core.connection import Connection
+from fieldtwin.gateway.core.device import wire
+from fieldtwin.gateway.core.errors import FileInvalid, UnknownCommand
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.recording import RecordingReader
 
 MOST_COUNTED = 4
 """Registers that a counter may have."""

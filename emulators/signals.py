@@ -14,10 +14,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
-from emulators.context import UsedUp, WhenUsedUp
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.recording import RecordingReader, SignalRow
+from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.recording import RecordingReader, SignalRow
 
 MAX_NUMBERS = 16_000_000
 """Times and values of one track: 128 MB, or 46 hours of three signals at 24 Hz. More is refused, not swapped."""

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 
-from emulators.codec import decode, encode
-from emulators.modbus.bank import BIT_TABLES, Access, Span, Table
-from emulators.modbus.fifo import MOST_READ, FifoQueues
-from emulators.modbus.file_records import FileRecords
-from emulators.modbus.identification import Identification
-from emulators.modbus.unit import UnitParts
-from gateway.core.profile import DeviceProfile, Effect, Tag
+from fieldtwin.emulators.codec import decode, encode
+from fieldtwin.emulators.modbus.bank import BIT_TABLES, Access, Span, Table
+from fieldtwin.emulators.modbus.fifo import MOST_READ, FifoQueues
+from fieldtwin.emulators.modbus.file_records import FileRecords
+from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.unit import UnitParts
+from fieldtwin.gateway.core.profile import DeviceProfile, Effect, Tag
 
 Peek = Callable[[Table, int], int]
 """Returns the value of one cell without the effects of a read."""

@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any
 from fieldtwin.__about__ import __version__
 
 if TYPE_CHECKING:
+    from fieldtwin.gateway.core.errors import FieldtwinError as FieldtwinError
+    from fieldtwin.gateway.core.profile import load_profile as load_profile
     from fieldtwin.running.node_scan import scan_can_bus as scan_can_bus
     from fieldtwin.running.options import RunOptions as RunOptions
     from fieldtwin.running.session import RunSession as RunSession
     from fieldtwin.running.summary import summarise as summarise
-    from gateway.core.errors import FieldtwinError as FieldtwinError
-    from gateway.core.profile import load_profile as load_profile
-    from twin.prototype_file import load_prototype as load_prototype
-    from twin.system import load_system as load_system
+    from fieldtwin.twin.prototype_file import load_prototype as load_prototype
+    from fieldtwin.twin.system import load_system as load_system
 
 _PUBLIC = {
-    "FieldtwinError": "gateway.core.errors",
+    "FieldtwinError": "fieldtwin.gateway.core.errors",
     "RunOptions": "fieldtwin.running.options",
     "RunSession": "fieldtwin.running.session",
-    "load_profile": "gateway.core.profile",
-    "load_prototype": "twin.prototype_file",
-    "load_system": "twin.system",
+    "load_profile": "fieldtwin.gateway.core.profile",
+    "load_prototype": "fieldtwin.twin.prototype_file",
+    "load_system": "fieldtwin.twin.system",
     "scan_can_bus": "fieldtwin.running.node_scan",
     "summarise": "fieldtwin.running.summary",
 }

@@ -12,7 +12,7 @@ import time
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-from gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 T = TypeVar("T")
 
@@ -21,7 +21,7 @@ LEAD_NS, LEAD_SHARE = 60_000, 20
 
 
 class WallClock:
-    """`gateway.core.clock.Clock` on the host's clocks.
+    """`fieldtwin.gateway.core.clock.Clock` on the host's clocks.
 
     `monotonic_ns` is CLOCK_MONOTONIC, which every process of a host shares: time stamps in the process image can be
     compared across processes.

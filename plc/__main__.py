@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from gateway.core.errors import FieldtwinError
-from plc.config import PlcConfig
-from plc.process import plc_main
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.plc.config import PlcConfig
+from fieldtwin.plc.process import plc_main
 
 
 def main() -> int:

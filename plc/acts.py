@@ -10,7 +10,7 @@ import json
 import os
 from typing import Any
 
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.errors import Unreachable
 
 
 class Acts:

@@ -14,13 +14,13 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gateway.core.errors import FieldtwinError, FileInvalid
-from gateway.core.image import ImageLayout, TagKind, TagSpec, process_image
-from gateway.core.values import Scalar
-from plc.program import Program, Role, Variable
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.image import ImageLayout, TagKind, TagSpec, process_image
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.plc.program import Program, Role, Variable
 
 if TYPE_CHECKING:
-    from plc.st.program import StProgram
+    from fieldtwin.plc.st.program import StProgram
 
 _SOURCES = "python: module:Class, or FILE.st, or FILE.xml, each with :PROGRAM behind it where it has several"
 _ST_SUFFIXES = (".st", ".xml")
@@ -96,7 +96,7 @@ def _python_class(source: str, rest: str, python_path: Sequence[str]) -> type[Pr
         raise FileInvalid(f"program {source!r} cannot be imported: {type(e).__name__}: {e}") from e
     if not (isinstance(found, type) and issubclass(found, Program)):
         raise FileInvalid(
-            "not a program", expected=f"a class {class_name} derived from plc.program.Program", got=source
+            "not a program", expected=f"a class {class_name} derived from fieldtwin.plc.program.Program", got=source
         )
     return found
 
@@ -105,7 +105,7 @@ def _text_class(source: str, folders: Sequence[str]) -> type[StProgram]:
     name, _, program = source.strip().partition(":")
     if not name.lower().endswith(_ST_SUFFIXES):
         raise FileInvalid("not the source of a program", expected=_SOURCES, got=source)
-    from plc.st.program import load_file  # the compiler is only loaded where there is something to compile
+    from fieldtwin.plc.st.program import load_file  # the compiler is only loaded where there is something to compile
 
     places = [Path(folder) / name for folder in folders if not Path(name).is_absolute()] + [Path(name)]
     return load_file(next((p for p in places if p.exists()), places[0]), program.strip())

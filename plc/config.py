@@ -11,16 +11,16 @@ from typing import Any
 
 import msgspec
 
-from gateway.core.errors import FileInvalid
-from gateway.core.image import ImageLayout
-from plc.binding import BoundProgram, InputBinding, load_program
-from plc.start import StartPolicy
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.image import ImageLayout
+from fieldtwin.plc.binding import BoundProgram, InputBinding, load_program
+from fieldtwin.plc.start import StartPolicy
 
 
 @dataclass(frozen=True, slots=True)
 class ProgramConfig:
-    """A program: its source (`plc.binding.load_program`), its bindings, variable to tag, its task (the first if empty), and
-    how long it waits for its inputs."""
+    """A program: its source (`fieldtwin.plc.binding.load_program`), its bindings, variable to tag, its task (the first if
+    empty), and how long it waits for its inputs."""
 
     name: str
     source: str
@@ -30,7 +30,7 @@ class ProgramConfig:
     start: StartPolicy = field(default_factory=StartPolicy)
 
     def bind(self, python_path: tuple[str, ...] = (), together: dict[Any, Any] | None = None) -> BoundProgram:
-        """Make the program (`plc.binding.load_program`). Raises `FileInvalid`."""
+        """Make the program (`fieldtwin.plc.binding.load_program`). Raises `FileInvalid`."""
         return BoundProgram(self.name, load_program(self.source, python_path, together), self.inputs, self.outputs)
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from html import escape
 from math import atan2, cos, hypot, pi, sin
 
-from plc.states import StateTable
+from fieldtwin.plc.states import StateTable
 
 _CHAR = 7.2
 """Width of a character of the 12 px monospace face, in px."""

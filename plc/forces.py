@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import isfinite
 
-from gateway.core.errors import EndpointBusy, UsageError
-from gateway.core.image import TagKind, TagSpec
-from gateway.core.values import Scalar
+from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
+from fieldtwin.gateway.core.image import TagKind, TagSpec
+from fieldtwin.gateway.core.values import Scalar
 
 MAX_FORCES = 256
 

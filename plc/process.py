@@ -1,6 +1,6 @@
 """The PLC process: an image file, programs, their tasks on the wall clock, and a control channel.
 
-Control verbs (gateway.core.control, on the configured Unix socket):
+Control verbs (fieldtwin.gateway.core.control, on the configured Unix socket):
 
     ready     {"ready": true, "state": ...}: the image is attached and the tasks were started
     get       everything a display shows: state, error, statistics, forces; unless {"brief": true}, every tag's value and what is
@@ -33,16 +33,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from gateway.core.control import ControlServer
-from gateway.core.errors import FileInvalid, Unreachable, UsageError
-from gateway.core.image import Image
-from plc.acts import Acts
-from plc.config import PlcConfig
-from plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
-from plc.runner import Runner
-from plc.sources import changed
-from plc.tag_view import TagView
-from plc.task import StopReason
+from fieldtwin.gateway.core.control import ControlServer
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.core.image import Image
+from fieldtwin.plc.acts import Acts
+from fieldtwin.plc.config import PlcConfig
+from fieldtwin.plc.realtime import RealtimeReport, StuckAlarm, monotonic_ns, prepare, run_task, utc_ns
+from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.sources import changed
+from fieldtwin.plc.tag_view import TagView
+from fieldtwin.plc.task import StopReason
 
 MAX_STEPS = 10_000
 

@@ -25,9 +25,9 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from gateway.core.errors import Blame, Bug, FieldtwinError
-from gateway.core.image import Message, TagKind
-from gateway.core.values import Scalar, TagValue
+from fieldtwin.gateway.core.errors import Blame, Bug, FieldtwinError
+from fieldtwin.gateway.core.image import Message, TagKind
+from fieldtwin.gateway.core.values import Scalar, TagValue
 
 MESSAGE_BYTES = 256
 MESSAGE_DEPTH = 16

@@ -20,13 +20,13 @@ from itertools import product
 from random import Random
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import UsageError
-from gateway.core.image import Message, TagKind
-from gateway.core.values import Quality, Reason, TagValue
-from plc.blocks import FunctionBlock
-from plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
-from plc.states import StateMachine
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.image import Message, TagKind
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.plc.blocks import FunctionBlock
+from fieldtwin.plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
+from fieldtwin.plc.states import StateMachine
 
 MAX_STATES = 200_000
 WALKS, WALK_SCANS = 64, 64

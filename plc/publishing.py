@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.core.errors import FileInvalid
-from gateway.core.image import (
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.image import (
     INPUTS,
     OUTPUTS,
     Image,
@@ -26,10 +26,10 @@ from gateway.core.image import (
     consumed_name,
     taken_name,
 )
-from gateway.core.values import Quality, Reason, Scalar
-from plc.binding import BoundProgram
-from plc.forces import Forces
-from plc.program import Outbox, Place, ProgramFailed, Variable
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar
+from fieldtwin.plc.binding import BoundProgram
+from fieldtwin.plc.forces import Forces
+from fieldtwin.plc.program import Outbox, Place, ProgramFailed, Variable
 
 Seen = Callable[[], dict[str, Scalar | None]]
 """A program's inputs as it read them, by variable."""

@@ -36,9 +36,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from plc.program import ScanStuck
-from plc.task import Driven
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.plc.program import ScanStuck
+from fieldtwin.plc.task import Driven
 
 GUARD_NS = 2 * NS_PER_MS
 POLL_NS = 10 * NS_PER_MS

@@ -16,13 +16,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
-from gateway.core.errors import Bug, Desync
-from gateway.core.events import Consumer, Producer
-from gateway.core.image import Message, TagKind
-from gateway.core.statemachine import STATE_CODES, EventStateMachine, encode_period
-from gateway.core.values import COMMAND, DATA, RESPONSE, Scalar
-from plc.program import Outbox, Program, ScanInfo, message_input, message_output, var_local, var_output
-from plc.states import ANY, StateTable, Transition
+from fieldtwin.gateway.core.errors import Bug, Desync
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.image import Message, TagKind
+from fieldtwin.gateway.core.statemachine import STATE_CODES, EventStateMachine, encode_period
+from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE, Scalar
+from fieldtwin.plc.program import Outbox, Program, ScanInfo, message_input, message_output, var_local, var_output
+from fieldtwin.plc.states import ANY, StateTable, Transition
 
 QUEUE_CAPACITY = 256
 LOG_CAPACITY = 1024
@@ -142,7 +142,7 @@ class Relay(Program):
         Transition(ANY, "OFF", when="command < 0"),
         states=tuple(STATE_CODES),
     )
-    """The machine as it is drawn; gateway.core.statemachine is what runs it."""
+    """The machine as it is drawn; fieldtwin.gateway.core.statemachine is what runs it."""
     command: tuple[Message, ...] = message_input()
     sample: tuple[Message, ...] = message_input()
     period_s: int = var_output(TagKind.INT, initial=0, unit="s")

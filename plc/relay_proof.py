@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 
-from gateway.core.statemachine import STATE_CODES, delta, encode_period
-from plc.program import ScanInfo
-from plc.prove import Proof
-from plc.relay import DataLog, Relay
+from fieldtwin.gateway.core.statemachine import STATE_CODES, delta, encode_period
+from fieldtwin.plc.program import ScanInfo
+from fieldtwin.plc.prove import Proof
+from fieldtwin.plc.relay import DataLog, Relay
 
 _DEPTH = 2
 _LOG_CAPACITY = 3

@@ -22,8 +22,8 @@ from typing import Any
 
 import msgspec
 
-from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
-from plc.binding import BoundProgram
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
+from fieldtwin.plc.binding import BoundProgram
 
 _MAGIC = b"FTRETN1\n"
 _HEAD = struct.Struct("<8sQ32s")

@@ -4,7 +4,7 @@ Tasks are cyclic (INTERVAL) or run once at each rising edge of a tag (SINGLE), a
 thread: a task is never interrupted; of those that are due the one with the smallest PRIORITY number goes first, and of equals
 the one that has waited longest. If one stops by itself all stop, with the outputs safe. After a stop by the watchdog or a
 scan that did not end, the programs are made anew and begin warm, at most `max_restarts` times in a row. A program runs only after
-its inputs have been good once (plc.start), also after a restart.
+its inputs have been good once (fieldtwin.plc.start), also after a restart.
 
 Driven like a `CyclicTask`: by `deadline_ns` and `run_once`, on the wall clock or in virtual time, and never knows which.
 """
@@ -16,20 +16,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
-from gateway.core.image import INPUTS, Image, TagSpec
-from gateway.core.values import Quality, Reason, Scalar, TagValue
-from plc.binding import BoundProgram
-from plc.config import PlcConfig, TaskSpec
-from plc.forces import Forces, checked
-from plc.program import Program
-from plc.publishing import Change, OutputImage
-from plc.retain import Retained
-from plc.scan import Scan
-from plc.sources import Source, sources
-from plc.start import InputsMissing, Starts
-from plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import Bug, FieldtwinError, FileInvalid, UsageError
+from fieldtwin.gateway.core.image import INPUTS, Image, TagSpec
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.plc.binding import BoundProgram
+from fieldtwin.plc.config import PlcConfig, TaskSpec
+from fieldtwin.plc.forces import Forces, checked
+from fieldtwin.plc.program import Program
+from fieldtwin.plc.publishing import Change, OutputImage
+from fieldtwin.plc.retain import Retained
+from fieldtwin.plc.scan import Scan
+from fieldtwin.plc.sources import Source, sources
+from fieldtwin.plc.start import InputsMissing, Starts
+from fieldtwin.plc.task import CyclicTask, Guard, StopReason, TaskConfig, TaskState
 
 RESTARTABLE = (StopReason.WATCHDOG, StopReason.STUCK)
 STEADY_NS = 60 * NS_PER_S

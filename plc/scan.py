@@ -8,8 +8,8 @@ GATEWAY_DEAD, whatever quality the image shows. Then, and for every input that i
 says what the program sees (`InputBinding.if_bad`). A forced input is SIMULATED, whatever the image shows. Messages are
 events, not states: they are handed over whole, in order, exactly once, whatever the quality of their tag.
 
-A program that has not started (plc.start) is not executed, and nothing of it is published. Messages wait as long as a program
-that takes messages has not started.
+A program that has not started (fieldtwin.plc.start) is not executed, and nothing of it is published. Messages wait as long as a
+program that takes messages has not started.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import FieldtwinError, FileInvalid
-from gateway.core.image import INPUTS, Image, Message, RegionReader, TagKind, TagSpec
-from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
-from plc.binding import BoundProgram, InputBinding, substitute
-from plc.program import (
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.image import INPUTS, Image, Message, RegionReader, TagKind, TagSpec
+from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
+from fieldtwin.plc.binding import BoundProgram, InputBinding, substitute
+from fieldtwin.plc.program import (
     InputTripped,
     Program,
     ProgramFailed,
@@ -34,8 +34,8 @@ from plc.program import (
     ScanTooLong,
     Variable,
 )
-from plc.publishing import OutputImage, find
-from plc.start import ProgramStart
+from fieldtwin.plc.publishing import OutputImage, find
+from fieldtwin.plc.start import ProgramStart
 
 _BAD = int(Quality.BAD)
 MAX_SHOWN, MAX_SHOWN_BYTES = 4, 24

@@ -13,7 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from plc.binding import BoundProgram
+from fieldtwin.plc.binding import BoundProgram
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,13 +17,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import Blame, FieldtwinError
-from gateway.core.image import INPUTS, Image, TagKind
-from gateway.core.values import Quality, Reason
-from plc.binding import BoundProgram
-from plc.forces import Forces
-from plc.program import Role
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import Blame, FieldtwinError
+from fieldtwin.gateway.core.image import INPUTS, Image, TagKind
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.plc.binding import BoundProgram
+from fieldtwin.plc.forces import Forces
+from fieldtwin.plc.program import Role
 
 TIMEOUT_MS = 10_000.0
 """How long a program waits for its inputs before its policy decides, in ms, where the configuration does not say."""

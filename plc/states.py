@@ -12,7 +12,7 @@
 
 Each scan takes at most one transition: the first in the table's order that starts in the present state, whose guard holds and
 whose time in the state has passed. `when` is an expression over the program's variables, `do` a method. Diagrams
-(plc.diagram) and proofs (plc.prove) read the same table. Pure: time is the scan's.
+(fieldtwin.plc.diagram) and proofs (fieldtwin.plc.prove) read the same table. Pure: time is the scan's.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from dataclasses import dataclass, field, replace
 from types import CodeType
 from typing import Any, ClassVar
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import Bug, UsageError
-from gateway.core.image import TagKind
-from gateway.core.values import Scalar
-from plc.program import Program, ScanInfo, var_local
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import Bug, UsageError
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.plc.program import Program, ScanInfo, var_local
 
 ANY = "*"
 """As a source: every state but the target."""

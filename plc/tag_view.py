@@ -11,11 +11,11 @@ from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from typing import Any
 
-from gateway.core.errors import UsageError
-from gateway.core.image import INPUTS, OUTPUTS, Image, TagSpec
-from gateway.core.values import Quality, TagValue
-from plc.forces import Force
-from plc.runner import Runner
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, Image, TagSpec
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.plc.forces import Force
+from fieldtwin.plc.runner import Runner
 
 MAX_AT_ONCE = 64
 """Tags in one answer: what is asked between two scans must not make the next one late. Some 1 ms with its encoding."""

@@ -4,7 +4,7 @@ Deadlines are start + k x cycle and never move. A task that is late runs once an
 still to come: missed periods are skipped and counted, never made up for in a burst.
 
     READY --start--> RUNNING --stop------------------------------> STOPPED (requested)
-                        | ---inputs missing, policy is stop------> STOPPED (not started; plc.start)
+                        | ---inputs missing, policy is stop------> STOPPED (not started; fieldtwin.plc.start)
                         | ---`stop_after` overruns in a row------> STOPPED (watchdog)
                         | ---a program raises--------------------> STOPPED (failed; `error` says where)
                         | ---a scan does not end-----------------> STOPPED (stuck; `error` says where)
@@ -12,7 +12,7 @@ still to come: missed periods are skipped and counted, never made up for in a bu
 
 On every way to STOPPED the outputs are published as stopped, which makes the gateway write their safe values. The task
 waits for nothing by itself: whoever drives it sleeps until `deadline_ns` and calls `run_once`. So the same object runs
-on the wall clock (plc.realtime) and in a loop under virtual time (`run_on_clock`). It must never know which.
+on the wall clock (fieldtwin.plc.realtime) and in a loop under virtual time (`run_on_clock`). It must never know which.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.errors import Bug, CheckFailed, FieldtwinError
-from plc.histogram import Histogram
-from plc.program import InputTripped, ProgramStuck, ScanStuck
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import Bug, CheckFailed, FieldtwinError
+from fieldtwin.plc.histogram import Histogram
+from fieldtwin.plc.program import InputTripped, ProgramStuck, ScanStuck
 
 
 class Executable(Protocol):
-    """What a task runs: plc.scan.Scan."""
+    """What a task runs: fieldtwin.plc.scan.Scan."""
 
     def execute(self, now_ns: int) -> None: ...
 
@@ -50,7 +50,7 @@ class Guard(Protocol):
 
 
 class Driven(Protocol):
-    """What is driven: plc.runner.Runner, CyclicTask."""
+    """What is driven: fieldtwin.plc.runner.Runner, CyclicTask."""
 
     @property
     def running(self) -> bool: ...

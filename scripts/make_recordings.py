@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parent.parent
 if str(ROOT) not in sys.path:  # run as a file, the checkout's packages are not on the path
     sys.path.insert(0, str(ROOT))
 
-from emulators.models import cast, tilt  # noqa: E402
-from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
+from fieldtwin.emulators.models import cast, tilt  # noqa: E402
+from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo  # noqa: E402
 
 DEFAULT_SEED = 1
 Rows = Iterable[tuple[float, Sequence[float]]]

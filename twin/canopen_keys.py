@@ -8,19 +8,19 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from gateway.core.errors import UsageError
-from gateway.core.profile import DeviceProfile
-from gateway.core.yaml_file import Key, YamlFile
-from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, RpdoConfig
-from gateway.devices.canopen_rpdo import BITS
-from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
-from gateway.protocols.canopen.concise_dcf import configuration_date, settings_of
-from gateway.protocols.canopen.configure import rpdos_of, tpdos_of
-from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
-from gateway.protocols.canopen.lss import LssAddress
-from gateway.protocols.canopen.pdo import PDO_BITS
-from twin.data_files import find
-from twin.system_schema import BusForm, DeviceForm, IdentityForm
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile
+from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, RpdoConfig
+from fieldtwin.gateway.devices.canopen_rpdo import BITS
+from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
+from fieldtwin.gateway.protocols.canopen.concise_dcf import configuration_date, settings_of
+from fieldtwin.gateway.protocols.canopen.configure import rpdos_of, tpdos_of
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.gateway.protocols.canopen.pdo import PDO_BITS
+from fieldtwin.twin.data_files import find
+from fieldtwin.twin.system_schema import BusForm, DeviceForm, IdentityForm
 
 CANOPEN_BUS_KEYS = ("sync", "time_ms", "short_sdo")
 CANOPEN_KEYS = ("identity", "dcf", "store", "lss", "tpdos", "rpdo1", "rpdos")

@@ -1,7 +1,7 @@
 """A process that belongs to another: it ends in order when the one that started it dies, however that dies.
 
-``python -m twin.child PARENT_PID LINGER_S MODULE [ARG...]`` runs ``python -m MODULE ARG...`` like this. What stands for the plant
-lingers: the gateway needs it for a moment more, to make its outputs safe.
+``python -m fieldtwin.twin.child PARENT_PID LINGER_S MODULE [ARG...]`` runs ``python -m MODULE ARG...`` like this. What stands
+for the plant lingers: the gateway needs it for a moment more, to make its outputs safe.
 """
 
 from __future__ import annotations
@@ -60,7 +60,8 @@ def allow_open_files() -> None:
 
 def command(module: str, *args: str, linger_s: float = 0.0) -> list[str]:
     """The command line that runs `module` as a child of this process."""
-    return [sys.executable, "-m", "twin.child", str(os.getpid()), str(linger_s), module, *args]
+    # -P: a module in the folder in which the user works, such as their own yaml.py, is none of ours.
+    return [sys.executable, "-P", "-m", "fieldtwin.twin.child", str(os.getpid()), str(linger_s), module, *args]
 
 
 def main(argv: list[str]) -> None:

@@ -1,18 +1,19 @@
 """The plant's own say over commands from its digital twin: its switch, its limits, its rate, from its own file.
 
 A plant does not rely on the twin that commands it. Every command is answered for: taken, or refused with the reason, and that is
-knowledge. What was taken once is never taken again: a thread tells each number once (`twin.thread_end`), and numbers only grow.
+knowledge. What was taken once is never taken again: a thread tells each number once (`fieldtwin.twin.thread_end`), and numbers
+only grow.
 
 Pure but for the clock that it is given.
 """
 
 from __future__ import annotations
 
-from gateway.core.clock import Clock
-from gateway.core.values import COMMAND
-from gateway.store.event import Event, Kind
-from twin.mape.execute import Bounds, CommandCheck
-from twin.thread_process import PTDigitalThreadProcess
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.twin.mape.execute import Bounds, CommandCheck
+from fieldtwin.twin.thread_process import PTDigitalThreadProcess
 
 OLD_MS = 10 * 60_000
 """A command that was under way for longer is not obeyed: what it was meant for is over. Neither is one from so far ahead: its age

@@ -1,4 +1,4 @@
-"""The gateway's process: ``python -m twin.controller CONFIG.json``. The same for a plant and for its prototype.
+"""The gateway's process: ``python -m fieldtwin.twin.controller CONFIG.json``. The same for a plant and for its prototype.
 
 The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
 mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, gate, command, reload,
@@ -18,26 +18,26 @@ from typing import Any
 
 import msgspec
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import Connector
-from gateway.core.control import ControlServer
-from gateway.core.errors import FieldtwinError, Unreachable, UsageError
-from gateway.core.nursery import Nursery
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.learnt import LearntFile, describe_learnt
-from gateway.runtime.reconfigure import reconfigure
-from gateway.runtime.status import describe
-from gateway.runtime.taken import TakenFile
-from gateway.store.exchange_log import ExchangeLog
-from gateway.wallclock import WallClock, run
-from twin.mapping import MappedConnector, mapping_from_json
-from twin.physical import EmbeddedControlSystem, attached, gateway_config
-from twin.refusal_places import RefusalPlaces
-from twin.reloading import compare, limits_changed
-from twin.system import System, load_system
-from twin.watching import TagWatch
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.control import ControlServer
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.learnt import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.reconfigure import reconfigure
+from fieldtwin.gateway.runtime.status import describe
+from fieldtwin.gateway.runtime.taken import TakenFile
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.twin.mapping import MappedConnector, mapping_from_json
+from fieldtwin.twin.physical import EmbeddedControlSystem, attached, gateway_config
+from fieldtwin.twin.refusal_places import RefusalPlaces
+from fieldtwin.twin.reloading import compare, limits_changed
+from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.watching import TagWatch
 
 FLUSH_EVERY_NS = NS_PER_S // 2
 LOOK_EVERY_NS = NS_PER_S // 20
@@ -85,7 +85,7 @@ class GatewayProcess:
             connector = MappedConnector(connector, mapping_from_json(self._config.mapping))
         tap = None
         if self._config.capture:
-            from gateway.connections.tap import TapFile, TappedConnector
+            from fieldtwin.gateway.connections.tap import TapFile, TappedConnector
 
             started = datetime.fromtimestamp(self._clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
             of_run = {"started": started, "system": system.name, "prototype": self._config.mapping is not None}
@@ -201,7 +201,7 @@ class GatewayProcess:
         return {"entries": entries, "published": tags.published, "dropped": tags.journal_dropped}
 
     async def _watch(self, args: dict[str, Any]) -> dict[str, Any]:
-        """Changes of tags since the last question, and some tags now (`twin.watching`)."""
+        """Changes of tags since the last question, and some tags now (`fieldtwin.twin.watching`)."""
         return self._watching.answer(args)
 
     async def _gate(self, args: dict[str, Any]) -> dict[str, Any]:

@@ -11,11 +11,11 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import read_input
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import read_input
 
 MAX_BYTES = 8 * 1024 * 1024
-_HERE = Path(__file__).resolve().parent.parent
+_HERE = Path(__file__).absolute().parents[2].resolve()  # not resolved at once: in a checkout fieldtwin/twin is a link
 """site-packages where a wheel is installed, the checkout otherwise."""
 
 
@@ -28,7 +28,7 @@ def data_root(base: Path = _HERE) -> Path:
 
 
 TEMPLATE = "template.json"
-"""The manifest at the top of a template's folder (`twin.template`)."""
+"""The manifest at the top of a template's folder (`fieldtwin.twin.template`)."""
 
 
 def template_of(file: Path | None) -> list[Path]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gateway.core.image import TagKind
-from twin.physical import plant_tags
-from twin.system import System
-from twin.variables import Limits, Variable
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.twin.physical import plant_tags
+from fieldtwin.twin.system import System
+from fieldtwin.twin.variables import Limits, Variable
 
 
 def declared_variables(system: System, limits: Mapping[str, Limits] | None = None) -> tuple[Variable, ...]:

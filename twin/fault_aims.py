@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from emulators.faults.fault import Aim, Kind
-from emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
-from emulators.faults.value_ranges import check_fault
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.nearest import did_you_mean
-from gateway.core.profile import Tag
-from twin.system import System
+from fieldtwin.emulators.faults.fault import Aim, Kind
+from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
+from fieldtwin.emulators.faults.value_ranges import check_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.twin.system import System
 
 
 @dataclass(frozen=True, slots=True)

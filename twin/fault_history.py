@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from emulators.faults.fault import Active
+from fieldtwin.emulators.faults.fault import Active
 
 MOST = 10_000
 """Faults that are remembered; the oldest are forgotten."""

@@ -11,44 +11,44 @@ from collections.abc import Awaitable, Callable, Mapping, Sized
 from pathlib import Path
 from typing import Any
 
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.remarks import Remark
-from emulators.canopen.serve import serve_node
-from emulators.context import WhenUsedUp
-from emulators.distorted_registers import DistortedRegisters
-from emulators.emulator import EmulatedUnit
-from emulators.endpoints.client_counts import ClientCounts, Difference
-from emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
-from emulators.journal import HeldJournal, share_of
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import RegisterBank
-from emulators.modbus.line import LineSlave
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
-from emulators.modbus.unit import ModbusUnit, UnitLimits
-from emulators.models.emulated_node import NodeOptions, emulated_node
-from emulators.models.mailbox_modem import MailboxModem, ModemPair
-from emulators.models.packet_link import ModemEnd, Untamed
-from emulators.models.register_device import StatedRegisters, add_own_functions
-from emulators.models.sampled_sensor import SampledSensor
-from emulators.models.simulated_registers import SimulatedRegisters
-from emulators.recorded_device import RecordedDevice, load_replay
-from emulators.replay.can_log import SUFFIX, CanLog
-from emulators.replay.replay import ExchangeReplay
-from emulators.signals import SignalPlayer, Signals, SignalTrack
-from emulators.stated import parts_of
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.profile import DeviceProfile
-from gateway.devices.config import DeviceConfig
-from twin.field_faults import FieldFaults
-from twin.prototype_file import EmulatedBus, EmulatedDevice, Prototype
-from twin.simulations import Simulations
-from twin.system import System
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.remarks import Remark
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.emulator import EmulatedUnit
+from fieldtwin.emulators.endpoints.client_counts import ClientCounts, Difference
+from fieldtwin.emulators.endpoints.ports import CanPort, Listening, OnClient, OsPorts, Ports
+from fieldtwin.emulators.journal import HeldJournal, share_of
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import RegisterBank
+from fieldtwin.emulators.modbus.line import LineSlave
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import Latency, as_recorded, serve_mbap, serve_rtu, serve_udp
+from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
+from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
+from fieldtwin.emulators.models.mailbox_modem import MailboxModem, ModemPair
+from fieldtwin.emulators.models.packet_link import ModemEnd, Untamed
+from fieldtwin.emulators.models.register_device import StatedRegisters, add_own_functions
+from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.models.simulated_registers import SimulatedRegisters
+from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
+from fieldtwin.emulators.replay.can_log import SUFFIX, CanLog
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.signals import SignalPlayer, Signals, SignalTrack
+from fieldtwin.emulators.stated import parts_of
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.twin.field_faults import FieldFaults
+from fieldtwin.twin.prototype_file import EmulatedBus, EmulatedDevice, Prototype
+from fieldtwin.twin.simulations import Simulations
+from fieldtwin.twin.system import System
 
 
 class FieldDevice:

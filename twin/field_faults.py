@@ -9,26 +9,26 @@ from collections.abc import Callable, Mapping
 from random import Random
 from typing import Any
 
-from emulators.distortion import Distortions
-from emulators.endpoints.faulty import FaultyEnd
-from emulators.endpoints.faulty_can import FaultyCan, bus_rule
-from emulators.endpoints.faulty_udp import FaultyDatagrams
-from emulators.endpoints.ports import Datagrams
-from emulators.faults.can_fault import BusFault
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active, Aim, ValueFault
-from emulators.faults.frames import Framing, Way
-from emulators.faults.schema import FaultSpec, parse_fault
-from emulators.faults.set_value import Form, SetValue
-from emulators.faults.value_ranges import check_value
-from emulators.wires.can_faults import Rule
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from twin.fault_aims import tag_of, target
-from twin.fault_history import FaultHistory
-from twin.system import System
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty_can import FaultyCan, bus_rule
+from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
+from fieldtwin.emulators.endpoints.ports import Datagrams
+from fieldtwin.emulators.faults.can_fault import BusFault
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active, Aim, ValueFault
+from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
+from fieldtwin.emulators.faults.set_value import Form, SetValue
+from fieldtwin.emulators.faults.value_ranges import check_value
+from fieldtwin.emulators.wires.can_faults import Rule
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.twin.fault_aims import tag_of, target
+from fieldtwin.twin.fault_history import FaultHistory
+from fieldtwin.twin.system import System
 
 MOST = 1_000
 

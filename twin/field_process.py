@@ -1,10 +1,11 @@
-"""The field side's process: ``python -m twin.field_process CONFIG.json``, or inside `fieldtwin emulate SYSTEM`.
+"""The field side's process: ``python -m fieldtwin.twin.field_process CONFIG.json``, or inside `fieldtwin emulate SYSTEM`.
 
 Control verbs: ready, get (listening endpoints, counters), held (what the devices really held), fault, clear, set, lease, fresh,
 stop. On a Unix socket in the run directory, and on TCP where asked for, so that a controller elsewhere learns where each plant
 endpoint's emulator listens.
 
-    lease     {"id": ..., "for_s": 10}: open the lease `id` on these devices (`twin.field_leases`); {"renew": true} prolongs it,
+    lease     {"id": ..., "for_s": 10}: open the lease `id` on these devices (`fieldtwin.twin.field_leases`); {"renew": true}
+    prolongs it,
               {"release": true} ends it. `fault` and `set` with "lease": ID are taken out when that lease ends
     fresh     {"lease": ID}: every device, recording and simulation from its beginning, on the same ports and without a fault
 """
@@ -24,18 +25,18 @@ from typing import Any
 
 import msgspec
 
-from emulators.endpoints.acoustic_end import AcousticEnd
-from gateway.core.clock import NS_PER_S
-from gateway.core.control import ControlServer
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, UsageError
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock, run
-from twin.field import FieldSide
-from twin.field_leases import LEASE_S, FieldLeases
-from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import Prototype, load_prototype
-from twin.system import System, load_system
+from fieldtwin.emulators.endpoints.acoustic_end import AcousticEnd
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.control import ControlServer
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.twin.field import FieldSide
+from fieldtwin.twin.field_leases import LEASE_S, FieldLeases
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.prototype_file import Prototype, load_prototype
+from fieldtwin.twin.system import System, load_system
 
 HELD_AT_ONCE = 5_000
 """A field side that stood for hours holds more than a line of the control channel takes."""

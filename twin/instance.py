@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TextIO
 
-from gateway.core.errors import EndpointBusy, Unreachable, UsageError
+from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, UsageError
 
 try:
     import fcntl

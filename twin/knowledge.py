@@ -13,9 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from operator import itemgetter
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.errors import Unreachable
-from gateway.store.event import Event, Kind, KnowledgeStore, StoreFull
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore, StoreFull
 
 QUEUE = 200_000
 """Four seconds of the fastest writing that we promise."""

@@ -5,9 +5,9 @@ Emulators are unknown here: this is a Connector around a Connector (DESIGN.md, "
 
 from __future__ import annotations
 
-from gateway.core.connection import ByteConnection, CanConnection, Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 
 class MappedConnector:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.yaml_file import Key, YamlFile
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.protocols.modbus.framings import framing_of, make_framer
-from twin.system_schema import BusForm, DeviceForm, SystemForm
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.protocols.modbus.framings import framing_of, make_framer
+from fieldtwin.twin.system_schema import BusForm, DeviceForm, SystemForm
 
 MODBUS_BUS_KEYS = ("spacing_ms", "turnaround_ms", "connect_pause_ms", "echo", "strict", "probe_percent")
 MODBUS_KEYS = ("spacing_ms",)

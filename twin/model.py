@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from gateway.core.statemachine import STATE, EventStateMachine
-from gateway.core.values import COMMAND
-from twin.variables import Variable, Variables
+from fieldtwin.gateway.core.statemachine import STATE, EventStateMachine
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.twin.variables import Variable, Variables
 
 
 class DigitalModel:
     """SPEC row DigitalModel. Init: STANDBY, period 0, nothing known of any variable. ProcessEvent is the state machine's.
 
-    `declared`: the system's variables (`twin.declared`). What is heard of them is `variables`; no command and no status changes
-    that, and none of them changes the state.
+    `declared`: the system's variables (`fieldtwin.twin.declared`). What is heard of them is `variables`; no command and no
+    status changes that, and none of them changes the state.
     """
 
     __slots__ = ("state_machine", "variables")

@@ -10,16 +10,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from emulators.wires.acoustic import AcousticMedium, Spoils, Water
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
-from gateway.core.profile import DeviceProfile
-from gateway.core.yaml_file import Key, YamlFile, load, validate
-from twin.data_files import find, search_path
-from twin.network_schema import NetworkForm, ShipForm
-from twin.prototype_file import Prototype, load_prototype
-from twin.system import System, load_system
-from twin.system_schema import InputForm, PlcForm, ProgramForm
+from fieldtwin.emulators.wires.acoustic import AcousticMedium, Spoils, Water
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.twin.data_files import find, search_path
+from fieldtwin.twin.network_schema import NetworkForm, ShipForm
+from fieldtwin.twin.prototype_file import Prototype, load_prototype
+from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.system_schema import InputForm, PlcForm, ProgramForm
 
 WATER = "water"
 """What faults call the water, as they call a bus."""

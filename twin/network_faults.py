@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from emulators.faults.schema import FaultSpec
-from twin.fault_aims import target
-from twin.network import WATER, Network
-from twin.water_faults import check_water_fault
+from fieldtwin.emulators.faults.schema import FaultSpec
+from fieldtwin.twin.fault_aims import target
+from fieldtwin.twin.network import WATER, Network
+from fieldtwin.twin.water_faults import check_water_fault
 
 
 def check_network_fault(network: Network, spec: FaultSpec) -> None:

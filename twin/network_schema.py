@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from twin.system_schema import Name, Strict
+from fieldtwin.twin.system_schema import Name, Strict
 
 Place = Annotated[list[float], Field(min_length=2, max_length=3)]
 

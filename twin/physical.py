@@ -13,26 +13,26 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from gateway.connections.listeners import TcpListener
-from gateway.core.clock import Clock
-from gateway.core.connection import Connector, Listen
-from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
-from gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
-from gateway.core.profile import Tag
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import DeviceConfig
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
-from gateway.runtime.tags import TagTable
-from gateway.runtime.taken import TakenFile
-from gateway.store.exchange_log import ExchangeLog
-from plc.binding import BoundProgram, InputBinding, image_for
-from plc.config import PlcConfig, ProgramConfig, TaskSpec
-from plc.program import Role
-from plc.start import StartPolicy
-from twin.system import System
-from twin.system_schema import StartForm
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector, Listen
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
+from fieldtwin.gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.runtime.taken import TakenFile
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.program import Role
+from fieldtwin.plc.start import StartPolicy
+from fieldtwin.twin.system import System
+from fieldtwin.twin.system_schema import StartForm
 
 MESSAGE_DEPTH = 16
 PLC_LOST_CYCLES = 50

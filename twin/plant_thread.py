@@ -1,9 +1,9 @@
-"""The plant's side of a digital thread as a process: ``python -m twin.plant_thread CONFIG.json``.
+"""The plant's side of a digital thread as a process: ``python -m fieldtwin.twin.plant_thread CONFIG.json``.
 
 It looks at the process image, as any watcher does, and shares what changes: values, states with their periods, commands that
 came, responses that went. It writes into a store of its own and sends from there. What its digital twin commands goes through
-the plant's own gate (`twin.command_gate`) to the gateway, as if the transmitter had brought it; the image is the gateway's.
-Control verbs: ready, get, stop.
+the plant's own gate (`fieldtwin.twin.command_gate`) to the gateway, as if the transmitter had brought it; the image is the
+gateway's. Control verbs: ready, get, stop.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from typing import Any
 import msgspec
 from msgspec.structs import replace
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.connection import Connector
-from gateway.core.control import ControlClient, ControlServer
-from gateway.core.errors import FieldtwinError
-from gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
-from gateway.core.image_snapshot import Snapshot
-from gateway.core.nursery import Nursery
-from gateway.core.statemachine import STATE_CODES, STATES
-from gateway.core.values import COMMAND, RESPONSE, Quality, Reason, TagValue
-from gateway.runtime.audit import AuditLog
-from gateway.store.event import Event, Kind, KnowledgeStore
-from gateway.store.knowledge import open_knowledge
-from gateway.wallclock import WallClock, run
-from twin.command_gate import CommandGate
-from twin.knowledge import KnowledgeWriter
-from twin.mape.execute import Bounds
-from twin.mapping import MappedConnector, mapping_from_json
-from twin.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
-from twin.status import encode_status
-from twin.system import System, load_system
-from twin.thread import PTtoDTConnection, schema_of
-from twin.thread_end import ThreadEnd
-from twin.thread_place import lent_transmitter, plant_carrier
-from twin.thread_process import PTDigitalThreadProcess
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.control import ControlClient, ControlServer
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, ImageLayout, TagKind
+from fieldtwin.gateway.core.image_snapshot import Snapshot
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.statemachine import STATE_CODES, STATES
+from fieldtwin.gateway.core.values import COMMAND, RESPONSE, Quality, Reason, TagValue
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
+from fieldtwin.gateway.store.knowledge import open_knowledge
+from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.twin.command_gate import CommandGate
+from fieldtwin.twin.knowledge import KnowledgeWriter
+from fieldtwin.twin.mape.execute import Bounds
+from fieldtwin.twin.mapping import MappedConnector, mapping_from_json
+from fieldtwin.twin.physical import attached, gateway_lost_ms, image_layout, plc_lost_ms
+from fieldtwin.twin.status import encode_status
+from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.thread import PTtoDTConnection, schema_of
+from fieldtwin.twin.thread_end import ThreadEnd
+from fieldtwin.twin.thread_place import lent_transmitter, plant_carrier
+from fieldtwin.twin.thread_process import PTDigitalThreadProcess
 
 LOOK_MS = 50
 REFRESH_MS = 10_000
@@ -54,8 +54,8 @@ NAMES = list(STATES)
 
 
 class PlantThreadConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the process is told. `place` is where the thread goes (`twin.thread_place`), `store` a file or a database. `mapping`
-    is None on a plant. `every_ms`: a tag's new value is shared at most so often, however often it changes."""
+    """What the process is told. `place` is where the thread goes (`fieldtwin.twin.thread_place`), `store` a file or a database.
+    `mapping` is None on a plant. `every_ms`: a tag's new value is shared at most so often, however often it changes."""
 
     system: str
     run_dir: str

@@ -1,7 +1,7 @@
 """The digital twin prototype: the physical twin's own software and configuration, with every device emulated.
 
 Here the two sides of the wire are put together and nowhere else: which emulator answers which driver is checked, and the field
-side is made. What runs left of the wire is `twin.physical`, unchanged and unaware.
+side is made. What runs left of the wire is `fieldtwin.twin.physical`, unchanged and unaware.
 """
 
 from __future__ import annotations
@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from emulators.emulator import EmulatedCommunication
-from emulators.endpoints.ports import Ports
-from emulators.models.packet_link import ModemEnd
-from gateway.core.clock import Clock
-from twin.declared import declared_variables
-from twin.field import FieldSide
-from twin.model import DigitalModel
-from twin.physical import EmbeddedControlSystem
-from twin.prototype_file import Prototype
-from twin.system import System
+from fieldtwin.emulators.emulator import EmulatedCommunication
+from fieldtwin.emulators.endpoints.ports import Ports
+from fieldtwin.emulators.models.packet_link import ModemEnd
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.field import FieldSide
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.physical import EmbeddedControlSystem
+from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.system import System
 
 
 class DigitalTwinPrototype:

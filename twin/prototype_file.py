@@ -8,16 +8,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from emulators.replay.can_log import SUFFIX
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import shown
-from gateway.core.yaml_file import Key, YamlFile, load, validate
-from twin.data_files import find, find_recording
-from twin.simulations import check_plays, check_simulations
-from twin.system import System
-from twin.system_schema import EmulatedForm, PrototypeForm
+from fieldtwin.emulators.replay.can_log import SUFFIX
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import shown
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.twin.data_files import find, find_recording
+from fieldtwin.twin.simulations import check_plays, check_simulations
+from fieldtwin.twin.system import System
+from fieldtwin.twin.system_schema import EmulatedForm, PrototypeForm
 
 
 @dataclass(frozen=True)

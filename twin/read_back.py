@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gateway.core.profile import Tag
-from gateway.core.yaml_file import YamlFile
-from gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.yaml_file import YamlFile
+from fieldtwin.gateway.devices.config import DeviceConfig
 
 
 def never_read_back(file: YamlFile, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:

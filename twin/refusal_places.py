@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from gateway.core.control import ControlClient
-from gateway.core.errors import FieldtwinError
-from gateway.runtime.refusals import Refusal, Refusals
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.runtime.refusals import Refusal, Refusals
 
 ANSWER_S = 1.0
 """How long the PLC may take to answer."""

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import DeviceProfile
-from gateway.core.yaml_file import Key, YamlFile, load, validate
-from gateway.devices.config import DeviceConfig
-from twin.physical import plant_tags
-from twin.system import System
-from twin.system_schema import SystemForm
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.twin.physical import plant_tags
+from fieldtwin.twin.system import System
+from fieldtwin.twin.system_schema import SystemForm
 
 Loc = tuple[Key, ...]
 GATE = frozenset({"remote", "commands"})

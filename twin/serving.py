@@ -9,18 +9,18 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from gateway.connections.tls_listen import check_files
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
-from gateway.core.profile import Tag
-from gateway.core.yaml_file import Key, YamlFile
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS, ServedTable
-from gateway.runtime.bridge import BridgeConfig, Route
-from gateway.runtime.bridge_policy import AllowRule, Network, Policy, network
-from gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag
-from twin.system_schema import AllowForm, BridgeForm, ServedTagForm, ServeForm
+from fieldtwin.gateway.connections.tls_listen import check_files
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS, ServedTable
+from fieldtwin.gateway.runtime.bridge import BridgeConfig, Route
+from fieldtwin.gateway.runtime.bridge_policy import AllowRule, Network, Policy, network
+from fieldtwin.gateway.runtime.serve import BIT_TABLES, QUALITY_TABLE, ServeConfig, ServedTag
+from fieldtwin.twin.system_schema import AllowForm, BridgeForm, ServedTagForm, ServeForm
 
 TABLES: tuple[ServedTable, ...] = ("input", "holding", "discrete", "coil")
 ADDRESSES = 0x10000

@@ -9,16 +9,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.events import Consumer
-from gateway.store.event import Event
-from twin.mape.analyze import Analyze
-from twin.mape.messages import Verdict
-from twin.mape.monitor import Monitor
-from twin.mape.upkeep import Upkeep
-from twin.model import DigitalModel
-from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
-from twin.variables import Variable
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.mape.analyze import Analyze
+from fieldtwin.twin.mape.messages import Verdict
+from fieldtwin.twin.mape.monitor import Monitor
+from fieldtwin.twin.mape.upkeep import Upkeep
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.twin.variables import Variable
 
 VERDICTS = 1000
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from emulators.endpoints.ports import Listening, Ports
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
-from emulators.modbus.unit import ModbusUnit
-from emulators.models.acoustic_link import AcousticLink
-from emulators.models.mailbox_modem import MailboxModem
-from emulators.wires.acoustic import AcousticMedium
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.endpoint import Endpoint
-from twin.field import unit_limits
-from twin.network import SHIP, Network
+from fieldtwin.emulators.endpoints.ports import Listening, Ports
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.models.mailbox_modem import MailboxModem
+from fieldtwin.emulators.wires.acoustic import AcousticMedium
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.twin.field import unit_limits
+from fieldtwin.twin.network import SHIP, Network
 
 MOST_CLIENTS = 4
 

@@ -6,18 +6,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from random import Random
 
-from emulators.journal import HeldJournal
-from emulators.simulation.formula import STEP, TIME, Formula
-from emulators.simulation.inputs import number_of
-from emulators.simulation.python_model import PythonModel
-from emulators.simulation.signals import SimulatedSignals
-from emulators.simulation.simulation import Simulation, by_formulas, by_model
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import UsageError
-from gateway.core.profile import DeviceProfile, Tag
-from gateway.core.yaml_file import YamlFile
-from twin.system import System
-from twin.system_schema import EmulatedForm, PrototypeForm, SimulationForm
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula
+from fieldtwin.emulators.simulation.inputs import number_of
+from fieldtwin.emulators.simulation.python_model import PythonModel
+from fieldtwin.emulators.simulation.signals import SimulatedSignals
+from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, by_model
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.yaml_file import YamlFile
+from fieldtwin.twin.system import System
+from fieldtwin.twin.system_schema import EmulatedForm, PrototypeForm, SimulationForm
 
 
 def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> None:

@@ -7,21 +7,25 @@ and have hashes of their own.
 from __future__ import annotations
 
 import hashlib
+import os
 import re
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
-PACKAGES = ("emulators", "fieldtwin", "gateway", "plc", "twin")
-HERE = Path(__file__).resolve().parent.parent
+PACKAGE = "fieldtwin"
+HERE = Path(__file__).absolute().parents[2]
+"""The folder that holds the package. Not resolved: in a checkout fieldtwin/twin is a link to a folder beside the package."""
 MAX_MODULE_BYTES = 16 << 20
 MAX_MODULES = 10_000
 MAX_WHEEL_BYTES = 16 << 20
 """Packed; and sixteen times that unpacked. Ours is a tenth of it, and a stranger's may be a bomb."""
-_LEFT_OUT = re.compile(r"(^|/)__pycache__/|\.pyc$|^fieldtwin/_data/|(^|/)\.")
+_DATA = f"{PACKAGE}/_data/"
+_NO_SOURCE = re.compile(r"(^|/)__pycache__/|\.pyc$|(^|/)\.")
+"""What lies beside the modules on a computer that runs them, and never in a wheel of ours."""
 
 
 def modules_hash(folder: Path = HERE) -> str:
@@ -30,10 +34,10 @@ def modules_hash(folder: Path = HERE) -> str:
 
 
 def _modules_below(folder: Path) -> Iterator[tuple[str, bytes]]:
-    for package in PACKAGES:
-        for path in (folder / package).rglob("*"):
+    for parent, _, files in os.walk(folder / PACKAGE, followlinks=True):  # the links of a checkout
+        for path in (Path(parent, file) for file in files):
             name = path.relative_to(folder).as_posix()
-            if not _LEFT_OUT.search(name) and path.is_file():
+            if not name.startswith(_DATA) and not _NO_SOURCE.search(name) and path.is_file():
                 yield name, path.read_bytes()
 
 
@@ -46,18 +50,20 @@ def wheel_hash(wheel: Path) -> tuple[str, str]:
         if wheel.stat().st_size > MAX_WHEEL_BYTES:
             raise FileInvalid("too large for a wheel of ours", path=str(wheel), expected=f"{MAX_WHEEL_BYTES} bytes")
         with zipfile.ZipFile(wheel) as archive:
-            return match[1], _hash(_modules_in(archive))
+            return match[1], _hash(_modules_in(archive, f"fieldtwin-{match[1]}.dist-info/"))
     except (OSError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as e:
         raise FileInvalid(f"cannot read the wheel: {e}", path=str(wheel)) from e
 
 
-def _modules_in(archive: zipfile.ZipFile) -> Iterator[tuple[str, bytes]]:
+def _modules_in(archive: zipfile.ZipFile, about: str) -> Iterator[tuple[str, bytes]]:
+    """Yield all that the wheel would install, without shipped data and without what it says `about` itself. A module of another
+    package is included, because a wheel of ours has none."""
     entries = archive.infolist()
     if len(entries) > MAX_MODULES:
         raise FileInvalid("too many files for a wheel of ours", path=str(archive.filename), expected=f"{MAX_MODULES}")
     room = 16 * MAX_WHEEL_BYTES
     for entry in entries:
-        if entry.filename.split("/")[0] in PACKAGES and not entry.is_dir() and not _LEFT_OUT.search(entry.filename):
+        if not entry.is_dir() and not entry.filename.startswith((_DATA, about)):
             with archive.open(entry) as file:
                 data = file.read(MAX_MODULE_BYTES + 1)
             room -= len(data)

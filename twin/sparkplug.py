@@ -10,9 +10,9 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-from gateway.core.errors import Desync, UsageError
-from gateway.store.event import Value
-from twin.thread_frames import Reader, varint
+from fieldtwin.gateway.core.errors import Desync, UsageError
+from fieldtwin.gateway.store.event import Value
+from fieldtwin.twin.thread_frames import Reader, varint
 
 NAMESPACE = "spBv1.0"
 MAX_PAYLOAD = 1 << 20

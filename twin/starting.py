@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gateway.core.yaml_file import YamlFile
-from gateway.devices.config import DeviceConfig
-from twin.system_schema import PlcForm
+from fieldtwin.gateway.core.yaml_file import YamlFile
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.twin.system_schema import PlcForm
 
 
 def waits_for_its_command(file: YamlFile, plc: PlcForm, devices: Mapping[str, DeviceConfig]) -> tuple[str, ...]:

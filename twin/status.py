@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import struct
 
-from gateway.core.errors import Desync
-from gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, STATE_CODES
-from gateway.core.values import STATUS
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, STATE_CODES
+from fieldtwin.gateway.core.values import STATUS
 
 _STATUS = struct.Struct(">Bh")
 _NAMES = {code: name for name, code in STATE_CODES.items()}

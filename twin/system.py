@@ -11,19 +11,19 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
-from gateway.core.profile import DeviceProfile, Tag, load_profile
-from gateway.core.yaml_file import Key, YamlFile, load, validate
-from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
-from twin.canopen_keys import canopen_bus, canopen_node, check_rpdo1
-from twin.data_files import find
-from twin.modbus_keys import connect_pauses, device_pace, modbus_bus
-from twin.read_back import never_read_back
-from twin.serving import Serving, resolve_serving
-from twin.starting import waits_for_its_command
-from twin.system_schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag, load_profile
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
+from fieldtwin.twin.canopen_keys import canopen_bus, canopen_node, check_rpdo1
+from fieldtwin.twin.data_files import find
+from fieldtwin.twin.modbus_keys import connect_pauses, device_pace, modbus_bus
+from fieldtwin.twin.read_back import never_read_back
+from fieldtwin.twin.serving import Serving, resolve_serving
+from fieldtwin.twin.starting import waits_for_its_command
+from fieldtwin.twin.system_schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
 
 SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
 """What the gateway can talk over so far."""

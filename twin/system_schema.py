@@ -275,6 +275,10 @@ class InvariantsForm(Strict):
     within: list[FollowsForm] = Field(default=[], max_length=200)
 
 
+NONE_STATED = InvariantsForm()
+"""Of a system without invariants."""
+
+
 class SystemForm(Strict):
     """A plant: read by the physical twin and by its prototype, byte for byte the same."""
 

@@ -17,12 +17,12 @@ from typing import Any, ClassVar, Literal
 
 import msgspec
 
-from gateway.core.errors import FileInvalid
-from gateway.core.statemachine import ACCEPTING, delta
-from twin.declared import declared_variables
-from twin.model import DigitalModel
-from twin.physical import EmbeddedControlSystem
-from twin.system import System
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.statemachine import ACCEPTING, delta
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.physical import EmbeddedControlSystem
+from fieldtwin.twin.system import System
 
 VERSION = 1
 MANIFEST = "template.json"
@@ -67,7 +67,8 @@ class TemplateFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
 
 class Software(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
-    """The control software: its version, the hash of its modules (`twin.software`), and the wheel in the package, if any."""
+    """The control software: its version, the hash of its modules (`fieldtwin.twin.software`), and the wheel in the package, if
+    any."""
 
     name: str = "fieldtwin"
     version: str

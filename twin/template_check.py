@@ -11,13 +11,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from gateway.core.clock import Clock
-from gateway.core.errors import FileInvalid
-from twin.software import wheel_hash
-from twin.system import System, load_system
-from twin.template import DigitalTemplate, Manifest, Software, describe_model
-from twin.template_pack import MODEL, collect
-from twin.template_package import Content, Package
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.twin.software import wheel_hash
+from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.template import DigitalTemplate, Manifest, Software, describe_model
+from fieldtwin.twin.template_pack import MODEL, collect
+from fieldtwin.twin.template_package import Content, Package
 
 TEXT = (".yaml", ".yml", ".st", ".xml", ".py", ".eds", ".dcf", ".json", ".md", ".txt", ".csv")
 MAX_SHOWN_BYTES = 256 * 1024
@@ -70,8 +70,8 @@ def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock)
     """
     template = DigitalTemplate(manifest, system)
     if manifest.prototype_file:
-        from twin.prototype import DigitalTwinPrototype  # a plant has no emulators installed
-        from twin.prototype_file import load_prototype
+        from fieldtwin.twin.prototype import DigitalTwinPrototype  # a plant has no emulators installed
+        from fieldtwin.twin.prototype_file import load_prototype
 
         DigitalTwinPrototype(system, load_prototype(system, folder / manifest.prototype_file), clock)
     return template

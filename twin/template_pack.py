@@ -1,8 +1,8 @@
 """Packing a template: everything that a system names, found where a run would find it, under paths that work anywhere.
 
 A package has ``systems/``, ``devices/``, ``recordings/``, ``documents/`` and ``software/``. What a system file names by a
-relative path keeps its place beside it; what it names bare lies where a bare name is looked for (`twin.data_files`). The system
-file itself is never touched: plant, prototype and template have the same bytes.
+relative path keeps its place beside it; what it names bare lies where a bare name is looked for (`fieldtwin.twin.data_files`).
+The system file itself is never touched: plant, prototype and template have the same bytes.
 """
 
 from __future__ import annotations
@@ -18,15 +18,24 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from gateway.core.errors import FileInvalid, Unreachable, UsageError
-from gateway.core.profile import DeviceProfile
-from twin.data_files import find
-from twin.software import modules_hash, wheel_hash
-from twin.system import System
-from twin.template import MANIFEST, DocumentKind, Kind, Manifest, Software, TemplateFile, check_path, describe_model
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.twin.data_files import find
+from fieldtwin.twin.software import modules_hash, wheel_hash
+from fieldtwin.twin.system import System
+from fieldtwin.twin.template import (
+    MANIFEST,
+    DocumentKind,
+    Kind,
+    Manifest,
+    Software,
+    TemplateFile,
+    check_path,
+    describe_model,
+)
 
 MODEL = "model.json"
-OUR_PROGRAMS = "plc"
+OUR_PROGRAMS = "fieldtwin"
 """The package whose programs come with fieldtwin itself."""
 
 
@@ -115,7 +124,7 @@ def _profile(got: Collected, named_in: Path, reference: str, profile: DeviceProf
 
 
 def _prototype(got: Collected, system: System, path: Path) -> None:
-    from twin.prototype_file import load_prototype  # where there is one, there are emulators
+    from fieldtwin.twin.prototype_file import load_prototype  # where there is one, there are emulators
 
     prototype = load_prototype(system, path)
     got.prototype_file = f"systems/{system.path.stem}.prototype.yaml"

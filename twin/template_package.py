@@ -20,9 +20,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from gateway.core.errors import FileInvalid, Unreachable, UsageError
-from gateway.core.input_file import open_input
-from twin.template import (
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.core.input_file import open_input
+from fieldtwin.twin.template import (
     MANIFEST,
     MAX_FILE_BYTES,
     MAX_FILES,

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 
-from gateway.core.endpoint import Endpoint
-from twin.prototype_file import Prototype
-from twin.system import System
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.system import System
 
 OUR_BUS = "fieldtwin"
 """The software CAN bus; every other interface may be a real one."""

@@ -1,7 +1,8 @@
 """The digital thread: a connection each way between two twins, and the processes whose knowledge goes over it.
 
 A process shares events; a connection collects them from its processes into the log that its end sends. Here the paper's
-schemas have their names; what goes over the wire is `twin.thread_end`, and the database is the store that it keeps both logs in.
+schemas have their names; what goes over the wire is `fieldtwin.twin.thread_end`, and the database is the store that it keeps
+both logs in.
 """
 
 from __future__ import annotations
@@ -9,16 +10,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import ClassVar, Generic, TypeVar
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.errors import Bug
-from gateway.core.statemachine import encode_period
-from gateway.core.values import COMMAND
-from gateway.store.event import Event, Kind
-from twin.knowledge import KnowledgeWriter
-from twin.system import System
-from twin.thread_end import OnEvents, ThreadEnd
-from twin.thread_frames import Schema
-from twin.thread_process import DigitalThreadProcess, DTDigitalThreadProcess, PTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.twin.knowledge import KnowledgeWriter
+from fieldtwin.twin.system import System
+from fieldtwin.twin.thread_end import OnEvents, ThreadEnd
+from fieldtwin.twin.thread_frames import Schema
+from fieldtwin.twin.thread_process import (
+    DigitalThreadProcess,
+    DTDigitalThreadProcess,
+    PTDigitalThreadProcess,
+    ReceivingEnd,
+)
 
 COLLECT_MS = 50
 

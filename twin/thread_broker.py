@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
-from gateway.connections.tls import client_context
-from gateway.core.clock import Clock
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.url_secrets import without_password
-from twin.system import System
-from twin.thread import schema_of
-from twin.thread_link import Carrier
+from fieldtwin.gateway.connections.tls import client_context
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.url_secrets import without_password
+from fieldtwin.twin.system import System
+from fieldtwin.twin.thread import schema_of
+from fieldtwin.twin.thread_link import Carrier
 
 EXPECTED = "mqtt://[USER@]HOST[:PORT]/GROUP/NODE"
 SCHEMES = ("mqtt:", "mqtts:")
@@ -37,10 +37,10 @@ def broker_carrier(place: str, clock: Clock, plant: System | None) -> Carrier:
     """An edge node of `plant`, or the host application where there is none. Raises `UsageError` for what is no broker, and
     `Unreachable` for files of no use."""
     try:
-        from twin.thread_mqtt import Broker, MqttCarrier  # an extra
+        from fieldtwin.twin.thread_mqtt import Broker, MqttCarrier  # an extra
     except ModuleNotFoundError as e:
         raise UsageError("MQTT needs an extra", hint="pip install 'fieldtwin[mqtt]'") from e
-    from twin.thread_sparkplug import EdgeNode, HostApplication, types_of
+    from fieldtwin.twin.thread_sparkplug import EdgeNode, HostApplication, types_of
 
     url, group, node, said = _split(place)
     host = said.pop("host", DEFAULT_HOST)

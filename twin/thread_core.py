@@ -17,9 +17,9 @@ from collections import OrderedDict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.store.event import Event, Kind, merged
-from twin.thread_frames import MAX_RUNS, Ack, Ask, Data, Frame, Hello, Lost, Refused, tag_of
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.store.event import Event, Kind, merged
+from fieldtwin.twin.thread_frames import MAX_RUNS, Ack, Ask, Data, Frame, Hello, Lost, Refused, tag_of
 
 WINDOW = 2000
 """Events that are under way or wait for their turn in memory; the rest waits in the store."""

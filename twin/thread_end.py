@@ -11,13 +11,13 @@ from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.errors import FieldtwinError, Unreachable
-from gateway.core.nursery import Nursery
-from gateway.store.event import Event, KnowledgeStore, without
-from twin.thread_core import Effect, Incoming, Keep, NoteLost, Open, Outgoing
-from twin.thread_frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
-from twin.thread_link import Carrier, Link, Unwelcome
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.store.event import Event, KnowledgeStore, without
+from fieldtwin.twin.thread_core import Effect, Incoming, Keep, NoteLost, Open, Outgoing
+from fieldtwin.twin.thread_frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
+from fieldtwin.twin.thread_link import Carrier, Link, Unwelcome
 
 FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
 PROVEN_NS = 5 * NS_PER_S

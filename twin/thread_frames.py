@@ -23,8 +23,8 @@ from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from gateway.core.errors import Bug, Desync
-from gateway.store.event import MAX_VALUE_BYTES, Event, Value
+from fieldtwin.gateway.core.errors import Bug, Desync
+from fieldtwin.gateway.store.event import MAX_VALUE_BYTES, Event, Value
 
 VERSION = 1
 TAG_BYTES = 2

@@ -8,9 +8,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-from gateway.core.errors import Desync, Unreachable
-from gateway.store.event import Event
-from twin.thread_frames import Frame, FrameCodec, Schema
+from fieldtwin.gateway.core.errors import Desync, Unreachable
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.thread_frames import Frame, FrameCodec, Schema
 
 
 class Unwelcome(Unreachable):

@@ -9,19 +9,19 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.connection import Connector
-from gateway.core.errors import ConnectionLost, FieldtwinError
-from gateway.core.nursery import Nursery
-from gateway.core.values import DATA
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.bus_turns import DeviceState
-from gateway.runtime.mailboxes import Inbox, Mailboxes
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
-from twin.thread_frames import Schema
-from twin.thread_link import Carrier, DatagramLink
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import DATA
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.bus_turns import DeviceState
+from fieldtwin.gateway.runtime.mailboxes import Inbox, Mailboxes
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.twin.thread_frames import Schema
+from fieldtwin.twin.thread_link import Carrier, DatagramLink
 
 TICK_NS = 20 * NS_PER_MS
 ACK_DELAY_NS = 1000 * NS_PER_MS

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 
 import aiomqtt
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.errors import ConnectionLost, Desync, Unreachable
-from gateway.store.event import Event
-from twin.sparkplug import MAX_PAYLOAD
-from twin.thread_frames import Frame
-from twin.thread_link import Carrier, Link, Unwelcome
-from twin.thread_sparkplug import EdgeNode, HostApplication, Message
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import ConnectionLost, Desync, Unreachable
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.sparkplug import MAX_PAYLOAD
+from fieldtwin.twin.thread_frames import Frame
+from fieldtwin.twin.thread_link import Carrier, Link, Unwelcome
+from fieldtwin.twin.thread_sparkplug import EdgeNode, HostApplication, Message
 
 KEEPALIVE_S = 15
 TIMEOUT_S = 10.0

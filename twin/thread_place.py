@@ -1,6 +1,6 @@
 """Where a thread goes, as a URL: ``tcp://127.0.0.1:PORT`` on one computer, ``tls://HOST:PORT?ca=FILE&cert=FILE&key=FILE`` between
-two (the plant listens, its twin comes, both show a certificate), a broker with Sparkplug B (`twin.thread_broker`), or the modems
-of the system: ``modem:`` or ``modem:DEVICE`` on the plant, which lends its mailboxes to the thread, and
+two (the plant listens, its twin comes, both show a certificate), a broker with Sparkplug B (`fieldtwin.twin.thread_broker`), or
+the modems of the system: ``modem:`` or ``modem:DEVICE`` on the plant, which lends its mailboxes to the thread, and
 ``modem:[DEVICE@]tcp://HOST:PORT``, the far modem, at its twin.
 """
 
@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from ipaddress import ip_address
 
-from gateway.connections.listeners import TcpListener
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import Clock
-from gateway.core.connection import Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.url_secrets import without_password
-from gateway.devices.config import BusConfig, DeviceConfig
-from twin.system import System
-from twin.thread import schema_of
-from twin.thread_broker import broker_carrier, is_broker
-from twin.thread_link import Carrier
-from twin.thread_tcp import TcpDialler, TcpListening
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.url_secrets import without_password
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.twin.system import System
+from fieldtwin.twin.thread import schema_of
+from fieldtwin.twin.thread_broker import broker_carrier, is_broker
+from fieldtwin.twin.thread_link import Carrier
+from fieldtwin.twin.thread_tcp import TcpDialler, TcpListening
 
 EXPECTED = "tcp://127.0.0.1:PORT, tls://HOST:PORT?..., mqtt://HOST/GROUP/NODE, mqtts://..., or modem:"
 MODEM = "modem:"
@@ -94,7 +94,7 @@ def _is_loopback(host: str) -> bool:
 
 def _modem(system: System, device: str, endpoint: Endpoint, connector: Connector, clock: Clock) -> Carrier:
     """The mailboxes of `device`'s modem, or of its peer, at `endpoint`."""
-    from twin.thread_modem import ModemCarrier
+    from fieldtwin.twin.thread_modem import ModemCarrier
 
     config = system.devices[device]
     poll = {"inbox": config.poll.get("inbox", MODEM_POLL_MS)}

@@ -9,11 +9,11 @@ from abc import ABC
 from collections import deque
 from typing import ClassVar
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.errors import Bug
-from gateway.core.events import EventHandler
-from gateway.core.values import DATA, RESPONSE, STATUS, TagValue
-from gateway.store.event import Event, Kind, of_tag, plain
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.events import EventHandler
+from fieldtwin.gateway.core.values import DATA, RESPONSE, STATUS, TagValue
+from fieldtwin.gateway.store.event import Event, Kind, of_tag, plain
 
 KNOWLEDGE = 10_000
 """Events that a process keeps to be shared."""
@@ -71,7 +71,8 @@ class PTDigitalThreadProcess(DigitalThreadProcess):
 
 
 class DTDigitalThreadProcess(DigitalThreadProcess):
-    """One of the digital twin: Monitor, Analyze, Plan, Execute, a database. This one commands nobody (`twin.thread.Operator`)."""
+    """One of the digital twin: Monitor, Analyze, Plan, Execute, a database. This one commands nobody
+    (`fieldtwin.twin.thread.Operator`)."""
 
     side = "digital"
 

@@ -19,10 +19,10 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from gateway.core.errors import Desync
-from gateway.core.profile import Tag
-from gateway.store.event import Event, Value
-from twin.sparkplug import (
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.store.event import Event, Value
+from fieldtwin.twin.sparkplug import (
     BAD_QUALITY,
     GOOD_QUALITY,
     DataType,
@@ -34,8 +34,8 @@ from twin.sparkplug import (
     topic,
     type_of,
 )
-from twin.system import System
-from twin.thread_frames import Ask, Data, Frame, FrameCodec, Hello, Schema
+from fieldtwin.twin.system import System
+from fieldtwin.twin.thread_frames import Ask, Data, Frame, FrameCodec, Hello, Schema
 
 SEQUENCE, TAG, FRAME = "fieldtwin/sequence", "fieldtwin/tag", "fieldtwin/frame"
 OURS = (SEQUENCE, TAG, FRAME)

@@ -12,11 +12,11 @@ import secrets
 from collections.abc import Sequence
 from contextlib import suppress
 
-from gateway.core.connection import ByteConnection, Client, Clients, Connector, Listen
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable
-from twin.thread_frames import Schema
-from twin.thread_link import Carrier, DatagramLink, Unwelcome
+from fieldtwin.gateway.core.connection import ByteConnection, Client, Clients, Connector, Listen
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.twin.thread_frames import Schema
+from fieldtwin.twin.thread_link import Carrier, DatagramLink, Unwelcome
 
 MTU = 8192
 ACK_DELAY_NS = 20_000_000

@@ -1,7 +1,7 @@
 """The digital twin: the shadow, and the way back: Plan and Execute, and a producer whose commands go to the plant.
 
-What carries the commands is a process of the thread (`twin.thread.Operator`), which takes what `execute.transmitter` emits.
-Whether the plant obeys is the plant's to say.
+What carries the commands is a process of the thread (`fieldtwin.twin.thread.Operator`), which takes what `execute.transmitter`
+emits. Whether the plant obeys is the plant's to say.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from gateway.core.clock import Clock
-from twin.mape.execute import Bounds, Execute
-from twin.mape.plan import Plan, Planner
-from twin.mape.what_if import Question, WhatIf
-from twin.shadow import DigitalShadow
-from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
-from twin.variables import Variable
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.twin.mape.execute import Bounds, Execute
+from fieldtwin.twin.mape.plan import Plan, Planner
+from fieldtwin.twin.mape.what_if import Question, WhatIf
+from fieldtwin.twin.shadow import DigitalShadow
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.twin.variables import Variable
 
 
 class DigitalTwin(DigitalShadow):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gateway.core.values import Quality, Reason, Scalar
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar
 
 Limits = tuple[float, float]
 """The least and the most that a value may be."""

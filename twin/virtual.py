@@ -10,30 +10,30 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from emulators.models.packet_link import ModemEnd
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
-from gateway.connections.tap import TappedConnector
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import Connector, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.image import Image
-from gateway.core.nursery import Nursery
-from gateway.core.started import Started
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.gateway import Gateway
-from gateway.runtime.refusals import Refusal
-from gateway.store.exchange_log import ExchangeLog
-from plc.publishing import Change
-from plc.runner import Runner
-from plc.task import run_on_clock
-from twin.field import FieldSide
-from twin.mapping import MappedConnector, mapped_endpoint
-from twin.physical import plc_config
-from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import Prototype
-from twin.system import System
+from fieldtwin.emulators.models.packet_link import ModemEnd
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.connections.tap import TappedConnector
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import Connector, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.image import Image
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.started import Started
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.gateway import Gateway
+from fieldtwin.gateway.runtime.refusals import Refusal
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.plc.publishing import Change
+from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.task import run_on_clock
+from fieldtwin.twin.field import FieldSide
+from fieldtwin.twin.mapping import MappedConnector, mapped_endpoint
+from fieldtwin.twin.physical import plc_config
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.system import System
 
 FLUSH_EVERY_NS = 60 * NS_PER_S
 STARTING_NS = NS_PER_S // 20

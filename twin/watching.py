@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from gateway.core.clock import Clock
-from gateway.core.errors import UsageError
-from gateway.core.values import TagValue
-from gateway.runtime.refusals import Refusals
-from gateway.runtime.tags import TagTable
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.values import TagValue
+from fieldtwin.gateway.runtime.refusals import Refusals
+from fieldtwin.gateway.runtime.tags import TagTable
 
 MOST = 50_000
 AT_ONCE = 10_000

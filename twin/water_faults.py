@@ -6,17 +6,17 @@ from collections.abc import Mapping
 from random import Random
 from typing import Any
 
-from emulators.faults.drop import Drop
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active
-from emulators.faults.frames import Frame, Framing, Way
-from emulators.faults.schema import FaultSpec, parse_fault
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import UsageError
-from twin.fault_aims import known
-from twin.fault_history import FaultHistory
-from twin.network import WATER, Network
+from fieldtwin.emulators.faults.drop import Drop
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active
+from fieldtwin.emulators.faults.frames import Frame, Framing, Way
+from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.twin.fault_aims import known
+from fieldtwin.twin.fault_history import FaultHistory
+from fieldtwin.twin.network import WATER, Network
 
 MOST = 1_000
 _AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probability", "optional"})
@@ -34,7 +34,7 @@ class WaterFaults:
         self._numbers = {name: number for number, name in enumerate(network.places, 1)}
 
     def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
-        """`emulators.wires.acoustic.Spoils`."""
+        """`fieldtwin.emulators.wires.acoustic.Spoils`."""
         return self._wire.decide(Frame(Way.REPLY, Framing.RAW, payload, listener), t_ns) is not None
 
     def inject(self, said: Mapping[str, Any]) -> str:

@@ -1,13 +1,13 @@
 """SDO abort codes by name (CiA 301 v4.2, 7.2.4.3.17) and how the emulated node raises them.
 
-An abort is an ordinary `gateway.core.errors.SdoAborted`; the SDO server turns it into a frame.
+An abort is an ordinary `fieldtwin.gateway.core.errors.SdoAborted`; the SDO server turns it into a frame.
 """
 
 from __future__ import annotations
 
 from enum import IntEnum
 
-from gateway.core.errors import SdoAborted
+from fieldtwin.gateway.core.errors import SdoAborted
 
 
 class Abort(IntEnum):

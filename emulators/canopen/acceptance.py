@@ -7,9 +7,9 @@ error), and so does what is no plain identifier.
 
 from __future__ import annotations
 
-from emulators.canopen.service import Core
-from emulators.canopen.sync import DEFAULT_COB_ID
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.canopen.service import Core
+from fieldtwin.emulators.canopen.sync import DEFAULT_COB_ID
+from fieldtwin.gateway.core.canframe import CanFrame
 
 NMT, LSS = 0x000, 0x7E5
 SDO_RESPONSE, SDO_REQUEST, ERROR_CONTROL = 0x580, 0x600, 0x700

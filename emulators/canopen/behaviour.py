@@ -14,12 +14,12 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 
 import msgspec
 
-from emulators.canopen import codec
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.dictionary import Key
-from emulators.canopen.emcy import Emergency
-from emulators.canopen.node_data import NodeData
-from emulators.canopen.service import NEVER, Core, NmtState, Service, Source
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.emcy import Emergency
+from fieldtwin.emulators.canopen.node_data import NodeData
+from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, Service, Source
 
 Number = int | float
 

@@ -6,12 +6,12 @@ identifiers. In bus-off a node can say nothing, so that 8140h is told afterwards
 
 from __future__ import annotations
 
-from emulators.canopen import emcy
-from emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
-from emulators.canopen.sdo_channels import RESPONSE
-from emulators.canopen.service import Core, Service
-from gateway.core.can_error import CanErrorState, tells_overrun, told_state
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.canopen import emcy
+from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
+from fieldtwin.emulators.canopen.sdo_channels import RESPONSE
+from fieldtwin.emulators.canopen.service import Core, Service
+from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
+from fieldtwin.gateway.core.canframe import CanFrame
 
 OVERRUN, PASSIVE, RECOVERED, COLLISION = 0x8110, 0x8120, 0x8140, 0x8150
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.dictionary import Key
-from emulators.canopen.service import Core, Service
-from emulators.canopen.tpdo import Tpdos
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.service import Core, Service
+from fieldtwin.emulators.canopen.tpdo import Tpdos
 
 
 class ClientView:

@@ -7,8 +7,8 @@ predefined connection set as far as it goes, with nothing mapped.
 
 from __future__ import annotations
 
-from emulators.canopen.eds_text import Section
-from emulators.canopen.entries import RECORD, DictionaryObject, Entry
+from fieldtwin.emulators.canopen.eds_text import Section
+from fieldtwin.emulators.canopen.entries import RECORD, DictionaryObject, Entry
 
 _U8, _U16, _U32 = 0x05, 0x06, 0x07
 _PARAMETERS = {1: ("COB-ID", _U32), 2: ("Transmission type", _U8), 3: ("Inhibit time", _U16)} | {

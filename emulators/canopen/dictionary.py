@@ -1,7 +1,7 @@
 """An electronic data sheet (EDS or DCF, CiA 306-1) as the emulated node's object dictionary: a frozen description.
 
 Read by code of our own: the gateway reads data sheets with the `canopen` package, and two readings of one file are
-worth more than one. It must never know live values (`emulators.canopen.node_data`) nor the bus.
+worth more than one. It must never know live values (`fieldtwin.emulators.canopen.node_data`) nor the bus.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PureWindowsPath
 
-from emulators.canopen import codec
-from emulators.canopen.compact_pdo import implied_pdos
-from emulators.canopen.eds_text import Note, Section, decode_file, parse_sections
-from emulators.canopen.entries import ARRAY as ARRAY
-from emulators.canopen.entries import DOMAIN_OBJECT as DOMAIN_OBJECT
-from emulators.canopen.entries import RECORD as RECORD
-from emulators.canopen.entries import VAR as VAR
-from emulators.canopen.entries import DictionaryObject as DictionaryObject
-from emulators.canopen.entries import Entry as Entry
-from emulators.canopen.entries import Key as Key
-from gateway.core.errors import FileInvalid
-from gateway.core.input_file import read_input
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.compact_pdo import implied_pdos
+from fieldtwin.emulators.canopen.eds_text import Note, Section, decode_file, parse_sections
+from fieldtwin.emulators.canopen.entries import ARRAY as ARRAY
+from fieldtwin.emulators.canopen.entries import DOMAIN_OBJECT as DOMAIN_OBJECT
+from fieldtwin.emulators.canopen.entries import RECORD as RECORD
+from fieldtwin.emulators.canopen.entries import VAR as VAR
+from fieldtwin.emulators.canopen.entries import DictionaryObject as DictionaryObject
+from fieldtwin.emulators.canopen.entries import Entry as Entry
+from fieldtwin.emulators.canopen.entries import Key as Key
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.input_file import read_input
 
 MAX_EDS_BYTES = 8 * 1024 * 1024
 """An EDS or DCF file that is larger is a mistake; the largest one known has 2 MB."""

@@ -11,8 +11,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from emulators.canopen.codec import parse_number
-from gateway.core.errors import FileInvalid
+from fieldtwin.emulators.canopen.codec import parse_number
+from fieldtwin.gateway.core.errors import FileInvalid
 
 _OBJECT = re.compile(r"[0-9a-f]{4}(sub[0-9a-f]{1,2}|name|value)?", re.IGNORECASE)
 """Names of the sections that describe objects."""

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections import deque
 
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.service import NEVER, Core, Service
 
 COMMUNICATION_ERROR = 0x8100
 HEARTBEAT_LOST = 0x8130

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulators.canopen import codec
+from fieldtwin.emulators.canopen import codec
 
 Key = tuple[int, int]
 """(index, subindex)."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from emulators.canopen import emcy
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import NEVER, Core, NmtState, Service
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen import emcy
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, Service
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 ERROR_CONTROL = 0x700
 

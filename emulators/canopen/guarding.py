@@ -6,10 +6,10 @@ within the life time; silence is EMCY 8130h and the reaction of 1029h. A running
 
 from __future__ import annotations
 
-from emulators.canopen import emcy
-from emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
-from emulators.canopen.service import NEVER, Core, Service
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen import emcy
+from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction
+from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 _SOURCE = "life guarding"
 

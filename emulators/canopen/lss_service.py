@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from emulators.canopen.lss import BIT_RATES, FROM_SLAVE, UNCONFIGURED, Identity, LssSlave, LssStore
-from emulators.canopen.service import NEVER, Core, Service
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen.lss import BIT_RATES, FROM_SLAVE, UNCONFIGURED, Identity, LssSlave, LssStore
+from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 _MUTE = "bit timing"
 

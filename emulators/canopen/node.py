@@ -20,21 +20,21 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
 
-from emulators.canopen.aborts import Abort
-from emulators.canopen.acceptance import Acceptance
-from emulators.canopen.behaviour import Behaviour, DeviceModel, Distort
-from emulators.canopen.bus_faults import BusFaults
-from emulators.canopen.client_view import ClientView
-from emulators.canopen.dictionary import Dictionary, Key
-from emulators.canopen.emcy import GENERIC, Emergency
-from emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction, HeartbeatConsumer, HeartbeatProducer
-from emulators.canopen.guarding import NodeGuarding
-from emulators.canopen.lss import FROM_MASTER, UNCONFIGURED, LssStore
-from emulators.canopen.lss_service import LssService
-from emulators.canopen.node_data import NodeData
-from emulators.canopen.rpdo import Rpdos
-from emulators.canopen.sdo_channels import SdoChannels
-from emulators.canopen.service import (
+from fieldtwin.emulators.canopen.aborts import Abort
+from fieldtwin.emulators.canopen.acceptance import Acceptance
+from fieldtwin.emulators.canopen.behaviour import Behaviour, DeviceModel, Distort
+from fieldtwin.emulators.canopen.bus_faults import BusFaults
+from fieldtwin.emulators.canopen.client_view import ClientView
+from fieldtwin.emulators.canopen.dictionary import Dictionary, Key
+from fieldtwin.emulators.canopen.emcy import GENERIC, Emergency
+from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL, ErrorReaction, HeartbeatConsumer, HeartbeatProducer
+from fieldtwin.emulators.canopen.guarding import NodeGuarding
+from fieldtwin.emulators.canopen.lss import FROM_MASTER, UNCONFIGURED, LssStore
+from fieldtwin.emulators.canopen.lss_service import LssService
+from fieldtwin.emulators.canopen.node_data import NodeData
+from fieldtwin.emulators.canopen.rpdo import Rpdos
+from fieldtwin.emulators.canopen.sdo_channels import SdoChannels
+from fieldtwin.emulators.canopen.service import (
     NEVER,
     AnswersReads,
     Change,
@@ -46,14 +46,14 @@ from emulators.canopen.service import (
     Service,
     Source,
 )
-from emulators.canopen.storage import Storage
-from emulators.canopen.sync import Sync
-from emulators.canopen.time_of_day import TimeOfDay, TimeService
-from emulators.canopen.tpdo import Tpdos
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.canopen.storage import Storage
+from fieldtwin.emulators.canopen.sync import Sync
+from fieldtwin.emulators.canopen.time_of_day import TimeOfDay, TimeService
+from fieldtwin.emulators.canopen.tpdo import Tpdos
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import UsageError
 
 NMT_COMMAND = 0x000
 

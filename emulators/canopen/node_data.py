@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
 
-from emulators.canopen import codec
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.dictionary import Dictionary, Entry, Key
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.dictionary import Dictionary, Entry, Key
+from fieldtwin.gateway.core.errors import UsageError
 
 COMMUNICATION = range(0x1000, 0x2000)
 _NEVER_STORED = frozenset({0x1001, 0x1003, 0x1010, 0x1011})

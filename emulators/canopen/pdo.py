@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import msgspec
 
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.dictionary import Key
-from emulators.canopen.node_data import NodeData
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.node_data import NodeData
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 COB_ID, TYPE, INHIBIT, EVENT, SYNC_START = 1, 2, 3, 5, 6
 """Subindices of a communication parameter record."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulators.canopen import codec
-from emulators.canopen.dictionary import Dictionary
-from emulators.canopen.entries import Entry
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.dictionary import Dictionary
+from fieldtwin.emulators.canopen.entries import Entry
 
 _SHORTEST_CYCLE_US = 50
 """A SYNC without data takes 47 bits: 47 us at 1 Mbit/s, the highest bit rate (CiA 301, 5.3)."""

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from emulators.canopen import emcy
-from emulators.canopen.dictionary import Key
-from emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, PdoParameters, pdo_indices
-from emulators.canopen.service import NEVER, Core, Service
-from gateway.core.errors import SdoAborted
+from fieldtwin.emulators.canopen import emcy
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, PdoParameters, pdo_indices
+from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.gateway.core.errors import SdoAborted
 
 _FIRST = 0x1400
 

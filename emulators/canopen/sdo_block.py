@@ -11,8 +11,8 @@ from __future__ import annotations
 from binascii import crc_hqx
 from dataclasses import dataclass, field
 
-from emulators.canopen.aborts import Abort, abort
-from gateway.core.errors import SdoAborted
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.gateway.core.errors import SdoAborted
 
 MAX_BLOCK = 127
 SEGMENT_BYTES = 7

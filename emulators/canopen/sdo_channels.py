@@ -5,9 +5,9 @@ It must never know transfers (`sdo_server`): it knows which identifiers belong t
 
 from __future__ import annotations
 
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.sdo_server import ObjectAccess, SdoServer
-from emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.sdo_server import ObjectAccess, SdoServer
+from fieldtwin.emulators.canopen.service import NEVER, Core, Service
 
 REQUEST, RESPONSE = 0x600, 0x580
 DEFAULT = 0x1200

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from emulators.canopen.aborts import Abort, abort, abort_frame
-from emulators.canopen.sdo_block import MAX_BLOCK, BlockDownload, BlockUpload
-from gateway.core.errors import SdoAborted
+from fieldtwin.emulators.canopen.aborts import Abort, abort, abort_frame
+from fieldtwin.emulators.canopen.sdo_block import MAX_BLOCK, BlockDownload, BlockUpload
+from fieldtwin.gateway.core.errors import SdoAborted
 
 MAX_TRANSFER_BYTES = 1 << 20
 """The longest value a client may write; more is refused with 05040005."""

@@ -10,11 +10,11 @@ from collections.abc import Callable, Collection
 from functools import partial
 from typing import Protocol, runtime_checkable
 
-from emulators.canopen.node import CanopenNode
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import CanConnection
-from gateway.core.nursery import Nursery
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.nursery import Nursery
 
 Poke = Callable[[int], list[CanFrame]]
 """Something that happens in the device: called with the time, returns what the node then sends."""

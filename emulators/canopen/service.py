@@ -14,8 +14,8 @@ from typing import Protocol, runtime_checkable
 
 import msgspec
 
-from emulators.canopen.node_data import NodeData
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.canopen.node_data import NodeData
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class NmtState(IntEnum):

@@ -5,9 +5,9 @@ What is stored lives as long as the emulated node does. Restored defaults take e
 
 from __future__ import annotations
 
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.node_data import Group
-from emulators.canopen.service import Core, Service
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.node_data import Group
+from fieldtwin.emulators.canopen.service import Core, Service
 
 STORE, RESTORE = 0x1010, 0x1011
 _SIGNATURES = {STORE: b"save", RESTORE: b"load"}

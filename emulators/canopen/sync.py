@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from emulators.canopen import emcy
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import NEVER, Core, NmtState, Service
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.canopen import emcy
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.service import NEVER, Core, NmtState, Service
+from fieldtwin.gateway.core.canframe import CanFrame
 
 DEFAULT_COB_ID = 0x80
 COB_ID, CYCLE, WINDOW, OVERFLOW = 0x1005, 0x1006, 0x1007, 0x1019

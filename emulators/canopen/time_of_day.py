@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulators.canopen.aborts import Abort, abort
-from emulators.canopen.service import NEVER, Core, Service
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen.aborts import Abort, abort
+from fieldtwin.emulators.canopen.service import NEVER, Core, Service
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 COB_ID = 0x1012
 _CONSUMES, _PRODUCES = 1 << 31, 1 << 30

@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 
-from emulators.canopen.dictionary import Key
-from emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, TYPE, PdoParameters, pdo_indices
-from emulators.canopen.service import NEVER, Core, SentPdo, Service
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.pdo import COB_ID, EVENT, MAPPING_OFFSET, TYPE, PdoParameters, pdo_indices
+from fieldtwin.emulators.canopen.service import NEVER, Core, SentPdo, Service
+from fieldtwin.gateway.core.canframe import CanFrame
 
 SAMPLED, REMOTE = 252, 253
 _FIRST = 0x1800

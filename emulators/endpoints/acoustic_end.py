@@ -11,10 +11,10 @@ from collections import deque
 from contextlib import suppress
 from pathlib import Path
 
-from emulators.wires.acoustic import AcousticMedium
-from gateway.core.clock import Clock
-from gateway.core.errors import Desync, EndpointBusy, FieldtwinError, Unreachable
-from gateway.core.nursery import Nursery
+from fieldtwin.emulators.wires.acoustic import AcousticMedium
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import Desync, EndpointBusy, FieldtwinError, Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
 
 ROOM = 2
 """Packets that a modem hands over before the first is taken."""
@@ -123,7 +123,7 @@ class AcousticServer:
 
 
 class AcousticEnd:
-    """A modem's end of water that another process serves (`emulators.models.packet_link.ModemEnd`)."""
+    """A modem's end of water that another process serves (`fieldtwin.emulators.models.packet_link.ModemEnd`)."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.sent = self.resent = self.delivered = 0

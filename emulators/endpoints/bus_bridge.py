@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import asyncio
 
-from gateway.core.connection import CanConnection
-from gateway.core.errors import FieldtwinError, WireError
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.errors import FieldtwinError, WireError
 
 
 class CanBridge:

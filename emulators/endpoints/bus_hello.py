@@ -23,7 +23,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
-from gateway.core.canframe import RECORD_SIZE
+from fieldtwin.gateway.core.canframe import RECORD_SIZE
 
 VERSION, FD_VERSION = 1, 2
 WANTS_CONFIRMATIONS = 0x01

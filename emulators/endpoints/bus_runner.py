@@ -12,15 +12,15 @@ from collections import deque
 from collections.abc import Collection, Iterator
 from typing import Any, NamedTuple, Protocol
 
-from emulators.endpoints.overrun import TellsOverrun
-from emulators.wires.can_bus import CanBus
-from emulators.wires.can_faults import Rule
-from gateway.core.can_error import CanErrorState, state_frame, violation_frame
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CANConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, FieldtwinError
+from fieldtwin.emulators.endpoints.overrun import TellsOverrun
+from fieldtwin.emulators.wires.can_bus import CanBus
+from fieldtwin.emulators.wires.can_faults import Rule
+from fieldtwin.gateway.core.can_error import CanErrorState, state_frame, violation_frame
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CANConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 
 class BusPort(Protocol):

@@ -16,7 +16,7 @@ import errno
 import socket
 from typing import Any, cast
 
-from emulators.endpoints.bus_hello import (
+from fieldtwin.emulators.endpoints.bus_hello import (
     FD_VERSION,
     VERSION,
     WANTS_CONFIRMATIONS,
@@ -26,14 +26,22 @@ from emulators.endpoints.bus_hello import (
     Status,
     unpack_hello,
 )
-from emulators.endpoints.bus_runner import BusRunner
-from emulators.endpoints.client_counts import ClientCounts, Counts
-from emulators.wires.can_faults import Rule
-from gateway.core.can_error import overrun_frame
-from gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, FieldtwinError, Unreachable, UsageError, os_reason
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.client_counts import ClientCounts, Counts
+from fieldtwin.emulators.wires.can_faults import Rule
+from fieldtwin.gateway.core.can_error import overrun_frame
+from fieldtwin.gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
+    ConnectionLost,
+    Desync,
+    EndpointBusy,
+    FieldtwinError,
+    Unreachable,
+    UsageError,
+    os_reason,
+)
 
 HELLO_TIMEOUT_S = 5.0
 SDO_REPLY, SDO_REQUEST = 0x580, 0x600
@@ -123,7 +131,7 @@ class SoftBusServer:
         return self._runner
 
     def disturb(self, rule: Rule) -> None:
-        """Spoil attempts to send as `rule` says (`emulators.wires.can_faults.spoil` makes one)."""
+        """Spoil attempts to send as `rule` says (`fieldtwin.emulators.wires.can_faults.spoil` makes one)."""
         self._runner.disturb(rule)
 
     def undisturb(self, rule: Rule) -> None:

@@ -1,6 +1,6 @@
 """An emulated node's own end of a CAN bus: the software bus over TCP, or a kernel interface through python-can.
 
-Written apart from the plant's side (gateway.connections), so that a mistake in one is seen by the other. What the node
+Written apart from the plant's side (fieldtwin.gateway.connections), so that a mistake in one is seen by the other. What the node
 is and says is not known here.
 """
 
@@ -15,13 +15,13 @@ from pathlib import Path
 import can
 from msgspec.structs import replace
 
-from emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, WANTS_ERRORS, Hello, Status, unpack_hello
-from emulators.endpoints.overrun import TellsOverrun
-from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CANConnection, CanConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import (
+from fieldtwin.emulators.endpoints.bus_hello import WANTS_CONFIRMATIONS, WANTS_ERRORS, Hello, Status, unpack_hello
+from fieldtwin.emulators.endpoints.overrun import TellsOverrun
+from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
     ConnectionLost,
     Desync,
     EndpointBusy,

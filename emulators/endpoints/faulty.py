@@ -10,15 +10,15 @@ from collections.abc import Coroutine
 from dataclasses import replace
 from typing import Any
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketEnd
-from emulators.faults.engine import WireFaults, in_time
-from emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
-from emulators.faults.frames import FLUSH_S, Assembler, Frame, Way
-from emulators.virtual.wire import MemoryEnd
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import PROTOCOL, ByteConnection
-from gateway.core.errors import ConnectionLost, FieldtwinError
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketEnd
+from fieldtwin.emulators.faults.engine import WireFaults, in_time
+from fieldtwin.emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
+from fieldtwin.emulators.faults.frames import FLUSH_S, Assembler, Frame, Way
+from fieldtwin.emulators.virtual.wire import MemoryEnd
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 MOST_WAITING = 10_000
 """Pieces that wait for their time; what is more is lost and counted."""

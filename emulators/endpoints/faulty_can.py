@@ -6,16 +6,16 @@ import asyncio
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
-from emulators.endpoints.bus_runner import AttachedConnection
-from emulators.faults.can_engine import aimed, seen, struck
-from emulators.faults.can_fault import BusFault, CanFault, CanPiece
-from emulators.faults.engine import WireFaults, in_time
-from emulators.faults.fault import Active
-from emulators.faults.frames import Way
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CANConnection, CanConnection
-from gateway.core.errors import ConnectionLost, FieldtwinError
+from fieldtwin.emulators.endpoints.bus_runner import AttachedConnection
+from fieldtwin.emulators.faults.can_engine import aimed, seen, struck
+from fieldtwin.emulators.faults.can_fault import BusFault, CanFault, CanPiece
+from fieldtwin.emulators.faults.engine import WireFaults, in_time
+from fieldtwin.emulators.faults.fault import Active
+from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 
 class FaultyCan(CanConnection):
@@ -127,7 +127,7 @@ class FaultyCan(CanConnection):
 
 def bus_rule(active: Active, now_ns: Callable[[], int], from_nodes: frozenset[int]) -> Any:
     """A rule for the modelled bus (emulators/wires/can_faults.py): spoil what the nodes send while the fault lasts."""
-    from emulators.wires.can_faults import Disturbance
+    from fieldtwin.emulators.wires.can_faults import Disturbance
 
     assert isinstance(active.fault, BusFault)
     attempts, spoilt = active.fault.attempts, 0

@@ -7,13 +7,13 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import replace
 
-from emulators.endpoints.ports import Datagrams
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Outcome, Piece
-from emulators.faults.frames import Way, understood
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
+from fieldtwin.emulators.endpoints.ports import Datagrams
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Outcome, Piece
+from fieldtwin.emulators.faults.frames import Way, understood
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
 
 MOST_WAITING = 1_000
 """Datagrams that were heard and not yet taken; what is more is lost, as a socket loses it."""

@@ -1,7 +1,7 @@
 """The ends that an emulated connection forwards between: a TCP stream, dialled or accepted, and a serial device.
 
 The emulators' own: they share no code with the gateway's ends (DESIGN.md), so that a fault in one cannot hide behind
-the same fault in the other. A virtual serial port is emulators.endpoints.pty. Bytes pass here; no protocol is known.
+the same fault in the other. A virtual serial port is fieldtwin.emulators.endpoints.pty. Bytes pass here; no protocol is known.
 """
 
 from __future__ import annotations
@@ -12,9 +12,16 @@ import os
 import socket
 from typing import Any
 
-from gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable, UsageError, os_reason
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
+    ConnectionLost,
+    EndpointBusy,
+    FieldtwinError,
+    Unreachable,
+    UsageError,
+    os_reason,
+)
 
 try:
     import fcntl

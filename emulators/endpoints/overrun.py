@@ -5,9 +5,9 @@ The frame that says so is an error frame; what a node makes of it is not known h
 
 from __future__ import annotations
 
-from gateway.core.can_error import overrun_frame
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.can_error import overrun_frame
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
 
 
 class TellsOverrun(CanConnection):

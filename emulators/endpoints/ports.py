@@ -1,6 +1,7 @@
 """Where emulators are reached: whoever runs a field side asks here for serial ports, listeners and buses.
 
-`OsPorts` gives the operating system's; `emulators.virtual.ports` gives ones in memory. A device cannot tell which it has.
+`OsPorts` gives the operating system's; `fieldtwin.emulators.virtual.ports` gives ones in memory. A device cannot tell which it
+has.
 """
 
 from __future__ import annotations
@@ -9,14 +10,14 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from emulators.endpoints.bus_runner import BusRunner
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketListener
-from emulators.endpoints.udp_end import UdpEnd
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.endpoints.udp_end import UdpEnd
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 
 OnClient = Callable[[ByteConnection], Awaitable[None]]
 

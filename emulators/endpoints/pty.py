@@ -12,11 +12,11 @@ import errno
 import os
 from pathlib import Path
 
-from emulators.wires.serial_line import SerialPacer
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import ByteConnection, RS232Connection, closed_here
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from fieldtwin.emulators.wires.serial_line import SerialPacer
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
 try:
     import termios

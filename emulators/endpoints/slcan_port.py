@@ -11,12 +11,12 @@ import errno
 import socket
 from typing import cast
 
-from emulators.endpoints.bus_runner import BusRunner
-from emulators.endpoints.slcan_protocol import SlcanSession
-from gateway.core.can_error import overrun_frame
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable, os_reason
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.slcan_protocol import SlcanSession
+from fieldtwin.gateway.core.can_error import overrun_frame
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, Unreachable, os_reason
 
 MAX_OUTBOUND_BYTES = 64 * 1024
 """What waits for a client that reads slowly; beyond that it loses frames, alone and counted."""

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from gateway.core.can_error import CanErrorState, tells_overrun, told_state
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 OK, REFUSED = b"\r", b"\a"
 VERSION, SERIAL_NUMBER = b"V1013\r", b"NFT01\r"

@@ -12,10 +12,10 @@ import struct
 from collections.abc import Awaitable, Callable
 from typing import Any, cast
 
-from emulators.endpoints.tls_server import client_role, make_context
-from gateway.core.connection import ByteConnection, TCPConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, os_reason
+from fieldtwin.emulators.endpoints.tls_server import client_role, make_context
+from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, os_reason
 
 MAX_CLIENTS = 32
 MAX_PENDING_CHUNKS = 16

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ssl
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
 
 ROLE_OID = "1.3.6.1.4.1.50316.802.1"
 _UTF8_STRING, _OCTET_STRING, _BOOLEAN = 0x0C, 0x04, 0x01

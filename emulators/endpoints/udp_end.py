@@ -11,9 +11,9 @@ import socket
 from collections import deque
 from typing import cast
 
-from gateway.core.connection import closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, os_reason
+from fieldtwin.gateway.core.connection import closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, os_reason
 
 MAX_PENDING = 256
 """Datagrams that wait to be read."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from random import Random
 
-from emulators.faults.fault import Outcome, WireFault, passed
-from emulators.faults.frames import Frame
-from emulators.faults.remake import remade
+from fieldtwin.emulators.faults.fault import Outcome, WireFault, passed
+from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.remake import remade
 
 
 class Busy(WireFault):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from emulators.faults.can_fault import SDO_REPLY, SDO_REQUEST, CanFault, CanPiece
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active
-from emulators.faults.frames import Frame, Framing, Way
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.faults.can_fault import SDO_REPLY, SDO_REQUEST, CanFault, CanPiece
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active
+from fieldtwin.emulators.faults.frames import Frame, Framing, Way
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 def struck(faults: WireFaults, way: Way, frame: CanFrame, node: int, now_ns: int) -> list[CanPiece] | None:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from random import Random
 from typing import ClassVar
 
-from emulators.faults.fault import Fault, Kind
-from emulators.faults.frames import Way
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.faults.fault import Fault, Kind
+from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.gateway.core.canframe import CanFrame
 
 HEARTBEAT, EMCY, SDO_REPLY, SDO_REQUEST, SYNC = 0x700, 0x80, 0x580, 0x600, 0x80
 

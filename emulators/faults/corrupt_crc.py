@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from random import Random
 
-from emulators.faults.fault import Outcome, WireFault, passed
-from emulators.faults.frames import Frame, Framing
+from fieldtwin.emulators.faults.fault import Outcome, WireFault, passed
+from fieldtwin.emulators.faults.frames import Frame, Framing
 
 
 class CorruptCrc(WireFault):

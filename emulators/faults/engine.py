@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
-from emulators.faults.frames import Frame, Framing, Way, understood
+from fieldtwin.emulators.faults.fault import Active, Hang, Outcome, Piece, WireFault
+from fieldtwin.emulators.faults.frames import Frame, Framing, Way, understood
 
 
 class WireFaults:

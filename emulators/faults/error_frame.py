@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulators.faults.can_fault import BusFault
+from fieldtwin.emulators.faults.can_fault import BusFault
 
 
 class ErrorFrame(BusFault):

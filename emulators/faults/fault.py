@@ -15,8 +15,8 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from emulators.faults.frames import Frame, Way
-from gateway.core.profile import Tag
+from fieldtwin.emulators.faults.frames import Frame, Way
+from fieldtwin.gateway.core.profile import Tag
 
 
 class Hang(Enum):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from emulators.modbus.rtu_shapes import crc16
+from fieldtwin.emulators.modbus.rtu_shapes import crc16
 
 FLUSH_S = 0.05
 """How long bytes that make no frame wait for more."""

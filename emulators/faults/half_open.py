@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from random import Random
 
-from emulators.faults.fault import Hang, Outcome, WireFault
-from emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import Hang, Outcome, WireFault
+from fieldtwin.emulators.faults.frames import Frame
 
 
 class HalfOpen(WireFault):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from random import Random
 
-from emulators.faults.can_fault import HEARTBEAT, CanFault, CanPiece
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.faults.can_fault import HEARTBEAT, CanFault, CanPiece
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class HeartbeatLoss(CanFault):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from emulators.faults.fault import Aim, Fault
-from emulators.faults.registry import FAULTS
-from emulators.faults.schema import MOST, aims_of
+from fieldtwin.emulators.faults.fault import Aim, Fault
+from fieldtwin.emulators.faults.registry import FAULTS
+from fieldtwin.emulators.faults.schema import MOST, aims_of
 
 _ABOUT = {
     "bus": "on all that is on a bus",

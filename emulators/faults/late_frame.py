@@ -6,9 +6,9 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.can_fault import CanFault, CanPiece
-from emulators.faults.fault import Parameters
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.faults.can_fault import CanFault, CanPiece
+from fieldtwin.emulators.faults.fault import Parameters
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class Form(Parameters):

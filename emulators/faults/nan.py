@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from random import Random
 
-from emulators.faults.fault import ValueFault
+from fieldtwin.emulators.faults.fault import ValueFault
 
 
 class NotANumber(ValueFault):

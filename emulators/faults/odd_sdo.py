@@ -6,9 +6,9 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.can_fault import SDO_REPLY, CanFault, CanPiece
-from emulators.faults.fault import Parameters
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.faults.can_fault import SDO_REPLY, CanFault, CanPiece
+from fieldtwin.emulators.faults.fault import Parameters
+from fieldtwin.gateway.core.canframe import CanFrame
 
 _UPLOAD = 2
 _EXPEDITED, _SIZED = 0x02, 0x01

@@ -10,15 +10,15 @@ from collections.abc import Iterable, Mapping
 from random import Random
 from typing import Any
 
-from emulators.distortion import Distortions
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active, Aim, Kind, ValueFault
-from emulators.faults.frames import Framing
-from emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted, parse_fault
-from emulators.faults.value_ranges import check_fault
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.clock import NS_PER_S
-from gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active, Aim, Kind, ValueFault
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted, parse_fault
+from fieldtwin.emulators.faults.value_ranges import check_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
 
 
 class DeviceFaults:

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Mapping
 from random import Random
 from typing import Any
 
-from emulators.faults.can_fault import BusFault, CanFault
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active, Kind
-from emulators.faults.frames import Framing
-from emulators.faults.schema import FaultSpec, addressed, counted, parse_fault
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.clock import NS_PER_S
+from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active, Kind
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.faults.schema import FaultSpec, addressed, counted, parse_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 
 def check_link(spec: FaultSpec) -> None:

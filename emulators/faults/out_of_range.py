@@ -7,11 +7,11 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import Parameters, ValueFault
-from emulators.faults.value_ranges import beyond, numbers
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.errors import Bug
-from gateway.core.profile import Tag
+from fieldtwin.emulators.faults.fault import Parameters, ValueFault
+from fieldtwin.emulators.faults.value_ranges import beyond, numbers
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.profile import Tag
 
 
 class Form(Parameters):

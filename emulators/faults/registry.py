@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from emulators.faults.fault import Fault
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
+from fieldtwin.emulators.faults.fault import Fault
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
 
 _FILES = """
 drop delay jitter duplicate reorder split pause coalesce corrupt_bits corrupt_crc corrupt_length wrong_unit wrong_function
@@ -20,7 +20,7 @@ sync_jitter boot_storm late_frame short_frame odd_sdo odd_heartbeat stuck drift 
 def _load() -> dict[str, type[Fault]]:
     found: dict[str, type[Fault]] = {}
     for file in _FILES.split():
-        module = import_module(f"emulators.faults.{file}")
+        module = import_module(f"fieldtwin.emulators.faults.{file}")
         for kind in vars(module).values():
             if isinstance(kind, type) and issubclass(kind, Fault) and kind.__module__ == module.__name__:
                 found[kind.name] = kind

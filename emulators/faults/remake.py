@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from emulators.faults.frames import Frame, Framing
-from emulators.modbus.ascii import lrc
-from emulators.modbus.rtu_shapes import with_crc
+from fieldtwin.emulators.faults.frames import Frame, Framing
+from fieldtwin.emulators.modbus.ascii import lrc
+from fieldtwin.emulators.modbus.rtu_shapes import with_crc
 
 
 def remade(frame: Frame, *, unit: int | None = None, pdu: bytes | None = None) -> bytes:

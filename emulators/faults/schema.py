@@ -15,12 +15,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from emulators.faults.fault import Aim, Fault, Kind
-from emulators.faults.registry import fault_class
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.nearest import did_you_mean
-from gateway.core.yaml_file import Key, YamlFile, expected_value, load
+from fieldtwin.emulators.faults.fault import Aim, Fault, Kind
+from fieldtwin.emulators.faults.registry import fault_class
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, expected_value, load
 
 _AIM_KEYS = tuple(info.alias or name for name, info in Aim.model_fields.items())
 _NOT_OF = {

@@ -6,10 +6,10 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.canopen.aborts import MEANINGS
-from emulators.faults.can_fault import SDO_REPLY, CanFault, CanPiece
-from emulators.faults.fault import Parameters
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.canopen.aborts import MEANINGS
+from fieldtwin.emulators.faults.can_fault import SDO_REPLY, CanFault, CanPiece
+from fieldtwin.emulators.faults.fault import Parameters
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class Form(Parameters):

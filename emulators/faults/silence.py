@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from random import Random
 
-from emulators.faults.fault import LOST, Outcome, WireFault
-from emulators.faults.frames import Frame, Way
+from fieldtwin.emulators.faults.fault import LOST, Outcome, WireFault
+from fieldtwin.emulators.faults.frames import Frame, Way
 
 
 class Silence(WireFault):

@@ -6,7 +6,7 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import Parameters, ValueFault
+from fieldtwin.emulators.faults.fault import Parameters, ValueFault
 
 
 class Form(Parameters):

@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import Outcome, Parameters, Piece, WireFault
-from emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import Outcome, Parameters, Piece, WireFault
+from fieldtwin.emulators.faults.frames import Frame
 
 
 class Form(Parameters):

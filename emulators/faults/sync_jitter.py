@@ -6,10 +6,10 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.can_fault import SYNC, CanFault, CanPiece
-from emulators.faults.fault import Parameters
-from emulators.faults.frames import Way
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.faults.can_fault import SYNC, CanFault, CanPiece
+from fieldtwin.emulators.faults.fault import Parameters
+from fieldtwin.emulators.faults.frames import Way
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class Form(Parameters):

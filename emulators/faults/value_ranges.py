@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from emulators.faults.fault import Fault, ValueFault
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.profile import INTEGER_RANGES, Tag
+from fieldtwin.emulators.faults.fault import Fault, ValueFault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.profile import INTEGER_RANGES, Tag
 
 PLAUSIBLE = 1.0e9
 """A float is out of range with this value, unless its declared range includes it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 
 class WrongAim(UsageError):

@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import LOST, Outcome, Parameters, WireFault, passed
-from emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.fault import LOST, Outcome, Parameters, WireFault, passed
+from fieldtwin.emulators.faults.frames import Frame
 
 
 class Form(Parameters):

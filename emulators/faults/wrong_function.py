@@ -6,9 +6,9 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import Outcome, Parameters, WireFault, passed
-from emulators.faults.frames import Frame
-from emulators.faults.remake import remade
+from fieldtwin.emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from fieldtwin.emulators.faults.frames import Frame
+from fieldtwin.emulators.faults.remake import remade
 
 
 class Form(Parameters):

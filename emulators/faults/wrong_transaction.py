@@ -6,8 +6,8 @@ from random import Random
 
 from pydantic import Field
 
-from emulators.faults.fault import Outcome, Parameters, WireFault, passed
-from emulators.faults.frames import Frame, Framing
+from fieldtwin.emulators.faults.fault import Outcome, Parameters, WireFault, passed
+from fieldtwin.emulators.faults.frames import Frame, Framing
 
 
 class Form(Parameters):

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from emulators.modbus.line import Exchange, LineSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_S
+from fieldtwin.emulators.modbus.line import Exchange, LineSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 CHARACTER_GAP_NS = NS_PER_S
 """The longest pause between two characters of a frame (SL 2.5.2.1)."""

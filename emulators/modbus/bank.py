@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import ClassVar, Literal, NamedTuple, get_args
 
-from gateway.core.errors import DeviceRefused, UsageError
+from fieldtwin.gateway.core.errors import DeviceRefused, UsageError
 
 Table = Literal["coil", "discrete", "input", "holding"]
 Access = Literal["ro", "rw", "wo"]

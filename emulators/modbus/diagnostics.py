@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from emulators.modbus.bank import IllegalFunction, IllegalValue
-from emulators.modbus.event_log import ENTERED_LISTEN_ONLY, RESTARTED, EventLog
+from fieldtwin.emulators.modbus.bank import IllegalFunction, IllegalValue
+from fieldtwin.emulators.modbus.event_log import ENTERED_LISTEN_ONLY, RESTARTED, EventLog
 
 RETURN_QUERY_DATA = 0x00
 RESTART = 0x01

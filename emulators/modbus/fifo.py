@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
-from emulators.modbus.bank import IllegalAddress, IllegalValue
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import IllegalAddress, IllegalValue
+from fieldtwin.gateway.core.errors import UsageError
 
 MOST_READ = 31
 """Registers that one answer can hold; a longer queue is refused with 03 until the device took some out."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from emulators.modbus.bank import IllegalAddress, IllegalValue
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import IllegalAddress, IllegalValue
+from fieldtwin.gateway.core.errors import UsageError
 
 REFERENCE_TYPE = 6
 MAX_RECORDS = 10_000

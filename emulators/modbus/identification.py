@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from emulators.modbus.bank import IllegalAddress, IllegalFunction, IllegalValue
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import IllegalAddress, IllegalFunction, IllegalValue
+from fieldtwin.gateway.core.errors import UsageError
 
 MEI_TYPE = 0x0E
 BASIC, REGULAR, EXTENDED, INDIVIDUAL = 1, 2, 3, 4

@@ -13,8 +13,8 @@ from typing import Protocol
 
 import msgspec
 
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.errors import UsageError
 
 BROADCAST = 0
 LOWEST_UNIT, HIGHEST_UNIT = 1, 247

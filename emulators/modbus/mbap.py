@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from emulators.endpoints.client_counts import Counts
-from emulators.modbus.line import Exchange
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.errors import Desync, UsageError
+from fieldtwin.emulators.endpoints.client_counts import Counts
+from fieldtwin.emulators.modbus.line import Exchange
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.errors import Desync, UsageError
 
 HEADER = 6
 """Transaction id, protocol id and length: what precedes the bytes that the length counts (TG 3.1.3)."""

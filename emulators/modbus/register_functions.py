@@ -10,8 +10,8 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from emulators.modbus.bank import ADDRESSES, IllegalAddress, IllegalValue, RegisterBank, Table
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import ADDRESSES, IllegalAddress, IllegalValue, RegisterBank, Table
+from fieldtwin.gateway.core.errors import UsageError
 
 STANDARD_FUNCTIONS = frozenset({*range(0x01, 0x09), 0x0B, 0x0C, 0x0F, 0x10, 0x11, 0x14, 0x15, 0x16, 0x17, 0x18, 0x2B})
 

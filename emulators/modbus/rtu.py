@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from emulators.modbus.line import Exchange, LineCounters, LineSlave
-from emulators.modbus.rtu_receiver import FRAME_GAP_NS, RtuReceiver, with_crc
-from emulators.modbus.rtu_shapes import Declared
-from emulators.modbus.rtu_strict import StrictReceiver
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.emulators.modbus.line import Exchange, LineCounters, LineSlave
+from fieldtwin.emulators.modbus.rtu_receiver import FRAME_GAP_NS, RtuReceiver, with_crc
+from fieldtwin.emulators.modbus.rtu_shapes import Declared
+from fieldtwin.emulators.modbus.rtu_strict import StrictReceiver
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 __all__ = ["Exchange", "LineCounters", "RtuSlave"]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from heapq import heappop, heappush
 
-from emulators.modbus.rtu_shapes import (
+from fieldtwin.emulators.modbus.rtu_shapes import (
     CRC_TABLE,
     KNOWN_REQUESTS,
     LAST_UNIT,

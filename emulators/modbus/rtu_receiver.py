@@ -11,8 +11,8 @@ to be noise, every byte behind it is tried (`rtu_hunt`) and only a correct check
 
 from __future__ import annotations
 
-from emulators.modbus.rtu_hunt import Hunt
-from emulators.modbus.rtu_shapes import (
+from fieldtwin.emulators.modbus.rtu_hunt import Hunt
+from fieldtwin.emulators.modbus.rtu_shapes import (
     FIXED_REQUESTS,
     KNOWN_REQUESTS,
     LAST_UNIT,
@@ -25,7 +25,7 @@ from emulators.modbus.rtu_shapes import (
     response_shape,
     with_crc,
 )
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 __all__ = ["FRAME_GAP_NS", "MAX_FRAME", "MIN_FRAME", "RtuReceiver", "crc16", "with_crc"]
 

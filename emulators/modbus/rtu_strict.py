@@ -6,9 +6,9 @@ deliver every byte in time: behind a pty, a socket or a USB adapter the pauses a
 
 from __future__ import annotations
 
-from emulators.modbus.rtu_receiver import MAX_FRAME, MIN_FRAME, crc16
-from emulators.wires.serial_line import SerialPacer
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.emulators.modbus.rtu_receiver import MAX_FRAME, MIN_FRAME, crc16
+from fieldtwin.emulators.wires.serial_line import SerialPacer
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 
 class StrictReceiver:

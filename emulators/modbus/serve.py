@@ -8,17 +8,17 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from emulators.endpoints.client_counts import ClientCounts
-from emulators.endpoints.faulty import FaultyEnd
-from emulators.endpoints.ports import Datagrams
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketEnd
-from emulators.modbus.line import Exchange, LineSlave
-from emulators.modbus.mbap import MbapSlave
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, Direction
-from gateway.core.endpoint import SerialSettings
-from gateway.core.errors import ConnectionLost
+from fieldtwin.emulators.endpoints.client_counts import ClientCounts
+from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.ports import Datagrams
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketEnd
+from fieldtwin.emulators.modbus.line import Exchange, LineSlave
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, Direction
+from fieldtwin.gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.core.errors import ConnectionLost
 
 OnFrame = Callable[[Direction, int, bytes], None]
 """``(direction, t_ns, adu)`` for each whole ADU, directions as the gateway sees them: SENT is a request. `t_ns` is

@@ -9,20 +9,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypedDict
 
-from emulators.modbus.bank import Busy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
-from emulators.modbus.diagnostics import Diagnostics, UnitCounters
-from emulators.modbus.event_log import MAX_EVENTS
-from emulators.modbus.fifo import FifoQueues
-from emulators.modbus.file_records import FileRecords
-from emulators.modbus.identification import Identification
-from emulators.modbus.register_functions import (
+from fieldtwin.emulators.modbus.bank import Busy, IllegalFunction, NegativeAcknowledge, Refusal, RegisterBank
+from fieldtwin.emulators.modbus.diagnostics import Diagnostics, UnitCounters
+from fieldtwin.emulators.modbus.event_log import MAX_EVENTS
+from fieldtwin.emulators.modbus.fifo import FifoQueues
+from fieldtwin.emulators.modbus.file_records import FileRecords
+from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.register_functions import (
     STANDARD_FUNCTIONS,
     TABLES,
     RegisterFunctions,
     UnitLimits,
     require_length,
 )
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 __all__ = ["ALL_FUNCTIONS", "Handler", "ModbusUnit", "UnitLimits", "UnitParts"]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulators.wires.acoustic import AcousticMedium
+from fieldtwin.emulators.wires.acoustic import AcousticMedium
 
 
 class AcousticLink:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from emulators.canopen import codec
-from emulators.canopen.behaviour import DeviceModel
-from emulators.canopen.dictionary import Dictionary
-from emulators.models.drive import Drive
-from emulators.models.encoder import Encoder
-from emulators.models.inclinometer import Inclinometer
-from emulators.models.io_module import IoModule
-from emulators.models.measuring_device import MeasuringDevice
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.behaviour import DeviceModel
+from fieldtwin.emulators.canopen.dictionary import Dictionary
+from fieldtwin.emulators.models.drive import Drive
+from fieldtwin.emulators.models.encoder import Encoder
+from fieldtwin.emulators.models.inclinometer import Inclinometer
+from fieldtwin.emulators.models.io_module import IoModule
+from fieldtwin.emulators.models.measuring_device import MeasuringDevice
 
 MODELS: dict[int, Callable[[], DeviceModel]] = {
     401: IoModule,

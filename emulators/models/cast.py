@@ -11,7 +11,7 @@ import random
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from emulators.models.seawater import conductivity
+from fieldtwin.emulators.models.seawater import conductivity
 
 SIGNALS = {"pressure": "dbar", "temperature": "degC", "conductivity": "S/m"}
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from emulators.canopen import codec
-from emulators.canopen.dictionary import Dictionary, Key
-from emulators.canopen.node_data import NodeData
-from emulators.canopen.service import AnswersReads, Source
-from emulators.distortion import Distortions
-from emulators.models.played_objects import whole
-from gateway.core.profile import Tag
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.dictionary import Dictionary, Key
+from fieldtwin.emulators.canopen.node_data import NodeData
+from fieldtwin.emulators.canopen.service import AnswersReads, Source
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.models.played_objects import whole
+from fieldtwin.gateway.core.profile import Tag
 
 
 class DistortedObjects:

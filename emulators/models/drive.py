@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from emulators.canopen.aborts import Abort
-from emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
-from emulators.canopen.dictionary import Key
-from emulators.models import drive_objects as od
-from emulators.models.drive_homing import METHODS, Axis, Speeds, Way, plan
-from emulators.models.drive_states import Cause, DriveState, Transition, command_of, transition
-from emulators.models.motion import Motion, by_torque, to_place, to_speed
-from gateway.core.clock import NS_PER_S
+from fieldtwin.emulators.canopen.aborts import Abort
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.models import drive_objects as od
+from fieldtwin.emulators.models.drive_homing import METHODS, Axis, Speeds, Way, plan
+from fieldtwin.emulators.models.drive_states import Cause, DriveState, Transition, command_of, transition
+from fieldtwin.emulators.models.motion import Motion, by_torque, to_place, to_speed
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 NEW_SET_POINT, AT_ONCE, RELATIVE, HALT = 1 << 4, 1 << 5, 1 << 6, 1 << 8
 """Bits of the controlword in profile position mode; halt is every mode's."""

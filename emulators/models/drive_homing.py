@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from emulators.models.motion import Motion, Ramp, to_place, to_speed
+from fieldtwin.emulators.models.motion import Motion, Ramp, to_place, to_speed
 
 METHODS = (*range(1, 15), *range(17, 31), 33, 34, 35, 37)
 """Homing methods of this model, as 60E3h lists them."""

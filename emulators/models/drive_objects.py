@@ -5,10 +5,10 @@ Indices, bits and codes are those of CiA 402-2 and 402-3 (IEC 61800-7-201, -301)
 
 from __future__ import annotations
 
-from emulators.canopen import codec
-from emulators.canopen.behaviour import Objects
-from emulators.canopen.dictionary import Dictionary
-from emulators.models.drive_homing import METHODS
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.behaviour import Objects
+from fieldtwin.emulators.canopen.dictionary import Dictionary
+from fieldtwin.emulators.models.drive_homing import METHODS
 
 ERROR_CODE, CONTROLWORD, STATUSWORD = 0x603F, 0x6040, 0x6041
 ABORT_CONNECTION, QUICK_STOP_OPTION, SHUTDOWN_OPTION, DISABLE_OPTION, HALT_OPTION, FAULT_OPTION = (

@@ -8,23 +8,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from emulators.canopen.behaviour import DeviceModel
-from emulators.canopen.codec import encode
-from emulators.canopen.dictionary import Dictionary, Key, load_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.remarks import Remark, remarks
-from emulators.distortion import Distortions
-from emulators.journal import HeldJournal
-from emulators.models.by_profile import NO_MODEL, model_for
-from emulators.models.distorted_objects import DistortedObjects
-from emulators.models.drive import Drive
-from emulators.models.drive_objects import missing_modes
-from emulators.models.played_objects import HeldObjects, PlayedObjects
-from emulators.replay.can_log import CanLog
-from emulators.replay.objects import recorded_objects
-from emulators.signals import Signals
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.profile import DeviceProfile
+from fieldtwin.emulators.canopen.behaviour import DeviceModel
+from fieldtwin.emulators.canopen.codec import encode
+from fieldtwin.emulators.canopen.dictionary import Dictionary, Key, load_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.remarks import Remark, remarks
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.models.by_profile import NO_MODEL, model_for
+from fieldtwin.emulators.models.distorted_objects import DistortedObjects
+from fieldtwin.emulators.models.drive import Drive
+from fieldtwin.emulators.models.drive_objects import missing_modes
+from fieldtwin.emulators.models.played_objects import HeldObjects, PlayedObjects
+from fieldtwin.emulators.replay.can_log import CanLog
+from fieldtwin.emulators.replay.objects import recorded_objects
+from fieldtwin.emulators.signals import Signals
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,10 @@ with the factory's settings: scaling off, clockwise, no preset. That is the shaf
 
 from __future__ import annotations
 
-from emulators.canopen.aborts import Abort
-from emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
-from emulators.canopen.dictionary import Key
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.emulators.canopen.aborts import Abort
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 PARAMETERS, UNITS_PER_TURN, TOTAL_RANGE, PRESET, POSITION = 0x6000, 0x6001, 0x6002, 0x6003, 0x6004
 SPEED, CYCLIC_TIMER, OPERATING_STATUS = 0x6030, 0x6200, 0x6500

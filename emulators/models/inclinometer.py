@@ -7,8 +7,8 @@ plays the slopes as they were with the factory's settings, which is what the cel
 
 from __future__ import annotations
 
-from emulators.canopen.behaviour import DeviceModel, Number, Outcome, Situation
-from emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Outcome, Situation
+from fieldtwin.emulators.canopen.dictionary import Key
 
 SLOPES = (0x6010, 0x6020)
 _PARAMETER, _PRESET, _OFFSET, _DIFFERENTIAL = 1, 2, 3, 4

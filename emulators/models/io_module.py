@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
-from emulators.canopen.dictionary import Key
-from emulators.canopen.service import NmtState
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.service import NmtState
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 DIGITAL_IN, POLARITY_IN, INTERRUPT_ENABLE, ANY_CHANGE, RISING, FALLING = 0x6000, 0x6002, 0x6005, 0x6006, 0x6007, 0x6008
 DIGITAL_OUT, POLARITY_OUT, ERROR_MODE_OUT, ERROR_VALUE_OUT = 0x6200, 0x6202, 0x6206, 0x6207

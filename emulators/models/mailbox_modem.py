@@ -11,13 +11,13 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from random import Random
 
-from emulators.codec import encode
-from emulators.journal import HeldJournal
-from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
-from emulators.models.packet_link import TAME, Incoming, Outgoing, PacketLink, Untamed
-from emulators.stated import bytes_of, cells_held
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import Box, DeviceProfile, RegisterRange, Tag
+from fieldtwin.emulators.codec import encode
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Span, Table
+from fieldtwin.emulators.models.packet_link import TAME, Incoming, Outgoing, PacketLink, Untamed
+from fieldtwin.emulators.stated import bytes_of, cells_held
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import Box, DeviceProfile, RegisterRange, Tag
 
 LAST_SEQUENCE = 0xFFFF
 RECEIVED = 64

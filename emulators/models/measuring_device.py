@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from emulators.canopen.aborts import Abort
-from emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
-from emulators.canopen.dictionary import Key
+from fieldtwin.emulators.canopen.aborts import Abort
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, Number, Objects, Outcome, Situation
+from fieldtwin.emulators.canopen.dictionary import Key
 
 FIELD_VALUE, OPERATING_MODE = 0x6100, 0x6112
 POINT_1_FIELD, POINT_1_PROCESS, POINT_2_FIELD, POINT_2_PROCESS = 0x6120, 0x6121, 0x6122, 0x6123

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from random import Random
 from typing import Protocol
 
-from gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 OVERHEAD_BYTES = 8
 """Preamble, address and check sum of a packet."""

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from math import isnan
 
-from emulators.canopen.codec import encode, held_encoder, integer_range
-from emulators.canopen.dictionary import Dictionary
-from emulators.distortion import Distortions
-from emulators.journal import HeldJournal
-from emulators.signals import Signals
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import Tag
+from fieldtwin.emulators.canopen.codec import encode, held_encoder, integer_range
+from fieldtwin.emulators.canopen.dictionary import Dictionary
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.signals import Signals
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import Tag
 
 Key = tuple[int, int]
 

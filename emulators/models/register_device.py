@@ -10,12 +10,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from emulators.journal import HeldJournal
-from emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Table
-from emulators.modbus.unit import Handler, ModbusUnit
-from emulators.stated import Effects, bytes_of, cells_held, cells_of, fits, merged, spans_of, touches
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import DeviceProfile, OwnFunction, Tag
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.modbus.bank import IllegalValue, MapBank, RegisterBank, Table
+from fieldtwin.emulators.modbus.unit import Handler, ModbusUnit
+from fieldtwin.emulators.stated import Effects, bytes_of, cells_held, cells_of, fits, merged, spans_of, touches
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile, OwnFunction, Tag
 
 _WHOLE = re.compile(r"[1-9][0-9]{0,18}|0|0x[0-9a-fA-F]{1,16}")
 

@@ -11,15 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from emulators.codec import decode, encode
-from emulators.distortion import Distortions
-from emulators.journal import HeldJournal
-from emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
-from emulators.signals import Signals
-from emulators.stated import bytes_of, cells_held, touches
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.emulators.codec import decode, encode
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.modbus.bank import Access, IllegalValue, MapBank, RegisterBank, Span, Table
+from fieldtwin.emulators.signals import Signals
+from fieldtwin.emulators.stated import bytes_of, cells_held, touches
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
 
 STANDBY, SAMPLING, OFF = 0, 1, 2
 MAX_CATCH_UP = 3600

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from gateway.core.errors import Bug
+from fieldtwin.gateway.core.errors import Bug
 
 C_35_15_0 = 4.2914
 """Conductivity in S/m of seawater of salinity 35 at 15 degC (IPTS-68) and no pressure."""

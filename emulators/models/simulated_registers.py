@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from emulators.modbus.bank import Table
-from emulators.models.register_device import StatedRegisters
-from emulators.signals import Signals
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import DeviceProfile
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.signals import Signals
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile
 
 
 class SimulatedRegisters(StatedRegisters):

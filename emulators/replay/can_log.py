@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from emulators.context import WhenUsedUp
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import FileInvalid
-from gateway.core.input_file import open_input
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.input_file import open_input
 
 _LINE = re.compile(
     r"\((\d+\.\d+)\)\s+\S+\s+([0-9A-F]{3}|[0-9A-F]{8})#(R[0-8]?|(?:[0-9A-F]{2}){0,8})(?:\s+[RT])?", re.IGNORECASE

@@ -12,10 +12,10 @@ from array import array
 from collections.abc import Sequence
 from typing import overload
 
-from emulators.context import Recorded
-from emulators.replay.requests import CellRequest
-from gateway.core.recording import Exchange
-from gateway.core.values import RECORDING
+from fieldtwin.emulators.context import Recorded
+from fieldtwin.emulators.replay.requests import CellRequest
+from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.values import RECORDING
 
 BESIDE = 32
 """Bytes that an exchange costs besides its reply."""

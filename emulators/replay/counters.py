@@ -12,11 +12,11 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
-from emulators.modbus.bank import Table
-from emulators.replay.situation import Cell
-from gateway.core.errors import Bug, UnknownCommand
-from gateway.core.values import COMMAND, RECORDING
+from fieldtwin.emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.emulators.replay.situation import Cell
+from fieldtwin.gateway.core.errors import Bug, UnknownCommand
+from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 
 @dataclass(frozen=True, slots=True)

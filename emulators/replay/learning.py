@@ -11,16 +11,16 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from emulators.context import MAX_ENTRIES, Recorded, VirtualContext
-from emulators.modbus.bank import Table
-from emulators.modbus.register_functions import STANDARD_FUNCTIONS
-from emulators.replay import requests
-from emulators.replay.columns import BESIDE, CellValues, Column, Merged, Outcomes
-from emulators.replay.counters import Counters
-from emulators.replay.requests import CellRequest
-from emulators.replay.situation import Cell, Situations
-from gateway.core.recording import Exchange
-from gateway.core.values import COMMAND, RECORDING
+from fieldtwin.emulators.context import MAX_ENTRIES, Recorded, VirtualContext
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.emulators.modbus.register_functions import STANDARD_FUNCTIONS
+from fieldtwin.emulators.replay import requests
+from fieldtwin.emulators.replay.columns import BESIDE, CellValues, Column, Merged, Outcomes
+from fieldtwin.emulators.replay.counters import Counters
+from fieldtwin.emulators.replay.requests import CellRequest
+from fieldtwin.emulators.replay.situation import Cell, Situations
+from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 TABLE_CODES: dict[Table, int] = {"coil": 0, "discrete": 1, "holding": 3, "input": 4}
 _SHAPE_CODE = 0xFF

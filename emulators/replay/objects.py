@@ -11,17 +11,17 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterable
 
-from emulators.canopen.aborts import Abort
-from emulators.canopen.dictionary import Dictionary, Key
-from emulators.canopen.error_control import ERROR_CONTROL
-from emulators.canopen.node_data import COMMUNICATION, NodeData
-from emulators.canopen.pdo import PdoParameters, pdo_indices
-from emulators.canopen.sdo_channels import REQUEST, RESPONSE
-from emulators.context import UsedUp, WhenUsedUp
-from emulators.replay.can_log import CanLog
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.canopen.aborts import Abort
+from fieldtwin.emulators.canopen.dictionary import Dictionary, Key
+from fieldtwin.emulators.canopen.error_control import ERROR_CONTROL
+from fieldtwin.emulators.canopen.node_data import COMMUNICATION, NodeData
+from fieldtwin.emulators.canopen.pdo import PdoParameters, pdo_indices
+from fieldtwin.emulators.canopen.sdo_channels import REQUEST, RESPONSE
+from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.emulators.replay.can_log import CanLog
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
 
 MAX_VALUES = 1_000_000
 """Changes of objects that are kept; later ones are counted in `dropped`."""

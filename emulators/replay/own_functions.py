@@ -6,11 +6,11 @@ the profile says; any other request gets exception 03. Encodes for itself, as ev
 
 from __future__ import annotations
 
-from emulators.codec import encode
-from emulators.modbus.bank import IllegalValue
-from emulators.modbus.unit import Handler
-from emulators.replay.unit import ReplayUnit
-from gateway.core.profile import DeviceProfile, OwnFunction
+from fieldtwin.emulators.codec import encode
+from fieldtwin.emulators.modbus.bank import IllegalValue
+from fieldtwin.emulators.modbus.unit import Handler
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.gateway.core.profile import DeviceProfile, OwnFunction
 
 
 def add_own_functions(unit: ReplayUnit, profile: DeviceProfile) -> None:

@@ -8,14 +8,14 @@ recorded answer would count another wire. Pure; decodes for itself.
 
 from __future__ import annotations
 
-from emulators.modbus.bank import Table
-from emulators.replay import requests
-from emulators.replay.own_functions import add_own_functions
-from emulators.replay.replay import Answer, ExchangeReplay
-from emulators.replay.requests import CellRequest
-from emulators.replay.unit import ReplayUnit
-from emulators.stated import Effects, cells_of, parts_of
-from gateway.core.profile import DeviceProfile
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.emulators.replay import requests
+from fieldtwin.emulators.replay.own_functions import add_own_functions
+from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay
+from fieldtwin.emulators.replay.requests import CellRequest
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.emulators.stated import Effects, cells_of, parts_of
+from fieldtwin.gateway.core.profile import DeviceProfile
 
 _CELL_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F, 0x10})
 _COUNTING = frozenset({0x08, 0x0B, 0x0C})

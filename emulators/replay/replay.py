@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
-from emulators.context import MAX_ENTRIES, Recorded, UsedUp, VirtualContext, WhenUsedUp
-from emulators.modbus.bank import Table
-from emulators.replay import requests
-from emulators.replay.counters import Counters, CounterSpan
-from emulators.replay.learning import (
+from fieldtwin.emulators.context import MAX_ENTRIES, Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.emulators.replay import requests
+from fieldtwin.emulators.replay.counters import Counters, CounterSpan
+from fieldtwin.emulators.replay.learning import (
     CELL_KEY,
     TABLE_CODES,
     Learner,
@@ -32,11 +32,11 @@ from emulators.replay.learning import (
     in_situation,
     shape_key,
 )
-from emulators.replay.requests import CellRequest
-from emulators.replay.situation import Cell
-from gateway.core.errors import Bug
-from gateway.core.recording import Exchange, RecordingReader
-from gateway.core.values import COMMAND
+from fieldtwin.emulators.replay.requests import CellRequest
+from fieldtwin.emulators.replay.situation import Cell
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.recording import Exchange, RecordingReader
+from fieldtwin.gateway.core.values import COMMAND
 
 
 class NeverRecorded(Enum):

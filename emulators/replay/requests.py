@@ -2,7 +2,7 @@
 
 A cell is one bit or register: table and address. Functions 01 to 06, 0F and 10h are understood cell by cell (MODBUS
 Application Protocol V1.1b3, 6.1 to 6.12); all others are opaque: answered as a whole or not at all. Pure, and a stranger to the
-slave's own decoding in emulators.modbus and to the master's.
+slave's own decoding in fieldtwin.emulators.modbus and to the master's.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from emulators.modbus.bank import Table
+from fieldtwin.emulators.modbus.bank import Table
 
 _READS: dict[int, tuple[Table, int]] = {
     1: ("coil", 2000),

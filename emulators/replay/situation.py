@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from emulators.modbus.bank import Table
-from gateway.core.errors import Bug
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.gateway.core.errors import Bug
 
 Cell = tuple[Table, int]
 Written = tuple[Cell, int]

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from emulators.modbus.bank import IllegalAddress, RegisterBank, Table
-from emulators.modbus.unit import WHILE_BUSY, Handler, ModbusUnit, UnitParts
-from emulators.replay.replay import Answer, ExchangeReplay
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import IllegalAddress, RegisterBank, Table
+from fieldtwin.emulators.modbus.unit import WHILE_BUSY, Handler, ModbusUnit, UnitParts
+from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay
+from fieldtwin.gateway.core.errors import UsageError
 
 
 class _NoBank(RegisterBank):

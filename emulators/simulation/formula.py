@@ -13,8 +13,8 @@ import operator
 from collections.abc import Callable, Collection, Mapping
 from random import Random
 
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
 
 Values = Mapping[str, float]
 Compute = Callable[[Values], float]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import struct
 
-from emulators.codec import decode
-from emulators.modbus.bank import BIT_TABLES
-from gateway.core.profile import Tag
+from fieldtwin.emulators.codec import decode
+from fieldtwin.emulators.modbus.bank import BIT_TABLES
+from fieldtwin.gateway.core.profile import Tag
 
 _FLOATS = {"float32": "<f", "float64": "<d"}
 

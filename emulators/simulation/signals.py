@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from emulators.signals import Signals
-from emulators.simulation.simulation import Simulation
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid
+from fieldtwin.emulators.signals import Signals
+from fieldtwin.emulators.simulation.simulation import Simulation
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid
 
 
 class SimulatedSignals(Signals):

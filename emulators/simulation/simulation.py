@@ -10,10 +10,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
 
-from emulators.simulation.formula import STEP, TIME, Formula
-from emulators.simulation.python_model import PythonModel
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula
+from fieldtwin.emulators.simulation.python_model import PythonModel
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 MAX_STEPS = 100_000
 """Steps taken at once after nobody looked for long. What is older is left out, and counted."""

@@ -1,4 +1,4 @@
-"""`gateway.core.clock.Clock` on a virtual loop."""
+"""`fieldtwin.gateway.core.clock.Clock` on a virtual loop."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Callable
 from functools import partial
 from operator import attrgetter
 
-from emulators.virtual.loop import VirtualLoop
-from gateway.core.clock import NS_PER_S
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 EPOCH_UTC_NS = 1_767_225_600 * NS_PER_S
 """2026-01-01T00:00:00Z: the day on which every virtual run begins, so that its trace names the same moments."""

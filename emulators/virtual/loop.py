@@ -19,10 +19,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TypeVar, TypeVarTuple
 
-from emulators.virtual.interrupts import Interrupts
-from emulators.virtual.waiting import waits_at
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import Bug
+from fieldtwin.emulators.virtual.interrupts import Interrupts
+from fieldtwin.emulators.virtual.waiting import waits_at
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import Bug
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
@@ -166,7 +166,7 @@ class VirtualLoop(asyncio.AbstractEventLoop):
         return future
 
     def alarm(self, delay_s: float) -> asyncio.Future[None]:
-        """As `sleeper`, in seconds from now (`gateway.core.alarm`). Whoever has it may set it before."""
+        """As `sleeper`, in seconds from now (`fieldtwin.gateway.core.alarm`). Whoever has it may set it before."""
         return self.sleeper(self.now_ns + round(delay_s * NS_PER_S))
 
     def _compact(self) -> None:

@@ -11,20 +11,20 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from emulators.endpoints.bus_runner import AttachedConnection, BusRunner
-from emulators.endpoints.ports import OnClient
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.wire import MemoryEnd, MemoryWire
-from gateway.core.connection import ByteConnection, CanConnection, Client, closed_here
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, UsageError
-from gateway.core.nursery import Nursery
+from fieldtwin.emulators.endpoints.bus_runner import AttachedConnection, BusRunner
+from fieldtwin.emulators.endpoints.ports import OnClient
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.wire import MemoryEnd, MemoryWire
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Client, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
 
 FIRST_PORT = 50_000
 
 
 class MemoryNet:
-    """`emulators.endpoints.ports.Ports` for the field side and `Connector` for the gateway."""
+    """`fieldtwin.emulators.endpoints.ports.Ports` for the field side and `Connector` for the gateway."""
 
     def __init__(self, loop: VirtualLoop) -> None:
         self.loop = loop
@@ -107,8 +107,8 @@ class MemoryNet:
         admits: Callable[[str], bool],
         idle_s: float,
     ) -> _Listener:
-        """`gateway.core.connection.Listen`: what the gateway serves to others, in memory. Everybody is admitted, and may be
-        silent for as long as they like."""
+        """`fieldtwin.gateway.core.connection.Listen`: what the gateway serves to others, in memory. Everybody is admitted, and
+        may be silent for as long as they like."""
         bound = self._bound(endpoint)
         listener = _Listener(self, bound, on_client, max_clients)
         self._listeners[_key(bound)] = listener
@@ -160,7 +160,7 @@ class _SerialPort:
 
 
 class _Listener:
-    """The field's listeners, and the gateway's own (`gateway.core.connection.Clients`)."""
+    """The field's listeners, and the gateway's own (`fieldtwin.gateway.core.connection.Clients`)."""
 
     def __init__(
         self, net: MemoryNet, bound: Endpoint, on_client: Callable[[Client], Awaitable[None]], max_clients: int
@@ -204,7 +204,7 @@ class _Listener:
 
 
 class MemoryDatagrams:
-    """`emulators.endpoints.ports.Datagrams` in memory: what a client writes is one datagram."""
+    """`fieldtwin.emulators.endpoints.ports.Datagrams` in memory: what a client writes is one datagram."""
 
     def __init__(self, net: MemoryNet, bound: Endpoint) -> None:
         self.bound = bound
@@ -253,7 +253,7 @@ class MemoryDatagrams:
 
 
 class MemoryBus:
-    """`emulators.endpoints.ports.CanPort`: the bus model itself, joined without a socket."""
+    """`fieldtwin.emulators.endpoints.ports.CanPort`: the bus model itself, joined without a socket."""
 
     def __init__(self, net: MemoryNet, bound: Endpoint, runner: BusRunner) -> None:
         self.bound = bound

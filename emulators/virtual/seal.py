@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from emulators.virtual.loop import escape
-from emulators.virtual.taken_clocks import guarded_date, replaced
+from fieldtwin.emulators.virtual.loop import escape
+from fieldtwin.emulators.virtual.taken_clocks import guarded_date, replaced
 
 _CLOCKS = (
     *("time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "sleep"),

@@ -1,7 +1,7 @@
 """Clocks that a module has taken by name: ``from time import monotonic``, ``from datetime import datetime``.
 
-What `emulators.virtual.seal` puts into ``time`` does not reach these. They are found in the globals of loaded modules that are
-neither Python's own nor installed beside it: the user's programs and models. A module is looked through once.
+What `fieldtwin.emulators.virtual.seal` puts into ``time`` does not reach these. They are found in the globals of loaded modules
+that are neither Python's own nor installed beside it: the user's programs and models. A module is looked through once.
 """
 
 from __future__ import annotations

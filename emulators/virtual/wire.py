@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import asyncio
 
-from emulators.virtual.loop import VirtualLoop
-from emulators.wires.serial_line import SerialPacer
-from gateway.core.connection import Client, Connection, Direction, RS232Connection, TCPConnection, closed_here
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import ConnectionLost, FieldtwinError
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.wires.serial_line import SerialPacer
+from fieldtwin.gateway.core.connection import Client, Connection, Direction, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError
 
 MAX_PENDING = 1024
 SENT = Direction.SENT

@@ -17,8 +17,8 @@ from heapq import heappop, heappush
 from math import dist
 from random import Random
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
 
 QUEUE = 4
 """Packets that wait in a modem to be said; it takes no more."""

@@ -10,17 +10,17 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from emulators.wires import can_verdict
-from emulators.wires.can_events import Delivery, Notice, WireFault
-from emulators.wires.can_faults import SUSPEND_BITS, Disturbance, Rule
-from emulators.wires.can_fd_timing import data_phase
-from emulators.wires.can_load import BusLoad
-from emulators.wires.can_nodes import BusOff, Node, Start
-from emulators.wires.can_timing import INTERFRAME_BITS, bits_to_end
-from emulators.wires.can_verdict import Verdict
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
+from fieldtwin.emulators.wires import can_verdict
+from fieldtwin.emulators.wires.can_events import Delivery, Notice, WireFault
+from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, Disturbance, Rule
+from fieldtwin.emulators.wires.can_fd_timing import data_phase
+from fieldtwin.emulators.wires.can_load import BusLoad
+from fieldtwin.emulators.wires.can_nodes import BusOff, Node, Start
+from fieldtwin.emulators.wires.can_timing import INTERFRAME_BITS, bits_to_end
+from fieldtwin.emulators.wires.can_verdict import Verdict
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 _ACTIVE = CanErrorState.ACTIVE
 

@@ -22,15 +22,15 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from emulators.wires import can_verdict
-from emulators.wires.can_attempts import Attempts
-from emulators.wires.can_events import Delivery, Notice, WireFault
-from emulators.wires.can_faults import SUSPEND_BITS, Rule
-from emulators.wires.can_nodes import Node, Pending, Start
-from emulators.wires.can_timing import arbitration_key, bits_to_end
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import Bug, EndpointBusy, UsageError
+from fieldtwin.emulators.wires import can_verdict
+from fieldtwin.emulators.wires.can_attempts import Attempts
+from fieldtwin.emulators.wires.can_events import Delivery, Notice, WireFault
+from fieldtwin.emulators.wires.can_faults import SUSPEND_BITS, Rule
+from fieldtwin.emulators.wires.can_nodes import Node, Pending, Start
+from fieldtwin.emulators.wires.can_timing import arbitration_key, bits_to_end
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import Bug, EndpointBusy, UsageError
 
 MAX_BITRATE, MAX_DATA_BITRATE = 1_000_000, 8_000_000
 

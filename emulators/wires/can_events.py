@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import msgspec
 
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class Delivery(msgspec.Struct, frozen=True, gc=False):

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
 
 WARNING_LIMIT, PASSIVE_LIMIT, BUS_OFF_LIMIT = 96, 128, 256
 RECOVERY_SEQUENCES, RECOVERY_BITS = 128, 11

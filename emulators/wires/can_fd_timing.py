@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 CRC17, CRC21 = (17, 0x1685B), (21, 0x102899)
 """Length and polynomial without its highest term; up to 16 bytes of data take the first."""

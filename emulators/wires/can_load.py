@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections import Counter, deque
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 MAX_IDS_COUNTED = 4096
 

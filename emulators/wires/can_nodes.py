@@ -11,8 +11,8 @@ from typing import Any
 
 import msgspec
 
-from emulators.wires.can_faults import RECOVERY_BITS, RECOVERY_SEQUENCES, Confinement
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.wires.can_faults import RECOVERY_BITS, RECOVERY_SEQUENCES, Confinement
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 class Pending(msgspec.Struct, frozen=True, gc=False):

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-from emulators.wires.can_fd_timing import fd_bits
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.wires.can_fd_timing import fd_bits
+from fieldtwin.gateway.core.canframe import CanFrame
 
 CRC15_POLYNOMIAL = 0x4599
 """x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1, without its highest term."""

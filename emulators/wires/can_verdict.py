@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 
-from emulators.wires.can_faults import Disturbance
-from emulators.wires.can_timing import (
+from fieldtwin.emulators.wires.can_faults import Disturbance
+from fieldtwin.emulators.wires.can_timing import (
     ERROR_DELIMITER_BITS,
     ERROR_FLAG_BITS,
     INTERFRAME_BITS,
@@ -21,7 +21,7 @@ from emulators.wires.can_timing import (
     last_errant_bit,
     wire_bits,
 )
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,8 @@ in-memory wire asks it, because neither is slowed down by the baud rate that is 
 
 from __future__ import annotations
 
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 FAST_BAUDRATE = 19200
 T1_5_FAST_NS, T3_5_FAST_NS = 750_000, 1_750_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fieldtwin.checking.canopen_wire import CanopenWire, Key, Reply, mux, shown
 from fieldtwin.checking.device_case import NotHere
 from fieldtwin.conformance.case import Finding, failed, passed
-from gateway.protocols.canopen.abort_codes import UNKNOWN_SPECIFIER
+from fieldtwin.gateway.protocols.canopen.abort_codes import UNKNOWN_SPECIFIER
 
 
 def aborted(reply: Reply, *codes: int) -> str:

@@ -23,7 +23,7 @@ from fieldtwin.checking.canopen_wire import (
 )
 from fieldtwin.checking.device_case import NotHere, Unsaid
 from fieldtwin.conformance.case import Finding, passed
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 START, STOP, ENTER_PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 0x01, 0x02, 0x80, 0x81, 0x82
 NAMES = {OPERATIONAL: "OPERATIONAL", STOPPED: "STOPPED", PRE_OPERATIONAL: "PRE-OPERATIONAL", 0: "boot-up"}

@@ -14,8 +14,8 @@ from fieldtwin.checking.canopen_judging import (
 from fieldtwin.checking.canopen_wire import SDO_REQUEST, CanopenWire, Key, Reply, mux, shown
 from fieldtwin.checking.device_case import NotHere, Unsaid
 from fieldtwin.conformance.case import Finding, failed, passed
-from gateway.core.canframe import CanFrame
-from gateway.protocols.canopen.sdo_block import crc16
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
 
 TOGGLE, UNKNOWN, BLOCK_SIZE = 0x0503_0000, 0x0504_0001, 0x0504_0002
 UNLIKELY = (0x5FFE, 0x5F0D, 0x2FFD, 0x1FFE)

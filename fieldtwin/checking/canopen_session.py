@@ -12,13 +12,13 @@ from fieldtwin.checking.checked import Checked, shown
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.run import Plan, Transcript, play
 from fieldtwin.commissioning.live import frames_at
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import NotAllowed, Unreachable
-from gateway.protocols.canopen.dictionary import load_dictionary
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import NotAllowed, Unreachable
+from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.wallclock import WallClock
 
 NAMES = {(0x1008, 0): "name", (0x1009, 0): "hardware", (0x100A, 0): "software"}
 NUMBERS = {1: "vendor id", 2: "product code", 3: "revision", 4: "serial number"}

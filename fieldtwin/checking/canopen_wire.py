@@ -11,12 +11,12 @@ from collections import deque
 from dataclasses import dataclass
 
 from fieldtwin.conformance.case import Danger
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import CanConnection
-from gateway.core.errors import Bug, ConnectionLost
-from gateway.protocols.canopen.abort_codes import meaning
-from gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.errors import Bug, ConnectionLost
+from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 READS = frozenset({2, 3, 4, 5})
 """Client command specifiers that write nothing: upload, its segments, abort, block upload (7.2.4.3)."""

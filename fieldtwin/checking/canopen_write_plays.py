@@ -12,8 +12,8 @@ from fieldtwin.checking.canopen_judging import aborted, must_abort, present, ver
 from fieldtwin.checking.canopen_wire import ERROR_CONTROL, CanopenWire, Key, Reply, mux, shown
 from fieldtwin.checking.device_case import NotHere, Unsaid
 from fieldtwin.conformance.case import Danger, Finding
-from gateway.protocols.canopen.datatypes import DataType
-from gateway.protocols.canopen.sdo_block import crc16
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.sdo_block import crc16
 
 UNKNOWN, CRC, READ_ONLY = 0x0504_0001, 0x0504_0004, 0x0601_0002
 TOO_LONG, TOO_SHORT, TOO_HIGH, TOO_LOW = 0x0607_0012, 0x0607_0013, 0x0609_0031, 0x0609_0032

@@ -11,7 +11,7 @@ from typing import Generic, TypeVar
 
 from fieldtwin.conformance.case import About, Finding
 from fieldtwin.conformance.results import CaseResult
-from gateway.core.connection import Direction
+from fieldtwin.gateway.core.connection import Direction
 
 W = TypeVar("W")
 Play = Callable[[W], Awaitable[Finding]]

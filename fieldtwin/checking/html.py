@@ -22,13 +22,13 @@ from fieldtwin.checking.verdict_html import (
     verdict_pill,
 )
 from fieldtwin.conformance.results import summary
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.report.file import put
 from fieldtwin.report.html import pill
 from fieldtwin.report.markup import Markup, el, page
 from fieldtwin.report.model import Verdict
 from fieldtwin.report.style import style
-from gateway.core.clock import NS_PER_MS
-from gateway.core.connection import Direction
 
 MOST_LINES = 60
 """Of one case's bytes."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from gateway.protocols.modbus.ascii import lrc
-from gateway.protocols.modbus.crc import crc16, with_crc
-from gateway.protocols.modbus.frame_shapes import MAX_FRAME, frame_lengths
+from fieldtwin.gateway.protocols.modbus.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, frame_lengths
 
 NO_TRANSACTION = -1
 _STEP = [crc16(bytes((index ^ 0xFF,))) ^ 0xFF for index in range(256)]

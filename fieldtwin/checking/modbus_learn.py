@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from fieldtwin.checking.modbus_frames import Answer
 from fieldtwin.checking.modbus_wire import GATEWAY_SAYS_NO, ModbusWire
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.errors import Unreachable
 
 FUNCTION = {"coil": 0x01, "discrete": 0x02, "holding": 0x03, "input": 0x04}
 TABLE = {number: name for name, number in FUNCTION.items()}

@@ -11,8 +11,8 @@ from fieldtwin.checking.modbus_judging import answers_good, silent_then_good
 from fieldtwin.checking.modbus_learn import read_of
 from fieldtwin.checking.modbus_wire import ModbusWire
 from fieldtwin.conformance.case import Finding, failed, passed
-from gateway.protocols.modbus.ascii import lrc
-from gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
 LONG_PAUSE_S = 0.1
 """Ends any RTU frame at any baud rate from 1200 on."""

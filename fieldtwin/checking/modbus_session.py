@@ -13,12 +13,12 @@ from fieldtwin.checking.modbus_learn import learn
 from fieldtwin.checking.modbus_wire import ModbusWire
 from fieldtwin.checking.run import Plan, Transcript, play
 from fieldtwin.commissioning.live import bytes_at
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, Connector, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import NotAllowed
-from gateway.protocols.modbus.framings import framing_of
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import NotAllowed
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.wallclock import WallClock
 
 OBJECT_NAMES = {
     0: "vendor",

@@ -10,7 +10,7 @@ from fieldtwin.checking.modbus_frames import Answer, mbap
 from fieldtwin.checking.modbus_judging import answers_good, named
 from fieldtwin.checking.modbus_wire import GATEWAY_SAYS_NO, ModbusWire
 from fieldtwin.conformance.case import Finding, failed, passed
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.errors import Unreachable
 
 
 def _adu(wire: ModbusWire, transaction: int, protocol: int = 0, length: int | None = None) -> bytes:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from fieldtwin.checking.modbus_frames import Answer, framed, replies, short
 from fieldtwin.conformance.case import Danger
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection
-from gateway.core.errors import Bug, ConnectionLost, Unreachable
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.errors import Bug, ConnectionLost, Unreachable
 
 READS = frozenset({0x01, 0x02, 0x03, 0x04, 0x11, 0x18, 0x2B})
 """Functions that change nothing in any device that keeps to the standard, with whatever parameters."""

@@ -11,26 +11,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from emulators.canopen.dictionary import load_eds, parse_eds
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.ports import OnClient
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.identification import Identification
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
-from emulators.modbus.unit import ModbusUnit
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
 from fieldtwin.checking.checked import Checked
 from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
+from fieldtwin.emulators.canopen.dictionary import load_eds, parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.ports import OnClient
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
 
 CELLS = 0x1_0000
 

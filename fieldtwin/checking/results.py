@@ -10,9 +10,9 @@ from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.subject import Subject
 from fieldtwin.conformance.case import Basis
 from fieldtwin.conformance.results import ONLY_REQUIRED, for_build, summary
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.report.model import CheckResult, Report, ScenarioResult
-from gateway.core.clock import NS_PER_MS
-from gateway.core.connection import Direction
 
 KIND = "fieldtwin check"
 VERSION = 2

@@ -11,11 +11,11 @@ from typing import Protocol, TypeVar
 
 from fieldtwin.checking.device_case import DeviceCase, DeviceResult, NotHere, Spoken, Unsaid
 from fieldtwin.conformance.case import OTHER_WIRE, Danger, Finding, failed, inconclusive, skipped
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
 
 MOST_SPOKEN = 400
 """Chunks or frames that are kept of a case; of more the first ones."""

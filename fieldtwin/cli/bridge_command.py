@@ -9,11 +9,11 @@ import click
 
 from fieldtwin.cli.options import Duration, json_option, pairs
 from fieldtwin.cli.talk import talk
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.runtime.bridge_policy import LOOPBACK, network
+from fieldtwin.gateway.wallclock import run
 from fieldtwin.running.bridging import BridgeOptions, run_bridge
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.runtime.bridge_policy import LOOPBACK, network
-from gateway.wallclock import run
 
 ANYWHERE = ("127.0.0.1", "::1", "localhost", "")
 

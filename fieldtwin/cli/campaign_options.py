@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from fieldtwin.cli.options import Duration
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
     from fieldtwin.running.fault_schedule import RandomFaults
@@ -69,14 +69,15 @@ class Choice(NamedTuple):
 
     def of(self, faults: str | None) -> RandomFaults | None:
         """Return what seeds may choose from; None without random faults. Raise `UsageError` for options without effect."""
-        from fieldtwin.running.fault_schedule import MEAN_S, RandomFaults
-
         if faults != "random":
             if self.every_s is not None or self.kinds or self.aims:
                 raise UsageError(
                     "--fault-every, --fault-kinds and --fault-aims choose random faults", expected="--faults random"
                 )
             return None
+        # Here, because it loads emulators, which a plant does not need.
+        from fieldtwin.running.fault_schedule import MEAN_S, RandomFaults
+
         return RandomFaults(MEAN_S if self.every_s is None else self.every_s, self.kinds, self.aims)
 
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import click
 
-from emulators.endpoints.bus_bridge import CanBridge
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.endpoints.slcan_port import SlcanPort
 from fieldtwin.cli.talk import talk
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.endpoints.bus_bridge import CanBridge
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 
 @click.command("can-bus")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from difflib import get_close_matches
 from typing import Protocol
 
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 _ID = re.compile(r"^((?:MB|CO)-)?(\d{1,3})([a-h]?)$", re.IGNORECASE)
 

@@ -19,13 +19,13 @@ from fieldtwin.cli.check_cases import only_of
 from fieldtwin.cli.check_device_command import canopen, modbus
 from fieldtwin.cli.fail_on import bases_of, fail_on_option, print_not_counted
 from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
-    from emulators.modbus.bank import Table
     from fieldtwin.conformance.case import Basis, Case
     from fieldtwin.conformance.results import CaseResult
+    from fieldtwin.emulators.modbus.bank import Table
 
 FILE = click.Path(dir_okay=False, path_type=Path)
 DANGERS = ("observe", "read", "write", "disrupt")
@@ -311,7 +311,7 @@ def _judged(
     from fieldtwin.conformance.results import as_json as data_of
     from fieldtwin.conformance.results import exit_code, waive
     from fieldtwin.conformance.waivers import Waivers, load_waivers
-    from gateway.wallclock import run
+    from fieldtwin.gateway.wallclock import run
 
     argv = sys.argv[1:]
     known = {case.id for case in cases} | {case.row for case in cases}

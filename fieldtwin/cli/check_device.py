@@ -17,7 +17,7 @@ import click
 
 from fieldtwin.cli.fail_on import bases_of, fail_on_option, print_not_counted
 from fieldtwin.cli.options import Duration, json_option, junit_flavour_option
-from gateway.core.errors import NotAllowed, UsageError
+from fieldtwin.gateway.core.errors import NotAllowed, UsageError
 
 if TYPE_CHECKING:
     from fieldtwin.checking.checked import Checked
@@ -151,7 +151,7 @@ class Check:
         from fieldtwin.cli.check_view import Progress
         from fieldtwin.cli.talk import talk
         from fieldtwin.commissioning.wire_log import WireLog
-        from gateway.wallclock import run
+        from fieldtwin.gateway.wallclock import run
 
         with ExitStack() as stack:
             path = self.options["log_path"]
@@ -224,7 +224,7 @@ def list_cases(cases: Sequence[DeviceCase[Any]], as_json: bool) -> int:
 
 
 def _write(path: Path, text: str) -> None:
-    from gateway.core.errors import FileInvalid
+    from fieldtwin.gateway.core.errors import FileInvalid
 
     try:
         path.write_text(text, encoding="utf-8")

@@ -12,8 +12,8 @@ import click
 
 from fieldtwin.cli.check_device import Check, list_cases, shared
 from fieldtwin.cli.options import Duration
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 _CELL = re.compile(r"^(holding|coil|input|discrete):(0[xX][0-9A-Fa-f]{1,4}|\d{1,5})(?:\+(\d{1,3}))?$")
 _OBJECT = re.compile(r"^([0-9A-Fa-f]{4})h?(?::([0-9A-Fa-f]{1,2}))?$")

@@ -19,8 +19,8 @@ from rich.table import Table
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.conformance.case import OTHER_WIRE, Basis
 from fieldtwin.conformance.results import FOUND, called
+from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.report.model import Verdict
-from gateway.core.connection import Direction
 
 if TYPE_CHECKING:
     from fieldtwin.checking.checked import Checked

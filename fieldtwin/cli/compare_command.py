@@ -19,19 +19,19 @@ from fieldtwin.cli.device_options import device_options, logged, target_from
 from fieldtwin.cli.options import Duration, json_option, pairs
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.formats.candump import read_log
+from fieldtwin.gateway.core.endpoint import SCHEMES
+from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import shown
+from fieldtwin.gateway.protocols.canopen.sdo import SdoUpload
+from fieldtwin.gateway.wallclock import run as run_precise
 from fieldtwin.recording.asking import asker_at, changes, frame_for
 from fieldtwin.recording.comparing import Comparer, Comparison, Rules, Tolerance, pairs_of, request_of
 from fieldtwin.recording.comparing_can import Frames, compare_logs
 from fieldtwin.recording.live_comparing import compare_device, compare_node, uploads_of
 from fieldtwin.recording.rotating import exchanges_of, header_of, parts_of
 from fieldtwin.sitereport.about import headed
-from gateway.core.endpoint import SCHEMES
-from gateway.core.errors import FileInvalid, NotAllowed, UsageError
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import shown
-from gateway.protocols.canopen.sdo import SdoUpload
-from gateway.wallclock import run as run_precise
-from twin.data_files import find
+from fieldtwin.twin.data_files import find
 
 SHOWN = 20
 INCONCLUSIVE = 4

@@ -15,8 +15,8 @@ from fieldtwin.cli.options import Duration, profiles_option
 from fieldtwin.commissioning.address import ORDERS, TYPES, RawForm
 from fieldtwin.commissioning.reading import Target, target_of
 from fieldtwin.commissioning.wire_log import WireLog
-from gateway.core.connection import Tap
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.connection import Tap
+from fieldtwin.gateway.core.errors import UsageError
 
 F = TypeVar("F", bound=Callable[..., Any])
 

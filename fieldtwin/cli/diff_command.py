@@ -14,11 +14,11 @@ from fieldtwin.cli.options import json_option, pairs, profiles_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.commissioning.diff import Differences, Leave, diff_dictionary, diff_dumps, diff_profile
 from fieldtwin.commissioning.dump_file import Dump, load_dump
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
 from fieldtwin.sitereport.about import headed
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
-from twin.data_files import find, search_path
+from fieldtwin.twin.data_files import find, search_path
 
 DIFFERENT = 1
 

@@ -20,8 +20,8 @@ from fieldtwin.commissioning.dump import Progress as Told
 from fieldtwin.commissioning.dump_file import Dump, load_dump
 from fieldtwin.commissioning.dump_profile import dumped_tags
 from fieldtwin.commissioning.dumping import dump, estimate, frames, log_path, object_ranges, register_spans
-from gateway.core.errors import Unreachable, UsageError
-from gateway.wallclock import run as run_precise
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.wallclock import run as run_precise
 
 
 @click.command("dump")

@@ -12,8 +12,8 @@ from rich.text import Text
 from fieldtwin.commissioning.coverage import STATE_KEYS, STATE_NAMES
 from fieldtwin.commissioning.dump_file import Dump
 from fieldtwin.commissioning.dumping import Estimate
-from gateway.core.errors import ModbusExceptionReply
-from gateway.core.profile import gap_text, resolve_gap
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.core.profile import gap_text, resolve_gap
 
 FUNCTION_NAMES = {
     1: "read coils", 2: "read discrete inputs", 3: "read holding registers", 4: "read input registers",

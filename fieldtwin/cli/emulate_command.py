@@ -9,9 +9,9 @@ import click
 
 from fieldtwin.cli.options import Secret, pairs, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.running.field_contact import DEFAULT_CONTROL_PORT
-from gateway.core.errors import UsageError
-from twin.data_files import data_root, find
+from fieldtwin.twin.data_files import data_root, find
 
 if TYPE_CHECKING:
     from fieldtwin.running.device_here import Extras
@@ -161,9 +161,9 @@ def command(
                 "--on, --unit, --node and --bitrate are for a single device",
                 hint="a system's prototype file says where it listens",
             )
+        from fieldtwin.gateway.wallclock import run as run_precise
         from fieldtwin.running.field_here import FieldOptions, run_field
         from fieldtwin.running.template_here import system_file
-        from gateway.wallclock import run as run_precise
 
         file, folders = Path(prototype_file) if prototype_file else None, tuple(Path(p) for p in profiles)
         agreed = system_file(str(path), consent(trust=trust), prototype_file=file, profiles=folders)
@@ -183,9 +183,9 @@ def command(
                 )
             )
         )
-    from emulators.context import WhenUsedUp
-    from emulators.models.emulated_node import NodeOptions
-    from emulators.replay.replay import NeverRecorded
+    from fieldtwin.emulators.context import WhenUsedUp
+    from fieldtwin.emulators.models.emulated_node import NodeOptions
+    from fieldtwin.emulators.replay.replay import NeverRecorded
     from fieldtwin.running.device_here import run_device
     from fieldtwin.running.loops import run as run_loop
 
@@ -235,10 +235,10 @@ def _extras(
     any_unit: bool,
 ) -> Extras | None:
     """What else a Modbus device is given; None: nothing. Raises `UsageError` and `FileInvalid`."""
-    from emulators.faults.of_device import check_device
-    from emulators.faults.schema import load_faults
+    from fieldtwin.emulators.faults.of_device import check_device
+    from fieldtwin.emulators.faults.schema import load_faults
+    from fieldtwin.gateway.core.profile import load_profile
     from fieldtwin.running.device_here import Extras
-    from gateway.core.profile import load_profile
 
     if not (values or faults_file or any_unit):
         return None
@@ -265,7 +265,7 @@ def _extras(
 
 def _values(said: tuple[str, ...]) -> dict[str, float | str]:
     """The values of ``TAG=VALUE`` and of YAML files with a mapping of tags to values. A later one counts."""
-    from gateway.core.yaml_file import load
+    from fieldtwin.gateway.core.yaml_file import load
 
     found: dict[str, float | str] = {}
     for one in said:
@@ -290,7 +290,7 @@ def _number_or_text(text: str) -> float | str:
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
     """What `what` names: ("system" | "device" | "recording" | "log" | "data sheet", file)."""
-    from twin.template_package import is_template
+    from fieldtwin.twin.template_package import is_template
 
     direct = Path(what)
     if is_template(direct):
@@ -303,7 +303,7 @@ def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
         shipped = data_root() / "recordings" / what
         return "recording", direct if direct.is_file() else shipped
     if direct.is_file():
-        from gateway.core.yaml_file import load
+        from fieldtwin.gateway.core.yaml_file import load
 
         return ("system" if "system" in load(direct).data else "device"), direct
     try:

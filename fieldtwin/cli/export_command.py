@@ -10,8 +10,8 @@ import click
 
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import data
-from gateway.core.profile import load_profile
-from twin.data_files import find
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.twin.data_files import find
 
 
 @click.command("export")

@@ -9,9 +9,9 @@ from typing import Any
 import click
 from rich.table import Table
 
-from emulators.faults.fault import Fault
 from fieldtwin.cli.options import json_option
 from fieldtwin.cli.talk import data
+from fieldtwin.emulators.faults.fault import Fault
 
 
 @click.command("faults")
@@ -25,7 +25,7 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
     device, unit, function, address or register, registers, cob_id, direction (request, reply, both), nth, every,
     from, until, probability.
     """
-    from emulators.faults.registry import FAULTS, fault_class
+    from fieldtwin.emulators.faults.registry import FAULTS, fault_class
 
     chosen = [fault_class(name) for name in names] or list(FAULTS.values())
     described = [_described(kind) for kind in chosen]
@@ -47,7 +47,7 @@ def command(names: tuple[str, ...], as_json: bool) -> int:
 
 def _described(kind: type[Fault]) -> dict[str, Any]:
     """A fault as JSON; its parameters as JSON schema has them."""
-    from emulators.faults.schema import aims_of
+    from fieldtwin.emulators.faults.schema import aims_of
 
     own = kind.form.model_json_schema().get("properties", {})
     for parameter in own.values():

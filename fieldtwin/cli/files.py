@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 
 def write_text(path: Path, text: str) -> None:

@@ -19,11 +19,11 @@ from fieldtwin.cli.talk import data, talk
 from fieldtwin.commissioning.identify_canopen import CanIdentity, identify_canopen
 from fieldtwin.commissioning.identify_modbus import NAMES, ModbusIdentity, identify_modbus, modbus_frames
 from fieldtwin.commissioning.matching import Candidate, Sureness
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.wallclock import run as run_precise
-from twin.data_files import search_path
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.wallclock import run as run_precise
+from fieldtwin.twin.data_files import search_path
 
 COLOUR = {
     Sureness.CERTAIN: "bold green",

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TimeRemainingColu
 from fieldtwin.cli.options import json_option, pairs
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.formats.cnv import import_cnv
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 _SUFFIXES = (
     ".gz",

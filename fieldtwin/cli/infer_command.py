@@ -18,8 +18,8 @@ from fieldtwin.commissioning.infer import Inference, infer, series_of
 from fieldtwin.commissioning.infer_draft import checked, doubts, draft_profile
 from fieldtwin.commissioning.infer_fields import FEWEST_PASSES, Level, Reading
 from fieldtwin.commissioning.recorded_passes import dump_of_recording
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.recording.rotating import exchanges_of, header_of
-from gateway.core.errors import FileInvalid
 
 MOST_HEADER_BYTES = 65_536
 COLOUR = {Level.CERTAIN: "green", Level.LIKELY: "", Level.GUESS: "yellow", Level.UNKNOWN: "red"}

@@ -17,7 +17,7 @@ from fieldtwin.cli.scan_progress import ScanProgress
 from fieldtwin.cli.stop_key import StopKey
 from fieldtwin.cli.talk import data
 from fieldtwin.commissioning.line import LineLook, LineReport, look_at_line
-from gateway.wallclock import run as run_precise
+from fieldtwin.gateway.wallclock import run as run_precise
 
 
 @click.command("line")

@@ -11,20 +11,20 @@ from typing import Any
 
 import click
 
-from emulators.can_link import CanLink
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.faults.engine import WireFaults
-from emulators.faults.frames import Framing, Way
-from emulators.faults.on_link import check_can_link, check_link, wire_faults
-from emulators.faults.schema import FaultSpec, load_faults
-from emulators.link import run_link
 from fieldtwin.cli.struck import struck
 from fieldtwin.cli.talk import talk
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.can_link import CanLink
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.on_link import check_can_link, check_link, wire_faults
+from fieldtwin.emulators.faults.schema import FaultSpec, load_faults
+from fieldtwin.emulators.link import run_link
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 BITRATE = 125_000
 """Of a bus that the link runs itself, where its endpoint does not say ``bitrate=``."""

@@ -148,7 +148,7 @@ def cli() -> None:
 def main() -> None:
     """The console script. Never shows a traceback unless FIELDTWIN_TRACEBACK is set."""
     from fieldtwin.cli.plain_letters import write_plainly
-    from gateway.core.errors import FieldtwinError, FileInvalid
+    from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
     write_plainly()
     talk_unheard()

@@ -15,12 +15,14 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from emulators.faults.schema import load_faults
 from fieldtwin.cli.live_view import print_faults, troubles
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.talk import data, show_warnings, talk
 from fieldtwin.cli.template_question import consent
 from fieldtwin.cli.virtual_view import parse_seeds, progress_bar, run_many, shown_time
+from fieldtwin.emulators.faults.schema import load_faults
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.network_session import NetworkOptions, NetworkSession
 from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.session import RunSession
@@ -28,10 +30,8 @@ from fieldtwin.running.shore import Scripted, script
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.template_here import agree
 from fieldtwin.running.virtual_network_run import VirtualNetworkOptions
-from gateway.core.errors import FieldtwinError, UsageError
-from gateway.wallclock import WallClock
-from twin.network import SHIP, Network, load_network
-from twin.network_faults import check_network_fault
+from fieldtwin.twin.network import SHIP, Network, load_network
+from fieldtwin.twin.network_faults import check_network_fault
 
 FIRST_S = 1.0
 BASE_S = 10

@@ -13,8 +13,8 @@ from fieldtwin.cli.files import write_text
 from fieldtwin.cli.options import NegativeNumbers, json_option, profiles_option
 from fieldtwin.cli.talk import talk
 from fieldtwin.cli.template_question import consent, trust_option
-from gateway.core.errors import UsageError
-from twin.system import System, load_system
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.twin.system import System, load_system
 
 instance_option = click.option(
     "--instance", default="", metavar="NAME", help="Which one; default: the only one that runs."
@@ -230,8 +230,8 @@ def _agreed(system: str, profiles: tuple[str, ...], *, trust: bool) -> System:
 @profiles_option
 def diagram(system: str, program: str, output: Path | None, trust: bool, profiles: tuple[str, ...]) -> int:
     """Draw the state table of a program of SYSTEM as SVG."""
+    from fieldtwin.plc.diagram import svg
     from fieldtwin.running.plc_client import chosen, table_of
-    from plc.diagram import svg
 
     loaded = _agreed(system, profiles, trust=trust)
     name, table = chosen(loaded, program, table_of, "a state table")
@@ -271,9 +271,9 @@ def prove(
     _proof behind). Exit 1 with a shortest counterexample, or when the bounds were reached before everything was seen.
     """
     from fieldtwin.cli.plc_views import print_proof
+    from fieldtwin.plc.prove import prove as look
     from fieldtwin.running.counterexample import scenario
     from fieldtwin.running.plc_client import chosen, proof_of
-    from plc.prove import prove as look
 
     loaded = _agreed(system, profiles, trust=trust)
     name, proof = chosen(loaded, program, proof_of, "a proof")

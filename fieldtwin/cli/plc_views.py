@@ -12,10 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from fieldtwin.cli.talk import data, talk
-from gateway.core.control import ControlClient
-from gateway.core.errors import UsageError
-from plc.prove import Proof, Result
-from plc.tag_view import MAX_AT_ONCE, matches
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.plc.prove import Proof, Result
+from fieldtwin.plc.tag_view import MAX_AT_ONCE, matches
 
 REFRESH_S = 0.25
 IN_A_PIPE = 500

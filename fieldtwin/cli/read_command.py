@@ -15,9 +15,9 @@ from fieldtwin.cli.value_table import exit_code, value_table
 from fieldtwin.commissioning.address import tags_of
 from fieldtwin.commissioning.point import Answer
 from fieldtwin.commissioning.reading import Target, dry_point, read_all, row_of
-from gateway.core.errors import NotAllowed
-from gateway.core.profile import Tag
-from gateway.wallclock import run as run_precise
+from fieldtwin.gateway.core.errors import NotAllowed
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.wallclock import run as run_precise
 
 
 @click.command("read")

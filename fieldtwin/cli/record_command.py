@@ -20,6 +20,13 @@ from fieldtwin.cli.options import Duration, json_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.commissioning.address import tags_of
 from fieldtwin.commissioning.reading import Target, dry_point
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.recording import RecordingHeader, encode_header
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.gateway.wallclock import run as run_precise
 from fieldtwin.recording.asking import frame_for
 from fieldtwin.recording.importing import TextSummary, import_capture
 from fieldtwin.recording.polling import (
@@ -35,13 +42,6 @@ from fieldtwin.recording.rotating import MB, RotatingFile, exchanges_of, header_
 from fieldtwin.recording.sinks import CanLogSink, ExchangeSink, LineSink
 from fieldtwin.recording.sniffing import LineSniffer
 from fieldtwin.recording.tapping import LineTap
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.recording import RecordingHeader, encode_header
-from gateway.wallclock import WallClock
-from gateway.wallclock import run as run_precise
 
 REFRESH_S = 0.5
 
@@ -154,7 +154,7 @@ def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[str, .
     """A recorded run as a scenario, with the tolerances that `fieldtwin trace --as-scenario` has by itself."""
     from fieldtwin.cli.regression_view import write_scenario
     from fieldtwin.regression.comparing import Allowed
-    from twin.system import load_system
+    from fieldtwin.twin.system import load_system
 
     if run is None:
         raise UsageError("which run?", expected="the file of run --virtual --trace, or of run --capture")

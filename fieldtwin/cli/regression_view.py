@@ -12,11 +12,11 @@ from rich.markup import escape
 
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.decoding.trace_file import read_events
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.regression.as_scenario import Wanted, as_scenario
 from fieldtwin.regression.comparing import Allowed, Verdict, compare
 from fieldtwin.regression.story import story_of
-from gateway.core.errors import UsageError
-from twin.system import System
+from fieldtwin.twin.system import System
 
 SHOWN = 30
 LENGTHS_S = 1.0

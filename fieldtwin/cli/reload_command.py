@@ -11,7 +11,7 @@ import sys
 import click
 
 from fieldtwin.cli.options import json_option
-from gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.errors import FieldtwinError
 
 NEEDS_RESTART = 1
 
@@ -29,8 +29,8 @@ def command(instance: str, check: bool, as_json: bool) -> int:
     changes nothing either (3).
     """
     from fieldtwin.cli.talk import show_warnings
+    from fieldtwin.gateway.core.control import RemoteError
     from fieldtwin.running.reloading import reload_instance
-    from gateway.core.control import RemoteError
 
     try:
         done = asyncio.run(reload_instance(instance, _who(), check=check))

@@ -12,7 +12,7 @@ import click
 
 from fieldtwin.cli.options import json_option, pairs
 from fieldtwin.cli.talk import talk
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 
 @click.command("report")

@@ -18,6 +18,7 @@ from fieldtwin.cli.campaign_options import Choice, fault_choice
 from fieldtwin.cli.network_request import NetworkRequest
 from fieldtwin.cli.options import Duration, Secret, json_option, pairs, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import DEFAULT_SCRIPT, parse_periods
@@ -26,8 +27,7 @@ from fieldtwin.running.template_here import system_file
 from fieldtwin.service.attached import Service, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
-from gateway.core.errors import FieldtwinError, UsageError
-from twin.data_files import network_file
+from fieldtwin.twin.data_files import network_file
 
 if TYPE_CHECKING:
     from fieldtwin.running.fault_schedule import RandomFaults
@@ -293,9 +293,9 @@ def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int
 
 
 def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
-    from emulators.faults.schema import load_faults
-    from twin.fault_aims import target
-    from twin.system import load_system
+    from fieldtwin.emulators.faults.schema import load_faults
+    from fieldtwin.twin.fault_aims import target
+    from fieldtwin.twin.system import load_system
 
     if path == "random":
         raise UsageError("random faults go with --virtual")
@@ -353,7 +353,7 @@ def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
     from fieldtwin.cli.regression_view import judged, show
     from fieldtwin.cli.virtual_view import run_one
     from fieldtwin.regression.comparing import Allowed
-    from twin.system import load_system
+    from fieldtwin.twin.system import load_system
 
     if as_json:
         raise UsageError(

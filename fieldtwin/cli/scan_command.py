@@ -21,9 +21,9 @@ from fieldtwin.commissioning.scan_canopen import ALL_NODES, CanScan, CanScanner,
 from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.settings import name_of, seconds_of, with_settings
 from fieldtwin.commissioning.sweep import PROBE
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.wallclock import run as run_precise
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import run as run_precise
 
 INTERRUPTED = 130
 _PART = re.compile(r"^([0-9]{1,3})(?:-([0-9]{1,3}))?$")

@@ -14,7 +14,7 @@ from fieldtwin.commissioning.listening import describe
 from fieldtwin.commissioning.scan_canopen import CanScan
 from fieldtwin.commissioning.scan_modbus import FoundUnit, ModbusScan
 from fieldtwin.commissioning.settings import name_of
-from gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 
 def show_modbus(scan: ModbusScan) -> None:

@@ -11,38 +11,38 @@ import click
 
 
 def _system() -> dict[str, Any]:
-    from twin.system_schema import SystemForm
+    from fieldtwin.twin.system_schema import SystemForm
 
     return SystemForm.model_json_schema()
 
 
 def _prototype() -> dict[str, Any]:
-    from twin.system_schema import PrototypeForm
+    from fieldtwin.twin.system_schema import PrototypeForm
 
     return PrototypeForm.model_json_schema()
 
 
 def _network() -> dict[str, Any]:
-    from twin.network_schema import NetworkForm
+    from fieldtwin.twin.network_schema import NetworkForm
 
     return NetworkForm.model_json_schema()
 
 
 def _profile() -> dict[str, Any]:
-    from gateway.core.profile_schema import ProfileForm
+    from fieldtwin.gateway.core.profile_schema import ProfileForm
 
     return ProfileForm.model_json_schema()
 
 
 def _faults() -> dict[str, Any]:
-    from emulators.faults.json_schema import fault_file_schema
+    from fieldtwin.emulators.faults.json_schema import fault_file_schema
 
     return fault_file_schema()
 
 
 def _scenario() -> dict[str, Any]:
     """The faults of its steps are those of fault files."""
-    from emulators.faults.json_schema import fault_defs
+    from fieldtwin.emulators.faults.json_schema import fault_defs
     from fieldtwin.scenarios.words import ScenarioForm
 
     schema = ScenarioForm.model_json_schema()

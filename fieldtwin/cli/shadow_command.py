@@ -15,12 +15,12 @@ from rich.markup import escape
 
 from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.talk import talk
+from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.running.shadowing import Shadowing
 from fieldtwin.running.template_here import system_file
-from gateway.core.errors import Unreachable
-from twin.instance import Instance
-from twin.mape.messages import Verdict
-from twin.system import System, load_system
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.mape.messages import Verdict
+from fieldtwin.twin.system import System, load_system
 
 STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "yellow", "unreadable": "red"}
 

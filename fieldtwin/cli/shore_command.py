@@ -12,12 +12,12 @@ import click
 
 from fieldtwin.cli.options import Duration, Secret, json_option, profiles_option
 from fieldtwin.cli.talk import talk
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.field_contact import connect_control, reachable
 from fieldtwin.running.shore import Shore, parse_periods, script
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.wallclock import WallClock
-from twin.system import System, load_system
+from fieldtwin.twin.system import System, load_system
 
 
 @click.command("shore")

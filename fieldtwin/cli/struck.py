@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from emulators.faults.fault import Active
+from fieldtwin.emulators.faults.fault import Active
 
 
 def struck(active: Active) -> str:

@@ -8,7 +8,7 @@ from typing import NoReturn
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 
-from gateway.core.visible import visible
+from fieldtwin.gateway.core.visible import visible
 
 
 class _Console(Console):

@@ -15,17 +15,17 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.cli.template_question import ask_about, shown
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.visible import visible
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.template_here import Stranger
-from gateway.core.errors import UsageError
-from gateway.core.visible import visible
-from gateway.wallclock import WallClock
-from twin.prototype_file import prototype_path
-from twin.software import modules_hash
-from twin.system import load_system
-from twin.template import DOCUMENTS, DocumentKind, Manifest
-from twin.template_check import Difference, differences, examine, put_together, software_difference, unified
-from twin.template_pack import Extras, collect, pack
-from twin.template_package import FolderPackage, open_package, unpack
+from fieldtwin.twin.prototype_file import prototype_path
+from fieldtwin.twin.software import modules_hash
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.template import DOCUMENTS, DocumentKind, Manifest
+from fieldtwin.twin.template_check import Difference, differences, examine, put_together, software_difference, unified
+from fieldtwin.twin.template_pack import Extras, collect, pack
+from fieldtwin.twin.template_package import FolderPackage, open_package, unpack
 
 KINDS: dict[str, DocumentKind] = {kind: kind for kind in DOCUMENTS}
 

@@ -22,11 +22,11 @@ from fieldtwin.cli.options import Secret, json_option, junit_flavour_option, pro
 from fieldtwin.cli.talk import data, show_warnings
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.conformance.case import Danger
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
     from fieldtwin.report.model import Machine, SystemKey
-    from twin.system import System
+    from fieldtwin.twin.system import System
 
 SUFFIX = ".scenario.yaml"
 _CONTROLLER = "fieldtwin.controller"

@@ -16,9 +16,9 @@ def command(trust: bool) -> int:
     The pytest plugin of fieldtwin starts it; docs/testing.md has the verbs. It ends when its input does. Nobody is
     there to be asked: without --trust nothing of a stranger's template is run.
     """
+    from fieldtwin.gateway.wallclock import run
     from fieldtwin.testhost.host import Host
-    from gateway.wallclock import run
-    from twin.child import allow_open_files
+    from fieldtwin.twin.child import allow_open_files
 
     allow_open_files()
     return run(Host(trust=trust).serve())

@@ -15,9 +15,9 @@ from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Decoded, Exchange
 from fieldtwin.decoding.trace_file import read_events
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import UsageError
 
 
 @click.command("trace")
@@ -74,7 +74,7 @@ def command(
     Another run is compared by what it means: states and their order, values, qualities, latencies; never byte by byte.
     """
     from fieldtwin.running.template_here import system_file
-    from twin.system import load_system
+    from fieldtwin.twin.system import load_system
 
     folders = [Path(p) for p in profiles]
     agreed = consent(

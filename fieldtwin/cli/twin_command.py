@@ -15,19 +15,19 @@ from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.shadow_command import ShadowTalk, print_shadow, why_nothing
 from fieldtwin.cli.talk import talk
 from fieldtwin.cli.template_question import consent, trust_option
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.statemachine import decode_period, encode_period
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.shadowing import limits_of
 from fieldtwin.running.template_here import system_file
 from fieldtwin.running.twin_rules import Plans, PythonPlanner, load_planner, questions_of
 from fieldtwin.running.twinning import Twinning
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.mape.plan import RulePlanner
+from fieldtwin.twin.mape.what_if import Question
+from fieldtwin.twin.system import System, load_system
 from fieldtwin.whatif.asking import Asking, Subject
-from gateway.core.errors import Unreachable, UsageError
-from gateway.core.statemachine import decode_period, encode_period
-from gateway.core.values import COMMAND
-from gateway.wallclock import WallClock
-from twin.instance import Instance
-from twin.mape.plan import RulePlanner
-from twin.mape.what_if import Question
-from twin.system import System, load_system
 
 
 @click.command("twin")

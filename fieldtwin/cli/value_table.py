@@ -9,8 +9,8 @@ from rich.text import Text
 
 from fieldtwin.commissioning.point import Answer
 from fieldtwin.commissioning.reading import place_of, text_of
-from gateway.core.profile import Tag
-from gateway.core.values import Reason
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.values import Reason
 
 COLOUR = {"good": "", "uncertain": "yellow", "bad": "red"}
 REFUSED, UNREACHABLE = 5, 4

@@ -15,8 +15,8 @@ from rich.table import Table
 from fieldtwin.cli.files import write_text
 from fieldtwin.cli.live_view import print_summary
 from fieldtwin.cli.talk import data, show_warnings, talk
-from gateway.core.errors import UsageError
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
 
 if TYPE_CHECKING:
     from fieldtwin.running.many_seeds import Options, SeedResult

@@ -24,11 +24,11 @@ from fieldtwin.commissioning.plotting import check_plot, plot
 from fieldtwin.commissioning.point import Answer
 from fieldtwin.commissioning.reading import Target, dry_point, point_at, row_of, text_of
 from fieldtwin.commissioning.watching import History, Sample, samples
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import NotAllowed, Unreachable, UsageError
-from gateway.core.profile import Tag
-from gateway.wallclock import WallClock
-from gateway.wallclock import run as run_precise
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import NotAllowed, Unreachable, UsageError
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.gateway.wallclock import run as run_precise
 
 LEAST_EVERY_S = 0.02
 

@@ -14,10 +14,10 @@ from fieldtwin.cli.options import Duration, json_option, profiles_option
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.cli.what_if_view import show
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import open_input
 from fieldtwin.running.template_here import system_file
 from fieldtwin.whatif.state import KnownState
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import open_input
 
 
 @click.command("what-if")
@@ -65,11 +65,11 @@ def command(
 
     The plant is not touched. Exit status: 0 when a plan meets all that is required, 1 when none does.
     """
+    from fieldtwin.twin.system import load_system
     from fieldtwin.whatif.fork import Fork
     from fieldtwin.whatif.many import answers
     from fieldtwin.whatif.plan import Plan, in_words, load_plans
     from fieldtwin.whatif.plan import command as parsed
-    from twin.system import load_system
 
     plans: list[Plan] = []
     if plan_file is not None:
@@ -130,9 +130,9 @@ def _ahead(seconds: float) -> str:
 
 
 def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> KnownState:
+    from fieldtwin.twin.system import load_system
     from fieldtwin.whatif.known import known_state
     from fieldtwin.whatif.state import of_instance, read_state
-    from twin.system import load_system
 
     loaded = load_system(system, folders)
     if not source:
@@ -157,7 +157,7 @@ def _is_sqlite(path: Path) -> bool:
 def _faults(path: Path | None, system: Any) -> tuple[dict[str, Any], ...]:
     if path is None:
         return ()
-    from emulators.faults.schema import load_faults
-    from twin.fault_aims import target
+    from fieldtwin.emulators.faults.schema import load_faults
+    from fieldtwin.twin.fault_aims import target
 
     return load_faults(path, lambda spec: target(system, spec))

@@ -11,7 +11,7 @@ from rich.markup import escape
 from fieldtwin.cli.options import pairs, profiles_option
 from fieldtwin.cli.talk import show_warnings, talk
 from fieldtwin.cli.template_question import consent, trust_option
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 LONG = ("_URL", "_TTY", "_BAUDRATE", "_FRAME", "_HOST", "_PORT", "_INTERFACE", "_CHANNEL")
 """Endings of variables that say in parts what a shorter one says: they are not shown."""
@@ -55,12 +55,12 @@ def command(
 
     A signal that ends CMD is 128 and its number, as in a shell. When the field side dies under a CMD that says 0, so does this.
     """
+    from fieldtwin.gateway.wallclock import run
     from fieldtwin.running.struck import struck_of
     from fieldtwin.running.template_here import system_file
     from fieldtwin.running.with_field import run_with
-    from gateway.wallclock import run
-    from twin.field_process import FieldConfig
-    from twin.system import load_system
+    from fieldtwin.twin.field_process import FieldConfig
+    from fieldtwin.twin.system import load_system
 
     words = argv[1:] if argv[:1] == ("--",) else argv
     if not words:
@@ -79,8 +79,8 @@ def command(
     )
     put_in: tuple[dict[str, Any], ...] = ()
     if faults:
-        from emulators.faults.schema import load_faults
-        from twin.fault_aims import target
+        from fieldtwin.emulators.faults.schema import load_faults
+        from fieldtwin.twin.fault_aims import target
 
         put_in = load_faults(Path(faults), lambda spec: target(loaded, spec))
 

@@ -21,10 +21,10 @@ from fieldtwin.commissioning.live import frame_of, modbus_at
 from fieldtwin.commissioning.point import Answer, Point, decoded
 from fieldtwin.commissioning.reading import Target, dry_point, point_at, text_of
 from fieldtwin.commissioning.writing import Write, Written
-from gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, UsageError
-from gateway.core.profile import Tag
-from gateway.protocols.modbus.diagnostics import Diagnostics
-from gateway.wallclock import run as run_precise
+from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed, ReplyTimeout, UsageError
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
+from fieldtwin.gateway.wallclock import run as run_precise
 
 RESTART_COMMUNICATIONS = 1
 

@@ -10,11 +10,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
-from gateway.core.profile import INTEGER_RANGES, REGISTERS_OF, DeviceProfile, RegisterRange, Tag, resolve_address
-from gateway.protocols.canopen.datatypes import DataType
-from gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import (
+    INTEGER_RANGES,
+    REGISTERS_OF,
+    DeviceProfile,
+    RegisterRange,
+    Tag,
+    resolve_address,
+)
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
 
 AUTO = "auto"
 """The type of a CANopen object of which nothing is known: what its length says."""

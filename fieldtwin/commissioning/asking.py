@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 from fieldtwin.commissioning.dump_objects import ObjectKey
 from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent, Taken
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import (
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import (
     Bug,
     CrcError,
     Desync,
@@ -22,13 +22,13 @@ from gateway.core.errors import (
     WireError,
     WrongSize,
 )
-from gateway.core.profile import RegisterRange
-from gateway.protocols.canopen.abort_codes import TIMED_OUT
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog
-from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
-from gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.core.profile import RegisterRange
+from fieldtwin.gateway.protocols.canopen.abort_codes import TIMED_OUT
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog
+from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
+from fieldtwin.gateway.protocols.modbus.request import Request
 
 ACKNOWLEDGE, BUSY, NO_PATH, NO_TARGET = 0x05, 0x06, 0x0A, 0x0B
 BUSY_WAIT_S = 0.2

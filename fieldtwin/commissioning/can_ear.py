@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.protocols.canopen.nmt import NmtState
-from gateway.protocols.canopen.sync_watch import SyncWatch
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
 
 _STUFF = 1.1
 """Bits on the wire per bit of a frame, with stuff bits of usual data."""

@@ -13,9 +13,9 @@ from fieldtwin.commissioning.can_ear import BusHeard
 from fieldtwin.commissioning.listening import LineVerdict
 from fieldtwin.commissioning.settings import name_of
 from fieldtwin.commissioning.traffic import Heard
-from gateway.connections.can_facts import CanFacts
-from gateway.connections.line_counters import LineCounters
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.connections.can_facts import CanFacts
+from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 MANY = 0.2
 """A share of errors that is no accident."""

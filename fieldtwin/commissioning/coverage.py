@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.core.profile import RegisterRange, Table, gap_text
+from fieldtwin.gateway.core.profile import RegisterRange, Table, gap_text
 
 NOT_ASKED, READABLE, REFUSED, SILENT, INVALID = range(5)
 STATE_NAMES = ("not asked", "readable", "refused", "no reply", "invalid reply")

@@ -16,12 +16,12 @@ from fieldtwin.commissioning.dump_file import Cell, Dump, Pass
 from fieldtwin.commissioning.dump_profile import ProfileSweep, dumped_tags
 from fieldtwin.commissioning.point import Answer, decoded
 from fieldtwin.commissioning.reading import text_of
-from gateway.core.errors import FieldtwinError
-from gateway.core.profile import READ_FUNCTION, DeviceProfile, RegisterRange, Tag
-from gateway.core.values import Reason, TagValue
-from gateway.devices.codec import apply_scale
-from gateway.protocols.canopen.datatypes import LengthMismatch, decode
-from gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.profile import READ_FUNCTION, DeviceProfile, RegisterRange, Tag
+from fieldtwin.gateway.core.values import Reason, TagValue
+from fieldtwin.gateway.devices.codec import apply_scale
+from fieldtwin.gateway.protocols.canopen.datatypes import LengthMismatch, decode
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 NOT_THERE = 0x0602_0000
 NOTHING_WRONG = (0x0800_0024, 0x0800_0022, 0x0800_0021)

@@ -32,9 +32,9 @@ from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent
 from fieldtwin.commissioning.latency import Histogram
 from fieldtwin.commissioning.reading import Target
 from fieldtwin.commissioning.wire_log import WireLog
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import FileInvalid, Unreachable
-from gateway.core.profile import RegisterRange, gap_text
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
+from fieldtwin.gateway.core.profile import RegisterRange, gap_text
 
 DEFAULT_BUDGET_S = 600.0
 ALL_TABLES = tuple(RegisterRange(table, 0, 65536) for table in TABLES)

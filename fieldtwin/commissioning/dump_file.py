@@ -43,9 +43,9 @@ from fieldtwin.commissioning.coverage import (
 )
 from fieldtwin.commissioning.dump_objects import ObjectKey
 from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent, Taken
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import RegisterRange, Table, gap_text, resolve_gap
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import RegisterRange, Table, gap_text, resolve_gap
 
 VERSION = 2
 READABLE_VERSIONS = (1, 2)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from fieldtwin.commissioning.coverage import coarse_to_fine
 from fieldtwin.commissioning.dump_sweep import MOST_SILENT, Invalid, Outcome, Refused, Silent, Taken
-from gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 NO_OBJECT, NO_SUBINDEX = 0x0602_0000, 0x0609_0011
 MOST_MISSING = 8

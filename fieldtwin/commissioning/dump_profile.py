@@ -1,7 +1,7 @@
 """What a profile names, read in the fewest requests that its limits and the device's own allow.
 
-A generator as `dump_sweep` is, over the planner that runs the plant (`gateway.devices.read_plan`): a refused read is halved, and
-what is learnt on the way is used from the next pass on.
+A generator as `dump_sweep` is, over the planner that runs the plant (`fieldtwin.gateway.devices.read_plan`): a refused read is
+halved, and what is learnt on the way is used from the next pass on.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import replace
 from fieldtwin.commissioning.coverage import joined
 from fieldtwin.commissioning.dump_sweep import MOST_SILENT, Asking, Invalid, Refused, Silent, TableMap, Taken
 from fieldtwin.commissioning.point import asked_profile
-from gateway.core.profile import DeviceProfile, RegisterRange, Tag
-from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan
+from fieldtwin.gateway.core.profile import DeviceProfile, RegisterRange, Tag
+from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan
 
 
 class ProfileSweep:

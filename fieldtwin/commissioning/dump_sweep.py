@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from fieldtwin.commissioning.coverage import INVALID, READABLE, REFUSED, SILENT, Coverage, joined
-from gateway.core.profile import RegisterRange, Table
-from gateway.protocols.modbus.requests import MAX_READ_BITS, MAX_READ_REGISTERS
+from fieldtwin.gateway.core.profile import RegisterRange, Table
+from fieldtwin.gateway.protocols.modbus.requests import MAX_READ_BITS, MAX_READ_REGISTERS
 
 ILLEGAL_FUNCTION = 0x01
 DENSE = 8

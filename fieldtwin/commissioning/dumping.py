@@ -20,12 +20,12 @@ from fieldtwin.commissioning.dump_sweep import ROUND, Sweep
 from fieldtwin.commissioning.live import canopen_at, frame_of, modbus_at
 from fieldtwin.commissioning.point import CanopenPoint, read_request
 from fieldtwin.commissioning.wire_log import WireLog
-from gateway.core.clock import Clock
-from gateway.core.connection import Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.profile import RegisterRange, resolve_gap
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import RegisterRange, resolve_gap
+from fieldtwin.gateway.wallclock import WallClock
 
 REPLY_S = 0.01
 """How long a device is taken to think, for an estimate."""

@@ -10,14 +10,14 @@ from dataclasses import dataclass, field
 
 from fieldtwin.commissioning.live import canopen_at
 from fieldtwin.commissioning.matching import CanClues, Candidate, certain, judge_canopen, rank, summary
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Tap
-from gateway.core.errors import Desync, ReplyTimeout, SdoAborted
-from gateway.core.profile import DeviceProfile
-from gateway.protocols.canopen.configure import Identity
-from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Tap
+from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.protocols.canopen.configure import Identity
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.wallclock import WallClock
 
 NAMES = {0x1008: "name", 0x1009: "hardware", 0x100A: "software"}
 LONGEST_TEXT = 256

@@ -21,21 +21,21 @@ from fieldtwin.commissioning.matching import (
     summary,
 )
 from fieldtwin.commissioning.point import ModbusPoint
-from gateway.core.clock import Clock
-from gateway.core.connection import Connector, Tap
-from gateway.core.errors import (
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector, Tap
+from fieldtwin.gateway.core.errors import (
     CrcError,
     Desync,
     ModbusExceptionReply,
     ReplyTimeout,
 )
-from gateway.core.profile import DeviceProfile, Tag
-from gateway.core.values import Reason
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
-from gateway.protocols.modbus.replies import Reply
-from gateway.protocols.modbus.request import Request
-from gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
+from fieldtwin.gateway.protocols.modbus.replies import Reply
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
 
 MOST_TAGS = 24
 """Values of one profile that are read to see whether they make sense, besides those of its `identify`."""

@@ -16,8 +16,8 @@ from fieldtwin.commissioning.infer_calibration import calibrated, kind_of
 from fieldtwin.commissioning.infer_costs import ORDER_COST, decode_series
 from fieldtwin.commissioning.infer_fields import LIKELY, Reading, Run, infer_run, run_of, runs_of
 from fieldtwin.commissioning.infer_marks import clock_fields, marked, with_scales
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid
 
 FLOCK = 3
 """So many floats of one order support each other."""

@@ -15,8 +15,8 @@ from itertools import pairwise
 from statistics import median
 
 from fieldtwin.commissioning.infer_joint import bits_cost, carry_evidence
-from gateway.core.profile import REGISTERS_OF
-from gateway.devices.codec import reorder
+from fieldtwin.gateway.core.profile import REGISTERS_OF
+from fieldtwin.gateway.devices.codec import reorder
 
 IMPOSSIBLE = math.inf
 """A reading that no device means: not a number, a magnitude beyond all physics."""

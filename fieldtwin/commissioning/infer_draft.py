@@ -17,8 +17,8 @@ from fieldtwin.commissioning.dump_file import Dump
 from fieldtwin.commissioning.infer import BIT_TABLES, Inference, Series
 from fieldtwin.commissioning.infer_fields import Level, Reading
 from fieldtwin.commissioning.infer_joint import toggled_bits
-from gateway.core.profile import DeviceProfile, RegisterRange, gap_text, resolve
-from gateway.core.yaml_file import parse
+from fieldtwin.gateway.core.profile import DeviceProfile, RegisterRange, gap_text, resolve
+from fieldtwin.gateway.core.yaml_file import parse
 
 MOST_BITS = 4000
 FUNCTIONS = {"coil": 1, "discrete": 2, "holding": 3, "input": 4}

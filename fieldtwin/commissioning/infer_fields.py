@@ -26,8 +26,8 @@ from fieldtwin.commissioning.infer_costs import (
     orders_of,
     whole_numbers,
 )
-from gateway.core.profile import REGISTERS_OF
-from gateway.devices.codec import reorder
+from fieldtwin.gateway.core.profile import REGISTERS_OF
+from fieldtwin.gateway.devices.codec import reorder
 
 CERTAIN, LIKELY, GUESS = 0.9997, 0.80, 0.50
 """`CERTAIN` is a probability of the model; the others are calibrated."""

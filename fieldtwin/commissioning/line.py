@@ -20,14 +20,14 @@ from fieldtwin.commissioning.scan_canopen import CanScanner, CanScanOptions
 from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.sweep import Send, UnitSweep
 from fieldtwin.commissioning.traffic import Heard
-from gateway.connections.can_facts import CanFacts
-from gateway.connections.line_counters import CountsErrors, LineCounters
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, Connector, Tap
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import ConnectionLost, EndpointBusy, NotAllowed, Unreachable
-from gateway.protocols.modbus.framings import framing_of
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.can_facts import CanFacts
+from fieldtwin.gateway.connections.line_counters import CountsErrors, LineCounters
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, NotAllowed, Unreachable
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.wallclock import WallClock
 
 CONNECT_S = 5.0
 
@@ -230,7 +230,7 @@ class _Looker:
         return report
 
     async def _open(self) -> ByteConnection:
-        from gateway.connections.os_connector import OsConnector
+        from fieldtwin.gateway.connections.os_connector import OsConnector
 
         return await (self._connector or OsConnector()).open_bytes(self._endpoint)
 

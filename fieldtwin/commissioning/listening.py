@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from fieldtwin.commissioning.settings import name_of
 from fieldtwin.commissioning.traffic import Heard
-from gateway.connections.line_counters import LineCounters
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 SHORTEST_S, LONGEST_S = 1.5, 6.0
 """How long one setting is listened to: longer where the line is silent for long between bursts."""

@@ -10,18 +10,18 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.tap import TappedConnector
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, CanConnection, Connector, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nursery import Nursery
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.framings import framing_of, make_framer
-from gateway.protocols.modbus.request import Request
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.tap import TappedConnector
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Connector, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import framing_of, make_framer
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.wallclock import WallClock
 
 
 @asynccontextmanager

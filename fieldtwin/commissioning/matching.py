@@ -13,10 +13,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from gateway.core.profile import DeviceProfile, Tag
-from gateway.core.values import Quality, TagValue
-from gateway.protocols.canopen.configure import Identity
-from gateway.protocols.canopen.dictionary import ObjectDictionary
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.gateway.protocols.canopen.configure import Identity
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary
 
 ENOUGH_SIGNS = 6
 """So many values that could have been nonsense and are not make a map likely."""

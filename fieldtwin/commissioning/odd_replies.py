@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from gateway.core.endpoint import SerialSettings
-from gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from fieldtwin.commissioning.watching import History
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.profile import Tag
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import Tag
 
 MOST_PANELS = 24
 FORMATS = (".png", ".svg", ".pdf")

@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 from fieldtwin.commissioning.address import AUTO
 from fieldtwin.commissioning.live import frame_of
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import (
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
     CrcError,
     Desync,
     DeviceRefused,
@@ -21,17 +21,17 @@ from gateway.core.errors import (
     ReplyTimeout,
     SdoAborted,
 )
-from gateway.core.profile import DeviceProfile, RegisterRange, Tag
-from gateway.core.profile_schema import Limits, ProfileForm
-from gateway.core.values import Quality, Reason, Scalar, TagValue
-from gateway.devices.codec import apply_scale, decode, decode_little, encode, reorder
-from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, plan_reads
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.sdo import SdoDownload, SdoUpload
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.framings import framing_of
-from gateway.protocols.modbus.request import Request
-from gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.core.profile import DeviceProfile, RegisterRange, Tag
+from fieldtwin.gateway.core.profile_schema import Limits, ProfileForm
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.devices.codec import apply_scale, decode, decode_little, encode, reorder
+from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, plan_reads
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.sdo import SdoDownload, SdoUpload
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import (
     ReadBits,
     ReadRegisters,
     WriteCoil,

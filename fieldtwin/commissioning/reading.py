@@ -13,14 +13,14 @@ from typing import Any
 
 from fieldtwin.commissioning.live import canopen_at, modbus_at
 from fieldtwin.commissioning.point import Answer, CanopenPoint, ModbusPoint, Point
-from gateway.core.clock import Clock
-from gateway.core.connection import Connector, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable, UsageError
-from gateway.core.profile import DeviceProfile, Tag, load_profile
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
-from twin.data_files import find
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag, load_profile
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.twin.data_files import find
 
 MOST_HEX_BYTES = 48
 

@@ -13,9 +13,9 @@ from datetime import datetime
 from fieldtwin.commissioning.dump_file import VERSION, Cell, Dump, Pass
 from fieldtwin.decoding.exchange import Span
 from fieldtwin.decoding.modbus_pdu import BIT_TABLES, parse_reply, parse_request
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.recording import Exchange, RecordingHeader
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader
 
 MOST_PASSES = 2_000
 """Passes of a long recording that are kept, spread evenly over it."""

@@ -14,18 +14,18 @@ from dataclasses import dataclass, field, replace
 from fieldtwin.commissioning.can_ear import BusEar, BusHeard
 from fieldtwin.commissioning.live import canopen_at, frames_at
 from fieldtwin.commissioning.progress import Progress
-from gateway.connections.can_facts import CanFacts, can_facts
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import DeviceRefused, UsageError, WireError
-from gateway.protocols.canopen import cob_id
-from gateway.protocols.canopen.lss import LssAddress
-from gateway.protocols.canopen.lss_master import LssMaster
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.scan import FoundNode, scan_nodes
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.can_facts import CanFacts, can_facts
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import DeviceRefused, UsageError, WireError
+from fieldtwin.gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.scan import FoundNode, scan_nodes
+from fieldtwin.gateway.wallclock import WallClock
 
 ALL_NODES = tuple(range(1, cob_id.NODE_MAX + 1))
 ADAPTER_RATES = (125_000, 250_000, 500_000, 1_000_000, 50_000, 20_000, 100_000, 800_000, 10_000)

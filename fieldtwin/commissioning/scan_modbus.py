@@ -19,13 +19,13 @@ from fieldtwin.commissioning.progress import Progress
 from fieldtwin.commissioning.settings import Pace, Step
 from fieldtwin.commissioning.sweep import Send, UnitAnswer, UnitSweep
 from fieldtwin.commissioning.traffic import Heard, LineEar
-from gateway.connections.line_counters import CountsErrors, LineCounters
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, Connector, Tap
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import ConnectionLost, UsageError
-from gateway.protocols.modbus.framings import Framing, framing_of
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.line_counters import CountsErrors, LineCounters
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, Connector, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import ConnectionLost, UsageError
+from fieldtwin.gateway.protocols.modbus.framings import Framing, framing_of
+from fieldtwin.gateway.wallclock import WallClock
 
 SHARED_QUIET_NS = 30 * NS_PER_MS
 """On a line with another master: so much silence before each question."""

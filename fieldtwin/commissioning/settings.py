@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from fieldtwin.commissioning.sweep import expected_s
-from gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 
 LIKELY = tuple(
     SerialSettings(baudrate, frame)

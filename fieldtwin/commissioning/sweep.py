@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.decoding.modbus_frames import Frame, splitter
-from gateway.core.clock import NS_PER_MS
-from gateway.protocols.modbus.framings import Framing, make_framer
-from gateway.protocols.modbus.request import Request
-from gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.modbus.framings import Framing, make_framer
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
 
 PROBE = ReadRegisters("holding", 0, 1)
 """The question: a register that most devices have. One that has not says so, and is as present."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from fieldtwin.decoding.modbus_frames import Frame, splitter
-from gateway.core.clock import NS_PER_MS
-from gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.modbus.framings import Framing
 
 SETTLE_NS = 40 * NS_PER_MS
 """A silence behind which nothing belongs to what came before, behind a USB adapter as well."""

@@ -11,8 +11,8 @@ from collections.abc import AsyncGenerator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fieldtwin.commissioning.point import Answer, Point
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.profile import Tag
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.profile import Tag
 
 MOST_SAMPLES = 3600
 """So many samples of a tag are kept for a sparkline and a plot; older ones are counted and forgotten."""

@@ -12,12 +12,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self, TextIO
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.wallclock import WallClock
 
 
 class WireLog(Tap):

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from fieldtwin.commissioning.address import AUTO
 from fieldtwin.commissioning.point import Answer, ModbusPoint, Point, encoded
-from gateway.core.errors import CheckFailed, NotAllowed, UsageError, VerifyFailed
-from gateway.core.profile import Tag
-from gateway.core.values import Scalar
+from fieldtwin.gateway.core.errors import CheckFailed, NotAllowed, UsageError, VerifyFailed
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.values import Scalar
 
 _TRUE, _FALSE = ("true", "on", "yes"), ("false", "off", "no")
 

@@ -5,7 +5,7 @@ Pure: frames and `now` in, frames out. A node comes to life when it is first ask
 
 from __future__ import annotations
 
-from emulators.canopen.sdo_server import SdoServer
+from fieldtwin.emulators.canopen.sdo_server import SdoServer
 
 TIMEOUT_NS = 2_000_000_000
 LONG_BYTES = 1000

@@ -7,8 +7,8 @@ from itertools import pairwise
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
 from fieldtwin.conformance.judges import accepts, owes, publishes_nothing_bad
 from fieldtwin.conformance.observation import Asked, Observation, Sent, Shown, Told, Word
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import Verdict
-from gateway.core.clock import NS_PER_S
 
 ABORT, NMT, SYNC, SDO_REQUEST = 0x80, 0x000, 0x080, 0x600
 BLOCK_UPLOAD = 5

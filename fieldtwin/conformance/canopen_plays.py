@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fieldtwin.conformance.canopen_scene import CanPlay, CanScene, SayFrame
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 HEARTBEAT, EMCY, TPDO1 = 0x700, 0x080, 0x180
 PRE_OPERATIONAL = 0x7F

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from fieldtwin.conformance.case import TRAIL_S, Case
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 SDO_REPLY = 0x580
 

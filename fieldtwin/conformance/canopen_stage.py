@@ -9,11 +9,11 @@ from fieldtwin.conformance.canopen_device import BOOT_UP, STOPPED, HonestNode
 from fieldtwin.conformance.canopen_scene import CanopenCase, CanScene, SayFrame
 from fieldtwin.conformance.observation import Asked, Garbled, Sent, Told, Word
 from fieldtwin.conformance.recorder import Recorder
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CanConnection
-from gateway.core.errors import ConnectionLost
-from gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.core.nursery import Nursery
 
 SDO_REQUEST, HEARTBEAT, NMT = 0x600, 0x700, 0x000
 ABORT, DOWNLOAD, UPLOAD, BLOCK_UPLOAD, BLOCK_DOWNLOAD = 0x80, 1, 2, 5, 6

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from fieldtwin.conformance.observation import Asked, Came, Ended, Event, Garbled, Left, Sent, Shown, Told
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
-from gateway.protocols.canopen import cob_id
-from gateway.protocols.canopen.abort_codes import meaning
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
 
 MOST_LINES = 200
 """Lines of evidence that a case keeps: its first and its last ones."""

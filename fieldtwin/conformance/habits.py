@@ -7,7 +7,7 @@ import math
 
 from fieldtwin.conformance.case import Finding, failed, inconclusive, passed, skipped
 from fieldtwin.conformance.observation import Asked, Came, Left, Observation
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 TURNAROUND_MS = 100
 """SL 2.4.1: the turnaround delay is typically 100 to 200 ms; it has to be long enough for any unit to process the request."""

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 
 from fieldtwin.conformance.case import Finding, Judge, failed, inconclusive, passed, skipped
 from fieldtwin.conformance.observation import Asked, Came, Ended, Garbled, Left, Observation, Shown, Told, Word
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import Verdict
-from gateway.core.clock import NS_PER_S
 
 FLOOD_FACTOR = 5.0
 """So many times the usual rate is a flood: a master that tries four times and polls on stays below."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 
-from emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.conformance.scene import Move, Play, Say, Scene, Unplug
+from fieldtwin.emulators.modbus.rtu_receiver import with_crc
 
 SPLIT_S = 0.016
 """The latency timer of a usual USB adapter."""

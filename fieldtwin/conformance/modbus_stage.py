@@ -8,9 +8,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 
-from emulators.endpoints.socket_end import SocketEnd
-from emulators.modbus.bank import Table
-from emulators.virtual.wire import MemoryEnd
 from fieldtwin.conformance.modbus_device import (
     READS,
     REGISTER_READS,
@@ -24,10 +21,13 @@ from fieldtwin.conformance.modbus_device import (
 from fieldtwin.conformance.observation import Asked, Came, Garbled, Left, Told, Word
 from fieldtwin.conformance.recorder import Recorder
 from fieldtwin.conformance.scene import Deaf, Hang, ModbusCase, Move, Say, Scene, Unplug
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import ByteConnection
-from gateway.core.errors import ConnectionLost
-from gateway.core.nursery import Nursery
+from fieldtwin.emulators.endpoints.socket_end import SocketEnd
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.emulators.virtual.wire import MemoryEnd
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.core.nursery import Nursery
 
 BEHIND_S = 0.050
 """How long after an odd answer the next honest one comes at the soonest."""

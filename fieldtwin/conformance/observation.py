@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TypeVar
 
-from gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,12 @@ from collections.abc import Callable
 from typing import Protocol
 
 from fieldtwin.conformance.observation import Word
-from gateway.core.clock import Clock
-from gateway.core.connection import Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, FieldtwinError, ModbusExceptionReply, UsageError, WireError
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.requests import RegisterTable
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, ModbusExceptionReply, UsageError, WireError
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.requests import RegisterTable
 
 OnShown = Callable[[Word, str], None]
 _REGISTER = re.compile(

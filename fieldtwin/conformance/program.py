@@ -9,8 +9,8 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from types import TracebackType
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 END_WITHIN_S = 3.0
 LAST_LINES = 12

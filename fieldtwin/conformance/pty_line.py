@@ -7,12 +7,12 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
-from emulators.endpoints.ports import OsPorts
 from fieldtwin.conformance.modbus_stage import Stage
 from fieldtwin.conformance.scene import Unplug
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import Unreachable
+from fieldtwin.emulators.endpoints.ports import OsPorts
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import Unreachable
 
 with suppress(ImportError):  # Windows has no ptys: none can be opened
     import fcntl

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from statistics import median
 
 from fieldtwin.conformance.observation import Asked, Event, Habit, Told
-from gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 MOST_EVENTS = 200_000
 

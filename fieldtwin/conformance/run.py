@@ -17,8 +17,8 @@ from fieldtwin.conformance.observation import Asked, Ended, Event, Habit, Observ
 from fieldtwin.conformance.probe import Probe
 from fieldtwin.conformance.recorder import Recorder
 from fieldtwin.conformance.results import CaseResult
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import Unreachable
 
 POLL_S = 0.01
 STEADY = 3

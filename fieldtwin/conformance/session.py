@@ -8,8 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, field
 
-from emulators.endpoints.ports import OsPorts
-from emulators.modbus.bank import Table
 from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
 from fieldtwin.conformance.canopen_cases import SILENT as CANOPEN_SILENT
 from fieldtwin.conformance.canopen_stage import CanopenStage
@@ -21,11 +19,13 @@ from fieldtwin.conformance.program import OnText, Program
 from fieldtwin.conformance.pty_line import PtyLine
 from fieldtwin.conformance.results import CaseResult
 from fieldtwin.conformance.run import C, MasterRun, Plan
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.ports import OsPorts
+from fieldtwin.emulators.modbus.bank import Table
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock
 
 MAX_CLIENTS = 8
 CAN_TRAITS = frozenset({"can"})

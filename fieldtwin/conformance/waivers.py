@@ -19,7 +19,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from gateway.core.yaml_file import YamlFile, load, validate
+from fieldtwin.gateway.core.yaml_file import YamlFile, load, validate
 
 
 class WaiverForm(BaseModel):

@@ -12,14 +12,14 @@ from fieldtwin.decoding.lss_watch import LssWatch
 from fieldtwin.decoding.node_map import NodeMap, Pdo
 from fieldtwin.decoding.sdo_watch import SdoWatch, Seen, Transfer
 from fieldtwin.decoding.tags import show_value
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import FieldtwinError
-from gateway.core.values import Scalar
-from gateway.devices.config import DeviceConfig
-from gateway.protocols.canopen import cob_id
-from gateway.protocols.canopen.abort_codes import meaning
-from gateway.protocols.canopen.emcy import parse_emcy
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, heartbeat_state
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.protocols.canopen.abort_codes import meaning
+from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, heartbeat_state
 
 _COMMANDS = {int(c): c.name.lower().replace("_", " ").replace("pre operational", "pre-operational") for c in NmtCommand}
 _STATES = {s: s.name.replace("_", "-") for s in NmtState}

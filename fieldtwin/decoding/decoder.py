@@ -17,14 +17,14 @@ from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Decoded, Exchange
 from fieldtwin.decoding.modbus_wire import ModbusWire, Unit
 from fieldtwin.decoding.tags import TagMap, show_value
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
 from fieldtwin.scenarios.trace import Event, Kind, refusal_text
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.errors import FieldtwinError
-from gateway.devices.config import DeviceConfig
-from gateway.protocols.modbus.framings import framing_of
-from twin.system import System
+from fieldtwin.twin.system import System
 
 
 class Decoder:

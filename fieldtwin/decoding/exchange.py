@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from gateway.core.profile import RegisterRange, Table
-from gateway.core.values import Scalar
+from fieldtwin.gateway.core.profile import RegisterRange, Table
+from fieldtwin.gateway.core.values import Scalar
 
 SECRET = "(secret)"
 """What is shown of a tag that nobody is to see."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from fieldtwin.decoding.exchange import Exchange
-from gateway.core.errors import FieldtwinError
-from gateway.protocols.canopen import lss
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.protocols.canopen import lss
 
 _STATES = {0: "waiting", 1: "configuration"}
 _SERVICES = {

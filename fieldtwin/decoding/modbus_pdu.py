@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import get_args
 
 from fieldtwin.decoding.exchange import Span
-from gateway.core.errors import ModbusExceptionReply
-from gateway.core.profile import Table
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.core.profile import Table
 
 SERVICES = {
     0x01: "read coils", 0x02: "read discrete inputs", 0x03: "read holding registers", 0x04: "read input registers",

@@ -14,7 +14,7 @@ from fieldtwin.decoding.exchange import SECRET, Exchange, Span
 from fieldtwin.decoding.modbus_frames import Expected, Frame, splitter
 from fieldtwin.decoding.modbus_pdu import Asked, parse_reply, parse_request, words
 from fieldtwin.decoding.tags import TagMap
-from gateway.core.values import Scalar
+from fieldtwin.gateway.core.values import Scalar
 
 MAX_OPEN = 64
 """Requests without an answer that are remembered on an MBAP wire; an older one will have none."""

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 from fieldtwin.decoding.exchange import SECRET, Span
 from fieldtwin.decoding.tags import TagMap, show_value
-from gateway.core.errors import FieldtwinError
-from gateway.core.values import Scalar
-from gateway.devices.canopen_rpdo import BITS
-from gateway.devices.config import DeviceConfig
-from gateway.protocols.canopen.cob_id import RPDO1_BASE, TPDO_BASES
-from gateway.protocols.canopen.configure import (
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.gateway.devices.canopen_rpdo import BITS
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.protocols.canopen.cob_id import RPDO1_BASE, TPDO_BASES
+from fieldtwin.gateway.protocols.canopen.configure import (
     PDO_INVALID,
     RPDO_COMMUNICATION,
     RPDO_MAPPING,
@@ -24,9 +24,9 @@ from gateway.protocols.canopen.configure import (
     TPDO_MAX,
     PdoConfig,
 )
-from gateway.protocols.canopen.datatypes import decode
-from gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
-from gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
+from fieldtwin.gateway.protocols.canopen.datatypes import decode
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
+from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
 
 _PARAMETERS = range(RPDO_COMMUNICATION, TPDO_MAPPING + TPDO_MAX)
 _MAPPINGS = frozenset((*range(RPDO_MAPPING, TPDO_COMMUNICATION), *range(TPDO_MAPPING, TPDO_MAPPING + TPDO_MAX)))

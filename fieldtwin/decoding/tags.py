@@ -1,6 +1,6 @@
 """Which tags of a profile stand in a piece of a device, and what they say there, in engineering units.
 
-Values are the driver's (gateway.devices.codec): a report says what the gateway made of the bytes. Pure.
+Values are the driver's (fieldtwin.gateway.devices.codec): a report says what the gateway made of the bytes. Pure.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from fieldtwin.decoding.exchange import SECRET, Span
-from gateway.core.profile import Box, DeviceProfile, Tag
-from gateway.core.values import Scalar, TagValue
-from gateway.devices.codec import apply_scale, decode, decode_little
+from fieldtwin.gateway.core.profile import Box, DeviceProfile, Tag
+from fieldtwin.gateway.core.values import Scalar, TagValue
+from fieldtwin.gateway.devices.codec import apply_scale, decode, decode_little
 
 _KEPT_PLANS = 1024
 """Different spans of a device whose tags are remembered: a scan of all addresses may not fill the memory."""

@@ -10,10 +10,10 @@ import msgspec
 
 from fieldtwin.decoding.decoder import frame_events
 from fieldtwin.formats.pcap import MAX_LINE_BYTES, read_capture
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.input_file import open_input
 from fieldtwin.scenarios.trace import Event, Kind, refusal_data
-from gateway.core.errors import FileInvalid
-from gateway.core.input_file import open_input
-from twin.system import System
+from fieldtwin.twin.system import System
 
 _EXPECTED = "[ns, kind, where, data], as `fieldtwin run --virtual --trace` writes it"
 

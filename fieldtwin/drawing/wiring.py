@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gateway.core.endpoint import Endpoint
-from gateway.devices.config import BusConfig, DeviceConfig
-from twin.prototype_file import Prototype
-from twin.system import System
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.system import System
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,9 @@ from typing import IO, Any
 
 from fieldtwin.formats.candump import LeftOut
 from fieldtwin.formats.packed import most_unpacked, too_much
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
-from gateway.core.input_file import open_input
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import open_input
 
 SUFFIXES = (".asc", ".blf", ".trc")
 MAX_TIME_S = 1 << 33

@@ -19,9 +19,9 @@ from typing import BinaryIO
 
 from fieldtwin.__about__ import __version__
 from fieldtwin.formats.packed import unpacked
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import open_input
-from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import open_input
+from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
 
 DEVICE = "fieldtwin/ctd-reference"
 MAX_LINE_BYTES = 65_536

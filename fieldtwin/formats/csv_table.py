@@ -15,9 +15,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
 
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import open_input
-from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import open_input
+from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
 
 MAX_LINE = 65_536
 MAX_COLUMNS = 1000

@@ -16,9 +16,9 @@ from types import TracebackType
 from typing import BinaryIO, Self
 
 from fieldtwin.formats.packed import unpacked
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid
-from gateway.core.input_file import open_input
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.input_file import open_input
 
 MAX_PACKET = 262_144
 """Bytes of a packet; the largest snapshot length that libpcap allows."""

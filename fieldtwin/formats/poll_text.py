@@ -12,8 +12,8 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from gateway.core.errors import FileInvalid
-from gateway.core.recording import Exchange
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.recording import Exchange
 
 _SLAVE = re.compile(r"Slave configuration\.*:\s*address = \[?(\d+)")
 _START = re.compile(r"start reference = (\d+)")

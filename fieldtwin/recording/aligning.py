@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 from fieldtwin.decoding.exchange import Span
 from fieldtwin.decoding.modbus_pdu import parse_reply, parse_request, words
-from gateway.core.recording import Exchange
+from fieldtwin.gateway.core.recording import Exchange
 
 MOST_WORDS = 1_000_000
 """Values of both sides that are kept for aligning; a longer dialogue is compared position by position."""

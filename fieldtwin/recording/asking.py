@@ -10,17 +10,24 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fieldtwin.commissioning.live import frame_of, modbus_at
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, CrcError, Desync, ModbusExceptionReply, ReplyTimeout, VerifyFailed
-from gateway.core.recording import Exchange, ExchangeError
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.framings import framing_of
-from gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked, examine
-from gateway.protocols.modbus.server_forward import Forwarded
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
+    ConnectionLost,
+    CrcError,
+    Desync,
+    ModbusExceptionReply,
+    ReplyTimeout,
+    VerifyFailed,
+)
+from fieldtwin.gateway.core.recording import Exchange, ExchangeError
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked, examine
+from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded
+from fieldtwin.gateway.wallclock import WallClock
 
 _READS = frozenset({1, 2, 3, 4})
 

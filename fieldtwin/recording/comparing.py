@@ -17,10 +17,10 @@ from typing import TypeVar
 from fieldtwin.decoding.exchange import Span
 from fieldtwin.decoding.modbus_pdu import Answer, Asked, parse_reply, parse_request, words
 from fieldtwin.decoding.tags import TagMap
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.recording.aligning import Shift
-from gateway.core.profile import DeviceProfile
-from gateway.core.recording import Exchange
-from gateway.core.values import Scalar
 
 MAX_DIFFERENCES = 1000
 MAX_LATENCIES = 200_000

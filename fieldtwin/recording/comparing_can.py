@@ -13,6 +13,9 @@ from dataclasses import dataclass, field, replace
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.decoding.tags import TagMap
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.values import Scalar
 from fieldtwin.recording.comparing import (
     MAX_DIFFERENCES,
     MAX_LATENCIES,
@@ -23,9 +26,6 @@ from fieldtwin.recording.comparing import (
     judge_latencies,
     pairs_of,
 )
-from gateway.core.canframe import CanFrame
-from gateway.core.profile import DeviceProfile
-from gateway.core.values import Scalar
 
 TRANSFERS = ("SDO upload", "SDO download")
 RARE = 5

@@ -12,7 +12,7 @@ from typing import Final
 
 from fieldtwin.decoding.exchange import Span
 from fieldtwin.decoding.modbus_pdu import parse_reply, parse_request
-from gateway.core.recording import Exchange
+from fieldtwin.gateway.core.recording import Exchange
 
 MAX_UNITS = 256
 MAX_SHAPES = 10_000

@@ -18,18 +18,18 @@ from fieldtwin.decoding.modbus_pdu import parse_reply, parse_request, words
 from fieldtwin.decoding.tags import TagMap
 from fieldtwin.formats.candump import line_of, read_log
 from fieldtwin.formats.pcap import read_capture, write_pcap
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import open_input
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, SignalRow
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 from fieldtwin.recording.rotating import RotatingFile, exchanges_of, header_of, parts_of
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import open_input
-from gateway.core.profile import DeviceProfile
-from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, SignalRow
-from gateway.core.values import Scalar
-from gateway.protocols.modbus.crc import with_crc
 
 BATCH = 10_000
 """Rows of a Parquet file that are held in memory at once."""

@@ -16,15 +16,15 @@ from pathlib import Path
 from fieldtwin.formats.candump import line_of
 from fieldtwin.formats.packet_file import PacketFile
 from fieldtwin.formats.tcp_segments import Conversation, Conversations, PacketCounters, Side
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, encode_exchange, encode_header
 from fieldtwin.recording.draft import Drafts
 from fieldtwin.recording.importing import BadFile, write_drafts
 from fieldtwin.recording.modbus_talk import ModbusTalk
 from fieldtwin.recording.pairing import Bad, OneWirePairer, PairCounters, Pairer, SerialPairer
 from fieldtwin.recording.rotating import RotatingFile
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FieldtwinError, FileInvalid
-from gateway.core.recording import Exchange, RecordingHeader, encode_exchange, encode_header
 
 LINK_CAN, LINK_USER0, LINK_RTAC = 227, 147, 250
 MAX_SERVERS = 256

@@ -19,18 +19,18 @@ from fieldtwin.formats.candump import LeftOut, line_of, read_log
 from fieldtwin.formats.packet_file import is_packet_file
 from fieldtwin.formats.pcap import read_capture
 from fieldtwin.formats.poll_text import IS_POLL_TEXT, read_polls
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import open_input
+from fieldtwin.gateway.core.recording import RecordingHeader, encode_exchange, encode_header
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
 from fieldtwin.recording.draft import Drafts
 from fieldtwin.recording.framing_guess import guess_framing
 from fieldtwin.recording.pairing import Bad, PairCounters, Pairer, pairer
 from fieldtwin.recording.rotating import RotatingFile, parts_of
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import open_input
-from gateway.core.recording import RecordingHeader, encode_exchange, encode_header
-from gateway.protocols.modbus.framings import framing_of
 
 CNV = (".cnv", ".cnv.gz", ".cnv.bz2")
 KINDS = ".pcap, .pcapng, .log (candump), .asc, .blf, .trc, .csv, .cnv, .txt (mbpoll, modpoll), a capture of fieldtwin's"

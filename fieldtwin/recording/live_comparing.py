@@ -13,17 +13,17 @@ from fieldtwin.commissioning.reading import Target
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange as Transfer
 from fieldtwin.decoding.modbus_pdu import parse_request
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import SdoAborted, WireError
+from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.aligning import Dialogue
 from fieldtwin.recording.asking import Asker, changes
 from fieldtwin.recording.comparing import Comparer, Comparison, Rules
 from fieldtwin.recording.comparing_can import TRANSFERS, Frames, compare_logs
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import SdoAborted, WireError
-from gateway.core.recording import Exchange
-from gateway.wallclock import WallClock
 
 MAX_FRAMES = 1_000_000
 """Frames of a live bus that are kept for comparing."""

@@ -12,8 +12,8 @@ from statistics import median
 
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import UsageError
 
 Key = tuple[int, int]
 

@@ -12,8 +12,8 @@ from collections.abc import Collection
 
 from fieldtwin.decoding.modbus_frames import RtuSplitter
 from fieldtwin.formats.tcp_segments import Conversation, Side
+from fieldtwin.gateway.core.recording import Exchange
 from fieldtwin.recording.pairing import OnBad, Pairer, pairer
-from gateway.core.recording import Exchange
 
 MODBUS_PORTS = frozenset({502, 503, 802})
 MAX_UNDECIDED = 600

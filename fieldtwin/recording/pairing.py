@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 from fieldtwin.decoding.modbus_frames import Expected, Frame, splitter
 from fieldtwin.decoding.modbus_pdu import parse_request
-from gateway.core.recording import Exchange, ExchangeError
-from gateway.protocols.modbus.crc import crc16
-from gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
+from fieldtwin.gateway.core.recording import Exchange, ExchangeError
+from fieldtwin.gateway.protocols.modbus.crc import crc16
+from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
 
 MAX_OPEN = 64
 """Requests without an answer on one connection; an older one is taken as unanswered."""

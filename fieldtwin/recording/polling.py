@@ -15,15 +15,15 @@ from fieldtwin.commissioning.address import tags_of
 from fieldtwin.commissioning.live import canopen_at, frames_at
 from fieldtwin.commissioning.point import CanopenPoint
 from fieldtwin.commissioning.reading import Target
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Tap
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable, UsageError
+from fieldtwin.gateway.core.profile import READ_FUNCTION, DeviceProfile
+from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.devices.read_plan import GroupPlan, Learnt, Read
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.asking import Asker, asker_at, changes
 from fieldtwin.recording.sinks import CanLogSink
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Tap
-from gateway.core.errors import ConnectionLost, Unreachable, UsageError
-from gateway.core.profile import READ_FUNCTION, DeviceProfile
-from gateway.core.recording import Exchange
-from gateway.devices.read_plan import GroupPlan, Learnt, Read
-from gateway.wallclock import WallClock
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 10.0
 MAX_REQUESTS = 10_000

@@ -12,8 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from gateway.core.errors import Bug, FileInvalid
-from gateway.core.recording import Exchange, RecordingHeader, RecordingReader
+from fieldtwin.gateway.core.errors import Bug, FileInvalid
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader
 
 MAX_PARTS = 9999
 MB = 1_000_000

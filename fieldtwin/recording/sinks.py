@@ -9,13 +9,13 @@ import json
 from datetime import UTC, datetime
 
 from fieldtwin.formats.candump import line_of
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.recording import Exchange, encode_exchange
 from fieldtwin.recording.rotating import RotatingFile
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
-from gateway.core.recording import Exchange, encode_exchange
 
 
 class ExchangeSink:

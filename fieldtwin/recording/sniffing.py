@@ -10,15 +10,15 @@ import asyncio
 
 from fieldtwin.commissioning.traffic import SETTLE_NS, is_reply
 from fieldtwin.decoding.modbus_frames import Frame, splitter
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.sinks import LineSink
 from fieldtwin.recording.tapping import Say
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.protocols.modbus.framings import framing_of
-from gateway.wallclock import WallClock
 
 
 class Directions:

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from emulators.endpoints.socket_end import SocketEnd, SocketListener
+from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import ByteConnection, Connector, Direction
+from fieldtwin.gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.sinks import LineSink
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import Clock
-from gateway.core.connection import ByteConnection, Connector, Direction
-from gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
-from gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable, UsageError
-from gateway.wallclock import WallClock
 
 Say = Callable[[str], None]
 
@@ -74,7 +74,7 @@ class LineTap:
         path = Path(self._near.path)
         if self._near.scheme in SERIAL_SCHEMES and path.is_char_device():
             return await self._connector.open_bytes(self._near)
-        from emulators.endpoints.pty import PtyEnd  # not where there are no ptys
+        from fieldtwin.emulators.endpoints.pty import PtyEnd  # not where there are no ptys
 
         serial = Endpoint("rtu", path=self._near.path, params=self._near.params)
         return await PtyEnd.open(path, serial)

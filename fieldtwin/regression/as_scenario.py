@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.statemachine import decode_period
+from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.regression.story import Change, Story
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FieldtwinError, UsageError
-from gateway.core.statemachine import decode_period
-from gateway.core.values import COMMAND
-from twin.system import System
+from fieldtwin.twin.system import System
 
 BRIEF_NS = 200_000_000
 """A state that lasted less is not waited for: a check might come too late for it."""

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.regression.story import Change, Story
-from gateway.core.clock import NS_PER_S
 
 MOST_SHOWN = 1_000
 

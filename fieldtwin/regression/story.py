@@ -13,9 +13,9 @@ from typing import Any
 
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.scenarios.trace import FAR_END, Event, Kind
-from gateway.core.statemachine import encode_period
-from twin.system import System
+from fieldtwin.twin.system import System
 
 MOST = 200_000
 """Changes of a field."""

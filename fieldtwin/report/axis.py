@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.markup import Markup, el
-from gateway.core.clock import NS_PER_S
 
 WIDTH = 1180.0
 LEFT = 176.0

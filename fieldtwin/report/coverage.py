@@ -13,13 +13,13 @@ from typing import TypeVar
 
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.core.profile import RegisterRange
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS
 from fieldtwin.report.model import Counts, Machine
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.errors import ModbusExceptionReply
-from gateway.core.profile import RegisterRange
-from gateway.devices.config import DeviceConfig
-from gateway.protocols.canopen.abort_codes import MEANINGS
-from twin.system import System
+from fieldtwin.twin.system import System
 
 MOST = 2000
 """Different things of a kind that are counted."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS, meaning
 from fieldtwin.report.coverage import (
     DeviceCoverage,
     Place,
@@ -13,8 +15,6 @@ from fieldtwin.report.coverage import (
 )
 from fieldtwin.report.markup import Markup, el, join
 from fieldtwin.report.model import Counts, Machine, Report
-from gateway.core.errors import ModbusExceptionReply
-from gateway.protocols.canopen.abort_codes import MEANINGS, meaning
 
 MOST_ROWS = 200
 """Rows of one table; the rest is counted."""

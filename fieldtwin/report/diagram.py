@@ -10,13 +10,13 @@ import math
 
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.decoding.tags import show_value
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.profile import Tag
 from fieldtwin.report.axis import CHAR, LEFT, RIGHT, WIDTH, Axis, fitted, label, seconds
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.value_lanes import value_lane
 from fieldtwin.report.window import FaultBar, Step, Window
-from gateway.core.clock import NS_PER_S
-from gateway.core.profile import Tag
-from twin.system import System
+from fieldtwin.twin.system import System
 
 MOST_TAGS = 10
 MOST_STATES = 6

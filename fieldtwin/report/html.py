@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.coverage_tables import coverage_section
 from fieldtwin.report.diagram import timing_diagram
 from fieldtwin.report.file import put
@@ -19,7 +20,6 @@ from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult, 
 from fieldtwin.report.requirements import requirement_section
 from fieldtwin.report.style import style
 from fieldtwin.report.window import MOST_FRAMES, Study, Window
-from gateway.core.clock import NS_PER_S
 
 MOST_DRAWN = 16
 """Failures with a diagram and frames."""

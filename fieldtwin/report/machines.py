@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from fieldtwin.plc.binding import load_program
+from fieldtwin.plc.states import StateTable
 from fieldtwin.report.model import Machine
-from plc.binding import load_program
-from plc.states import StateTable
-from twin.system import System
+from fieldtwin.twin.system import System
 
 
 def machines_of(system: System) -> tuple[Machine, ...]:
-    """Of every program that has a table (`plc.states`). Raises `FileInvalid` for a program that cannot be made."""
+    """Of every program that has a table (`fieldtwin.plc.states`). Raises `FileInvalid` for a program that cannot be made."""
     found = []
     for name, form in system.plc.programs.items():
         program = load_program(form.source, [str(system.path.parent)])

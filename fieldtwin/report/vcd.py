@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from fieldtwin.decoding.decoder import Decoder
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.values import Quality
 from fieldtwin.report.markup import clean
 from fieldtwin.report.model import Machine
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.errors import FileInvalid
-from gateway.core.values import Quality
-from twin.system import System
+from fieldtwin.twin.system import System
 
 MOST_CHARACTERS = 48
 """Characters of a word; longer ones end with a dot."""

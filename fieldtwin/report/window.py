@@ -13,10 +13,10 @@ from typing import Any
 
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import SECRET, Exchange
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.coverage import Collector
 from fieldtwin.report.model import CheckResult, Counts, Report, ScenarioResult
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.clock import NS_PER_S
 
 MOST_FRAMES = 160
 """Frames before the failure; a quarter as many behind it."""

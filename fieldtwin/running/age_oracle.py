@@ -11,7 +11,7 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import Any
 
-from gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_S
 
 KEPT_NS = 600 * NS_PER_S
 EXAMPLES = 10

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from emulators.endpoints.pty import PtyEnd
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
-from gateway.core.nursery import Nursery
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.core.nursery import Nursery
 
 
 class BridgeCable:

@@ -13,21 +13,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nursery import Nursery
-from gateway.devices.config import BusConfig
-from gateway.protocols.modbus.framings import framing_of
-from gateway.protocols.modbus.server import READ_FUNCTIONS
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.bridge import Bridge, BridgeConfig, Route
-from gateway.runtime.bridge_policy import LOOPBACK, AllowRule, Network, Policy
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
-from twin.instance import Instance
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig, Route
+from fieldtwin.gateway.runtime.bridge_policy import LOOPBACK, AllowRule, Network, Policy
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.instance import Instance
 
 TARGET = "target"
 WATCH_NS = NS_PER_S // 5

@@ -12,7 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from emulators.faults.schema import seconds
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.running.fault_schedule import RandomFaults, random_network_schedule, random_schedule
 from fieldtwin.running.virtual_scenario import reproduce, run_virtual
@@ -20,7 +21,6 @@ from fieldtwin.running.workers import each
 from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.form import Scenario, load_scenario
 from fieldtwin.scenarios.runner import ByChance
-from gateway.core.errors import UsageError
 
 SHORTEST_S = 600.0
 """How long a run with random faults lasts where neither the command line nor the scenario asks for longer."""

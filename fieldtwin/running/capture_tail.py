@@ -7,9 +7,9 @@ from pathlib import Path
 
 from fieldtwin.decoding.decoder import frame_events
 from fieldtwin.formats.pcap import captured_of
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.scenarios.trace import Event
-from gateway.core.errors import FieldtwinError, FileInvalid
-from twin.system import System
+from fieldtwin.twin.system import System
 
 AT_ONCE = 4 << 20
 

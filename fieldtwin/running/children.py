@@ -6,9 +6,9 @@ import asyncio
 import subprocess
 from pathlib import Path
 
-from gateway.core.control import ControlClient
-from gateway.core.errors import Bug, FieldtwinError, ReplyTimeout, Unreachable
-from twin.child import command
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import Bug, FieldtwinError, ReplyTimeout, Unreachable
+from fieldtwin.twin.child import command
 
 START_TIMEOUT_S = 30.0
 POLL_S = 0.02

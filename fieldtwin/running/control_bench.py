@@ -19,6 +19,15 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.conformance.case import Danger
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.control import ControlClient, RemoteError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.image import OUTPUTS
+from fieldtwin.gateway.core.image_region import RegionReader
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.started import Started
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.report.model import Struck
 from fieldtwin.running.capture_tail import CaptureTail
 from fieldtwin.running.field_contact import check_same, connect_control, reachable
@@ -33,17 +42,8 @@ from fieldtwin.running.with_field import environment_from
 from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
 from fieldtwin.scenarios.probe_form import Probe
 from fieldtwin.scenarios.trace import FAR_END, Event, Kind, Trace, refusal_data
-from gateway.core.clock import NS_PER_S
-from gateway.core.control import ControlClient, RemoteError
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, Unreachable, UsageError
-from gateway.core.image import OUTPUTS
-from gateway.core.image_region import RegionReader
-from gateway.core.nursery import Nursery
-from gateway.core.started import Started
-from gateway.wallclock import WallClock
-from twin.physical import attached, gateway_lost_ms, image_layout
-from twin.system import System
+from fieldtwin.twin.physical import attached, gateway_lost_ms, image_layout
+from fieldtwin.twin.system import System
 
 PLC_EVERY_S = 0.25
 STARTING_S = 5.0

@@ -11,12 +11,12 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from gateway.core.image import TagKind
-from gateway.core.statemachine import decode_period
-from gateway.core.values import COMMAND, Quality, TagValue
-from plc.program import Program
-from plc.prove import Given, Proof, Result, shown
-from twin.system import System
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.statemachine import decode_period
+from fieldtwin.gateway.core.values import COMMAND, Quality, TagValue
+from fieldtwin.plc.program import Program
+from fieldtwin.plc.prove import Given, Proof, Result, shown
+from fieldtwin.twin.system import System
 
 ARRIVES = "5s"
 """How long the last stimulus may take to get to the program."""

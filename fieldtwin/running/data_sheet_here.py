@@ -6,27 +6,27 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from emulators.canopen.dictionary import Dictionary, load_eds
-from emulators.canopen.lss import UNCONFIGURED
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.remarks import Remark
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.models.by_profile import model_for
-from emulators.models.emulated_node import NodeOptions, node_remarks
-from emulators.replay.can_log import CanLog
-from emulators.replay.objects import recorded_objects
 from fieldtwin.cli.talk import talk
+from fieldtwin.emulators.canopen.dictionary import Dictionary, load_eds
+from fieldtwin.emulators.canopen.lss import UNCONFIGURED
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.remarks import Remark
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.models.by_profile import model_for
+from fieldtwin.emulators.models.emulated_node import NodeOptions, node_remarks
+from fieldtwin.emulators.replay.can_log import CanLog
+from fieldtwin.emulators.replay.objects import recorded_objects
 from fieldtwin.formats.candump import read_log
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.log_sheet import LogSheet, nodes_of
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.until_stopped import until_stopped
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
 
 DEFAULT_NODE_ID = 1
 

@@ -11,53 +11,53 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from emulators.canopen.serve import serve_node
-from emulators.context import WhenUsedUp
-from emulators.distorted_registers import DistortedRegisters
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.faulty import FaultyEnd
-from emulators.endpoints.faulty_udp import FaultyDatagrams
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import OnClient, SocketEnd, SocketListener
-from emulators.endpoints.udp_end import UdpEnd
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active
-from emulators.faults.frames import Framing
-from emulators.faults.of_device import DeviceFaults
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.line import LineSlave
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
-from emulators.modbus.unit import ModbusUnit
-from emulators.models.emulated_node import NodeOptions, emulated_node
-from emulators.models.mailbox_modem import ModemPair
-from emulators.models.register_device import StatedRegisters, add_own_functions
-from emulators.models.sampled_sensor import SampledSensor
-from emulators.recorded_device import load_replay
-from emulators.replay.can_log import SUFFIX, CanLog
-from emulators.replay.profiled import ProfiledReplay
-from emulators.replay.replay import ExchangeReplay, NeverRecorded
-from emulators.replay.unit import ReplayUnit
-from emulators.signals import SignalPlayer, SignalTrack
-from emulators.stated import parts_of
 from fieldtwin.cli.struck import struck
 from fieldtwin.cli.talk import talk
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import OnClient, SocketEnd, SocketListener
+from fieldtwin.emulators.endpoints.udp_end import UdpEnd
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.faults.of_device import DeviceFaults
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.line import LineSlave
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.emulated_node import NodeOptions, emulated_node
+from fieldtwin.emulators.models.mailbox_modem import ModemPair
+from fieldtwin.emulators.models.register_device import StatedRegisters, add_own_functions
+from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.recorded_device import load_replay
+from fieldtwin.emulators.replay.can_log import SUFFIX, CanLog
+from fieldtwin.emulators.replay.profiled import ProfiledReplay
+from fieldtwin.emulators.replay.replay import ExchangeReplay, NeverRecorded
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.emulators.stated import parts_of
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import looks_like_another_file, shown
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.rotating import exchanges_of, header_of, oldest_part
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.data_sheet_here import print_remarks
 from fieldtwin.running.until_stopped import until_stopped
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import SERIAL_SCHEMES, Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import looks_like_another_file, shown
-from gateway.wallclock import WallClock
-from twin.data_files import find_recording
-from twin.field import unit_limits
+from fieldtwin.twin.data_files import find_recording
+from fieldtwin.twin.field import unit_limits
 
 DEFAULT_RECORDINGS = {"fieldtwin/ctd-reference": "cast.jsonl", "fieldtwin/inclinometer-cia410": "incl.jsonl"}
 """Shipped reference devices whose recording has another name than their profile."""

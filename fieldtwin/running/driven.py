@@ -14,11 +14,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Protocol
 
-from emulators.virtual.chance import seeded
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.seal import sealed
+from fieldtwin.emulators.virtual.chance import seeded
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 from fieldtwin.scenarios.trace import Trace, open_sink
-from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
 
 TRACE_KEPT = 20_000
 """Events that stay in memory; the hash and a file have them all."""

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from emulators.faults.fault import Kind
-from emulators.faults.registry import FAULTS, fault_class
-from emulators.faults.schema import parse_fault
-from emulators.faults.value_ranges import numbers
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
-from twin.fault_aims import target
-from twin.network import WATER, Network
-from twin.system import System
+from fieldtwin.emulators.faults.fault import Kind
+from fieldtwin.emulators.faults.registry import FAULTS, fault_class
+from fieldtwin.emulators.faults.schema import parse_fault
+from fieldtwin.emulators.faults.value_ranges import numbers
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.twin.fault_aims import target
+from fieldtwin.twin.network import WATER, Network
+from fieldtwin.twin.system import System
 
 MEAN_S = 120.0
 """One fault in so many seconds, on average."""

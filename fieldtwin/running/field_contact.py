@@ -10,12 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.running.link_child import LinkChild
-from gateway.core.control import ControlClient
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from twin.mapping import mapped_endpoint
-from twin.system import System
+from fieldtwin.twin.mapping import mapped_endpoint
+from fieldtwin.twin.system import System
 
 DEFAULT_CONTROL_PORT = 7420
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")

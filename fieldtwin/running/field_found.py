@@ -11,9 +11,9 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from gateway.core.control import ControlClient
-from gateway.core.errors import FieldtwinError, UsageError
-from twin.system import System
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.twin.system import System
 
 DEFAULT_HOST = "field"
 MOST_LOOKED_AT = 200

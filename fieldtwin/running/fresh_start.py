@@ -9,9 +9,9 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import ReplyTimeout
 from fieldtwin.running.field_lease import FieldLease
-from gateway.core.control import ControlClient
-from gateway.core.errors import ReplyTimeout
 
 BY = "fieldtwin test, start: fresh"
 WITHIN_S = 60.0

@@ -11,12 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.running import health_os as here
 from fieldtwin.running.health_judging import Check, Verdict, judged_can, judged_clock, judged_processor, judged_watches
-from gateway.core.errors import FieldtwinError
-from twin.data_files import data_root
-from twin.instance import runtime_root
-from twin.system import load_system
+from fieldtwin.twin.data_files import data_root
+from fieldtwin.twin.instance import runtime_root
+from fieldtwin.twin.system import load_system
 
 MIN_FREE_BYTES = 200 * 1024 * 1024
 MIN_OPEN_FILES = 1024
@@ -93,7 +93,7 @@ def _pty() -> Check:
 
 
 def _serial() -> Check:
-    from gateway.connections.serial_port import ports_here
+    from fieldtwin.gateway.connections.serial_port import ports_here
 
     ports = ports_here()
     closed = [p for p in ports if not os.access(p, os.R_OK | os.W_OK)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import Verdict
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.form import invariants_of, names_of
@@ -11,8 +12,7 @@ from fieldtwin.scenarios.knowledge import Knowledge
 from fieldtwin.scenarios.runner import LATE_SHARE, RECENT_S
 from fieldtwin.scenarios.standing import AlwaysRule, always_rule
 from fieldtwin.scenarios.whole_run import WithinRule, within_rule
-from gateway.core.clock import NS_PER_S
-from twin.system import System
+from fieldtwin.twin.system import System
 
 Rule = AlwaysRule | WithinRule
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
+from fieldtwin.gateway.core.input_file import read_input
 from fieldtwin.running.many_seeds import SeedResult
-from gateway.core.errors import FileInvalid, Unreachable
-from gateway.core.input_file import read_input
 
 
 class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

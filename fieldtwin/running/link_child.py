@@ -6,10 +6,10 @@ import asyncio
 import subprocess
 from pathlib import Path
 
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ReplyTimeout, Unreachable
 from fieldtwin.running.children import START_TIMEOUT_S, spawn
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ReplyTimeout, Unreachable
-from twin.child import command
+from fieldtwin.twin.child import command
 
 LINGER_S = 2.0
 """The line outlives us for so long when we are killed: the gateway writes its safe values over it."""

@@ -9,7 +9,7 @@ from contextlib import suppress
 from importlib import import_module
 from typing import Any, TypeVar
 
-from gateway.wallclock import precise_loop
+from fieldtwin.gateway.wallclock import precise_loop
 
 T = TypeVar("T")
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from gateway.core.events import Consumer, Producer
-from gateway.core.values import DATA
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.values import DATA
 
 MOST_KEPT = 100_000
 """Messages that are kept for the comparison. A run in which more arrive is judged by the newest ones only."""

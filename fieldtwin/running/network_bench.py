@@ -11,16 +11,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from fieldtwin.conformance.case import Danger
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.report.model import Struck
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.struck import struck_of
 from fieldtwin.scenarios.bench import Bench, Can, Reading, Stopped
 from fieldtwin.scenarios.trace import Kind, Trace
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import UsageError
-from twin.network import WATER, Network
-from twin.network_faults import placed
-from twin.water_faults import WaterFaults
+from fieldtwin.twin.network import WATER, Network
+from fieldtwin.twin.network_faults import placed
+from fieldtwin.twin.water_faults import WaterFaults
 
 
 class MemberTrace(Trace):

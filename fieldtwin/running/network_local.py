@@ -8,6 +8,8 @@ from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
 
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.report.model import ScenarioResult
 from fieldtwin.running.control_bench import ControlBench, Where
 from fieldtwin.running.network_bench import MemberTrace, NetworkBench, Part
@@ -16,8 +18,6 @@ from fieldtwin.running.session import RunSession
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner
 from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FieldtwinError
 
 
 async def run_network(scenario: Scenario, seed: int | None, trace: Trace) -> ScenarioResult:

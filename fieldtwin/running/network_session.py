@@ -10,20 +10,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emulators.endpoints.acoustic_end import AcousticServer
-from emulators.endpoints.ports import OsPorts
+from fieldtwin.emulators.endpoints.acoustic_end import AcousticServer
+from fieldtwin.emulators.endpoints.ports import OsPorts
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.started import Started
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import Scripted, Shore
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.core.started import Started
-from gateway.wallclock import WallClock
-from twin.instance import Instance
-from twin.network import WATER, Network
-from twin.network_faults import placed_all
-from twin.ship import Ship
-from twin.water_faults import WaterFaults
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.network import WATER, Network
+from fieldtwin.twin.network_faults import placed_all
+from fieldtwin.twin.ship import Ship
+from fieldtwin.twin.water_faults import WaterFaults
 
 
 @dataclass(frozen=True)

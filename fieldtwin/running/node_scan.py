@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import Clock
-from gateway.core.connection import Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.nursery import Nursery
-from gateway.protocols.canopen.cob_id import NODE_MAX
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.scan import FoundNode, scan_nodes
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.protocols.canopen.cob_id import NODE_MAX
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.scan import FoundNode, scan_nodes
+from fieldtwin.gateway.wallclock import WallClock
 
 
 async def scan_can_bus(

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gateway.core.errors import UsageError
-from gateway.core.url_secrets import has_password, without_password
-from gateway.store.knowledge import check_place
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.url_secrets import has_password, without_password
+from fieldtwin.gateway.store.knowledge import check_place
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class RunOptions:
     capture: Path | None = None
     cold: bool = False
     thread: str = ""
-    """Where the plant's side of a digital thread goes (`twin.thread_place`), empty for none."""
+    """Where the plant's side of a digital thread goes (`fieldtwin.twin.thread_place`), empty for none."""
     thread_store: str = ""
     """What keeps its log; a file of the instance where nothing is said."""
     thread_every_s: float | None = None
@@ -40,9 +40,9 @@ class RunOptions:
     seed: int | None = None
     """Of the emulators; None: the prototype file's."""
     faults: tuple[dict[str, Any], ...] = ()
-    """As `emulators.faults.schema.load_faults` gives them."""
+    """As `fieldtwin.emulators.faults.schema.load_faults` gives them."""
     water: dict[str, tuple[str, str]] = field(default_factory=dict)
-    """Transmitters that are in a network's water (`twin.field_process.FieldConfig`)."""
+    """Transmitters that are in a network's water (`fieldtwin.twin.field_process.FieldConfig`)."""
 
     def __post_init__(self) -> None:
         """Raises `UsageError` for a password in a URL, before it is handed on to a process or a file."""

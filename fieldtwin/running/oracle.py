@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from typing import Any
 
-from gateway.core.control import ControlClient
+from fieldtwin.gateway.core.control import ControlClient
 
 KEPT = 100_000
 """Held values kept a tag, newest first to be forgotten last."""

@@ -9,14 +9,14 @@ from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gateway.core.control import ControlClient
-from gateway.core.errors import Unreachable, UsageError
-from plc.binding import load_program
-from plc.program import Program
-from plc.prove import Proof
-from plc.states import StateTable
-from twin.instance import runtime_root
-from twin.system import System
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.plc.binding import load_program
+from fieldtwin.plc.program import Program
+from fieldtwin.plc.prove import Proof
+from fieldtwin.plc.states import StateTable
+from fieldtwin.twin.instance import runtime_root
+from fieldtwin.twin.system import System
 
 T = TypeVar("T")
 LOOK_S = 0.02

@@ -6,19 +6,19 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import TagValue
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.scenarios.bench import Reading
 from fieldtwin.scenarios.probe_form import Probe
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.core.values import TagValue
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
 
 MOST_EVENTS = 50_000
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.running.plc_client import choose
-from gateway.core.control import ControlClient
 
 PATIENCE_S = 120.0
 """A device whose group takes long has its new configuration when that group was read."""

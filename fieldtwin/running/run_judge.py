@@ -10,14 +10,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import CheckResult, ScenarioResult, Verdict
 from fieldtwin.running.driven import PIECE_S
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 from fieldtwin.scenarios.form import Scenario
-from gateway.core.clock import NS_PER_S
-from twin.network_faults import placed_all
-from twin.prototype_file import Prototype
+from fieldtwin.twin.network_faults import placed_all
+from fieldtwin.twin.prototype_file import Prototype
 
 MOST_TOLD = 5
 TITLE = "what a run in virtual time is judged by"

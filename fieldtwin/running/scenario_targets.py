@@ -15,6 +15,8 @@ from pathlib import Path
 from types import TracebackType
 
 from fieldtwin.conformance.case import Danger
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.report.coverage import Collector
 from fieldtwin.report.machines import machines_of
 from fieldtwin.report.model import ScenarioResult, Verdict
@@ -31,10 +33,8 @@ from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner, gone
 from fieldtwin.scenarios.target_limits import refusal
 from fieldtwin.scenarios.trace import Trace, open_sink
-from gateway.core.errors import FieldtwinError
-from gateway.wallclock import WallClock
-from twin.field_process import FieldConfig
-from twin.instance import Instance, runtime_root
+from fieldtwin.twin.field_process import FieldConfig
+from fieldtwin.twin.instance import Instance, runtime_root
 
 
 @dataclass(frozen=True)

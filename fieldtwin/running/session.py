@@ -16,11 +16,16 @@ import msgspec
 
 from fieldtwin.cli.talk import talk
 from fieldtwin.conformance.case import Danger
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.started import Started
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.children import Child
-from fieldtwin.running.control_bench import ControlBench, Where
 from fieldtwin.running.field_contact import FieldContact, contact_elsewhere, contact_here
 from fieldtwin.running.field_return import FieldReturn, is_loss
-from fieldtwin.running.invariant_watch import InvariantWatch
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.oracle import Oracle
 from fieldtwin.running.reloading import Reloaded, reload
@@ -28,24 +33,19 @@ from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.thread_return import ThreadReturn
 from fieldtwin.scenarios.trace import Trace
-from gateway.core.clock import NS_PER_S
-from gateway.core.control import ControlClient
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, ReplyTimeout, Unreachable, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.started import Started
-from gateway.wallclock import WallClock
-from twin.controller import ControllerConfig
-from twin.instance import Instance
-from twin.mapping import mapping_to_json
-from twin.physical import PhysicalTwin
-from twin.plant_thread import PlantThreadConfig
-from twin.system import System, load_system
-from twin.thread_place import MODEM, lent_transmitter
+from fieldtwin.twin.controller import ControllerConfig
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.mapping import mapping_to_json
+from fieldtwin.twin.physical import PhysicalTwin
+from fieldtwin.twin.plant_thread import PlantThreadConfig
+from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.system_schema import NONE_STATED
+from fieldtwin.twin.thread_place import MODEM, lent_transmitter
 
 if TYPE_CHECKING:
     from fieldtwin.running.bridge_cable import BridgeCable
-    from twin.field_process import FieldConfig
+    from fieldtwin.running.invariant_watch import InvariantWatch
+    from fieldtwin.twin.field_process import FieldConfig
 
 MODEM_EVERY_S = 1.0
 """So often, at most, a tag goes over a modem: it takes some thirty events a second."""
@@ -77,7 +77,7 @@ class RunSession(Started):
         self.twin = PhysicalTwin(self.system)
         self.lent = self._lent_to_the_thread()
         if options.prototype and not options.field_host:
-            from twin.field_process import resolve  # here and below: a plant has no emulators installed
+            from fieldtwin.twin.field_process import resolve  # here and below: a plant has no emulators installed
 
             resolve(self._field_config(Path()))  # what can be wrong in the files is wrong before anything starts
         self.instance = Instance(options.instance or self.system.name)
@@ -89,8 +89,12 @@ class RunSession(Started):
         self.children: dict[str, Child] = {}
         self.errors: deque[str] = deque(maxlen=MAX_ERRORS)
         self.oracle = Oracle()
-        self.invariants = InvariantWatch(self.system)
-        self.watches_invariants = bool(self.invariants)
+        self.invariants: InvariantWatch | None = None
+        if self.system.invariants != NONE_STATED:
+            # Here, because it loads emulators, which a plant does not need.
+            from fieldtwin.running.invariant_watch import InvariantWatch
+
+            self.invariants = InvariantWatch(self.system)
         self._judging: asyncio.Task[None] | None = None
         self.states = StateWatch(self.system)
         self.shore: Shore | None = None
@@ -154,7 +158,7 @@ class RunSession(Started):
             await self._lay_cables(run_dir)
         config = run_dir / "plc.json"
         config.write_bytes(plc.to_json())
-        await self._start_child("plc", "plc", config)
+        await self._start_child("plc", "fieldtwin.plc", config)
         gateway = ControllerConfig(
             system=str(self.system.path.resolve()),
             run_dir=str(run_dir),
@@ -164,7 +168,7 @@ class RunSession(Started):
             capture=str(self.options.capture.resolve()) if self.options.capture else "",
             lent=(self.lent,) if self.lent else (),
         )
-        await self._start_child("gateway", "twin.controller", self._write("gateway.json", gateway))
+        await self._start_child("gateway", "fieldtwin.twin.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
         if self.options.thread:
             await self._start_thread(run_dir)
@@ -192,7 +196,7 @@ class RunSession(Started):
                 1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.lent else 0)
             ),
         )
-        client = await self._start_child("thread", "twin.plant_thread", self._write("thread.json", config))
+        client = await self._start_child("thread", "fieldtwin.twin.plant_thread", self._write("thread.json", config))
         self.thread_place = str((await client.call("get"))["place"])
         if not self.lent:  # where it is found again, had it been free to choose a port
             config = msgspec.structs.replace(config, place=self.thread_place)
@@ -203,7 +207,7 @@ class RunSession(Started):
     def _keep_thread(self, config: PlantThreadConfig) -> None:
         def another() -> Child:
             path = self._write("thread.json", config)
-            self.children["thread"] = Child("thread", "twin.plant_thread", path, self.instance.dir)
+            self.children["thread"] = Child("thread", "fieldtwin.twin.plant_thread", path, self.instance.dir)
             return self.children["thread"]
 
         def came(client: ControlClient) -> None:
@@ -216,7 +220,7 @@ class RunSession(Started):
         self._nursery.start(self.thread_return.run(), "thread's process")
 
     def _field_config(self, run_dir: Path) -> FieldConfig:
-        from twin.field_process import FieldConfig
+        from fieldtwin.twin.field_process import FieldConfig
 
         o = self.options
         listen = dict(o.listen)
@@ -256,7 +260,7 @@ class RunSession(Started):
             self.field_return = FieldReturn(self._field, self.system, at, token, self._field_returned)
         else:
             config = self._write("field.json", self._field_config(run_dir))
-            client = await self._start_child("field", "twin.field_process", config, FIELD_LINGER_S)
+            client = await self._start_child("field", "fieldtwin.twin.field_process", config, FIELD_LINGER_S)
             self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far
@@ -293,8 +297,8 @@ class RunSession(Started):
         if self.field_return is not None:
             self._nursery.start(self.field_return.run(), "field side's return")
         self._nursery.start(self._watch(), "states")
-        if self.invariants:
-            self._judging = self._nursery.start(self._judge_invariants(), "invariants")
+        if self.invariants is not None:
+            self._judging = self._nursery.start(self._judge_invariants(self.invariants), "invariants")
         self._nursery.start(self._ask(), "status")
         device = next(iter(self.far), None)
         if device is not None and self.options.prototype and self.options.commands:
@@ -319,14 +323,16 @@ class RunSession(Started):
         finally:
             done.cancel()
 
-    async def _judge_invariants(self) -> None:
+    async def _judge_invariants(self, invariants: InvariantWatch) -> None:
         """Look at the invariants of the system file until the gateway or the PLC is gone, or the run is stopped."""
+        from fieldtwin.running.control_bench import ControlBench, Where
+
         where = Where(self.instance.dir, plant=True, allowed=Danger.OBSERVE)
         try:
-            async with ControlBench(self.system, where, Trace(1), target="real", names=self.invariants.names) as bench:
-                await self.invariants.run(bench, INVARIANTS_S)
+            async with ControlBench(self.system, where, Trace(1), target="real", names=invariants.names) as bench:
+                await invariants.run(bench, INVARIANTS_S)
         except FieldtwinError as e:  # the processes' own watch tells of one that is gone
-            self.invariants.end(str(e))
+            invariants.end(str(e))
             self.note_error(f"the invariants were not judged to the end: {e}")
 
     async def _settle(self) -> None:

@@ -1,7 +1,7 @@
 """A digital shadow at work: the thread that brings what the plant saw, the store that keeps it, and the shadow that is given it.
 
-Here the transmitter's side is assembled, outside of `twin.shadow` (SPEC ruling 16): it acknowledges and asks for what is missing,
-and has no log of its own to send.
+Here the transmitter's side is assembled, outside of `fieldtwin.twin.shadow` (SPEC ruling 16): it acknowledges and asks for what
+is missing, and has no log of its own to send.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.control import ControlServer
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
+from fieldtwin.gateway.store.knowledge import open_knowledge
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.knowledge import KnowledgeWriter
+from fieldtwin.twin.mape.messages import Verdict
+from fieldtwin.twin.shadow import DigitalShadow
+from fieldtwin.twin.system import System
+from fieldtwin.twin.thread import schema_of, to_receivers
+from fieldtwin.twin.thread_end import ThreadEnd
+from fieldtwin.twin.thread_link import Carrier
+from fieldtwin.twin.thread_place import twin_carrier
+from fieldtwin.twin.thread_process import ReceivingEnd
+from fieldtwin.twin.variables import Limits
 from fieldtwin.whatif.known import recall
-from gateway.core.clock import NS_PER_MS
-from gateway.core.control import ControlServer
-from gateway.core.nursery import Nursery
-from gateway.store.event import Event, Kind, KnowledgeStore
-from gateway.store.knowledge import open_knowledge
-from gateway.wallclock import WallClock
-from twin.declared import declared_variables
-from twin.instance import Instance
-from twin.knowledge import KnowledgeWriter
-from twin.mape.messages import Verdict
-from twin.shadow import DigitalShadow
-from twin.system import System
-from twin.thread import schema_of, to_receivers
-from twin.thread_end import ThreadEnd
-from twin.thread_link import Carrier
-from twin.thread_place import twin_carrier
-from twin.thread_process import ReceivingEnd
-from twin.variables import Limits
 
 STEP_MS = 50
 ABOUT_THE_PLANT = (Kind.VALUE, Kind.STATE, Kind.PAYLOAD)

@@ -13,20 +13,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.connection import Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.statemachine import encode_period
-from gateway.core.values import RESPONSE
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.mailboxes import Inbox, Mailboxes
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
-from twin.system import System
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import RESPONSE
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.mailboxes import Inbox, Mailboxes
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.twin.system import System
 
 TICK_NS = 20 * NS_PER_MS
 """How often an exchange that is under way is looked after."""

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gateway.core.image import OUTPUTS, ImageLayout, RegionReader
-from gateway.core.statemachine import STATES, encode_period
-from twin.model import DigitalModel
-from twin.physical import attached
-from twin.system import System
+from fieldtwin.gateway.core.image import OUTPUTS, ImageLayout, RegionReader
+from fieldtwin.gateway.core.statemachine import STATES, encode_period
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.physical import attached
+from fieldtwin.twin.system import System
 
 NAMES = list(STATES)
 MAX_TRANSITIONS = 10_000

@@ -6,12 +6,12 @@ from collections.abc import Collection, Iterable
 from typing import Any, Protocol
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.plc.task import StopReason
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.scenarios.trace import refusal_text
-from gateway.core.endpoint import Endpoint
-from plc.task import StopReason
-from twin.system import System
+from fieldtwin.twin.system import System
 
 MOST_REFUSED = 10
 """Refused outputs that a summary names one by one."""
@@ -49,11 +49,8 @@ class Run(Protocol):
     """A run that is over: of processes on this host, or in virtual time."""
 
     @property
-    def invariants(self) -> Invariants: ...
-
-    @property
-    def watches_invariants(self) -> bool:
-        """Whether the run judged the invariants of its system file."""
+    def invariants(self) -> Invariants | None:
+        """What judged the invariants of the system file; None where the run judged none."""
         ...
 
     @property
@@ -130,7 +127,7 @@ def summarise(run: Run) -> dict[str, Any]:
     checks += _refusal_checks(
         refusals, getattr(run, "may_refuse", ()), disturbed=run.options.prototype and run.disturbed
     )
-    invariants = run.invariants if run.watches_invariants else None
+    invariants = run.invariants
     errors = [*run.errors, *(invariants.errors() if invariants is not None else ()), *checks]
     return {
         "fieldtwin": __version__,

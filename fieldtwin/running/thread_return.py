@@ -9,10 +9,10 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.runtime.backoff import Backoff
 from fieldtwin.running.children import Child
-from gateway.core.control import ControlClient
-from gateway.core.errors import FieldtwinError
-from gateway.runtime.backoff import Backoff
 
 FIRST_S, LIMIT_S = 0.5, 60.0
 LASTED_S = 60.0

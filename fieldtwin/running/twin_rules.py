@@ -21,17 +21,17 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import ConfigDict, Field
 
-from emulators.faults.schema import seconds
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.values import COMMAND, DATA
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.running.shadowing import limits_of
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.values import COMMAND, DATA
-from gateway.core.yaml_file import Key, YamlFile, load, validate
-from twin.mape.plan import Planner, Rule, RulePlanner
-from twin.mape.what_if import Question
-from twin.model import DigitalModel
-from twin.system import System
-from twin.system_schema import Strict, TagName
-from twin.variables import Limits
+from fieldtwin.twin.mape.plan import Planner, Rule, RulePlanner
+from fieldtwin.twin.mape.what_if import Question
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.system import System
+from fieldtwin.twin.system_schema import Strict, TagName
+from fieldtwin.twin.variables import Limits
 
 Finding = Literal["agree", "mismatch", "outside", "inside", "bad", "good", "stale", "fresh", "unreadable"]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]

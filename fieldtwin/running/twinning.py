@@ -9,26 +9,26 @@ import secrets
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.knowledge import KnowledgeWriter
+from fieldtwin.twin.mape.execute import Bounds
+from fieldtwin.twin.mape.messages import Verdict
+from fieldtwin.twin.mape.plan import OLD_MS, Planner
+from fieldtwin.twin.mape.what_if import Question
+from fieldtwin.twin.system import System
+from fieldtwin.twin.thread import DTtoPTConnection, Operator, schema_of
+from fieldtwin.twin.thread_end import ThreadEnd
+from fieldtwin.twin.thread_link import Carrier
+from fieldtwin.twin.twin import DigitalTwin
+from fieldtwin.twin.variables import Limits
 from fieldtwin.whatif.asking import Asking
-from gateway.core.clock import NS_PER_MS
-from gateway.core.events import Consumer
-from gateway.core.nursery import Nursery
-from gateway.core.values import COMMAND
-from gateway.store.event import Event, Kind, KnowledgeStore
-from twin.declared import declared_variables
-from twin.instance import Instance
-from twin.knowledge import KnowledgeWriter
-from twin.mape.execute import Bounds
-from twin.mape.messages import Verdict
-from twin.mape.plan import OLD_MS, Planner
-from twin.mape.what_if import Question
-from twin.system import System
-from twin.thread import DTtoPTConnection, Operator, schema_of
-from twin.thread_end import ThreadEnd
-from twin.thread_link import Carrier
-from twin.twin import DigitalTwin
-from twin.variables import Limits
 
 
 class Twinning(Shadowing):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 
-from gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.nursery import Nursery
 
 
 async def until_stopped(nursery: Nursery) -> None:

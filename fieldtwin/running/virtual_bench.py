@@ -10,9 +10,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from emulators.models.packet_link import ModemEnd
-from emulators.virtual.loop import VirtualLoop
 from fieldtwin.conformance.case import Danger
+from fieldtwin.emulators.models.packet_link import ModemEnd
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.started import Started
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.runtime.refusals import Refusal
+from fieldtwin.plc.publishing import Change
+from fieldtwin.plc.task import StopReason
 from fieldtwin.report.model import Struck
 from fieldtwin.running.probes import Probes
 from fieldtwin.running.shore import Scripted, Shore
@@ -21,20 +32,9 @@ from fieldtwin.running.struck import struck_of
 from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
 from fieldtwin.scenarios.probe_form import Probe
 from fieldtwin.scenarios.trace import FAR_END, Kind, Trace, refusal_data
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.started import Started
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.runtime.refusals import Refusal
-from plc.publishing import Change
-from plc.task import StopReason
-from twin.prototype_file import Prototype
-from twin.system import System
-from twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.system import System
+from fieldtwin.twin.virtual import VirtualPrototype
 
 ASKED_KEPT = 64
 _QUALITIES = {quality: quality.name.lower() for quality in Quality}
@@ -269,7 +269,7 @@ class VirtualBench(Started):
 
 
 class _FrameTap:
-    """`gateway.core.connection.Tap` that writes a trace, and when something was sent."""
+    """`fieldtwin.gateway.core.connection.Tap` that writes a trace, and when something was sent."""
 
     def __init__(self, bench: VirtualBench, system: System) -> None:
         self._bench = bench

@@ -9,19 +9,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from emulators.models.acoustic_link import AcousticLink
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
+from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.started import Started
 from fieldtwin.running.network_bench import MemberTrace, NetworkBench, Part
 from fieldtwin.running.shore import Scripted, Shore
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
-from gateway.core.nursery import Nursery
-from gateway.core.started import Started
-from twin.network import Network
-from twin.ship import Ship
-from twin.water_faults import WaterFaults
+from fieldtwin.twin.network import Network
+from fieldtwin.twin.ship import Ship
+from fieldtwin.twin.water_faults import WaterFaults
 
 SEEDS_APART = 1_000_003
 """Between the systems of a run: none plays another one's chances."""

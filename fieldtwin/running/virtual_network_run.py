@@ -9,16 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.running.driven import DrivenRun
 from fieldtwin.running.fault_schedule import RandomFaults, random_network_schedule
 from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.shore import Scripted
 from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from gateway.core.nursery import Nursery
-from twin.network import load_network
-from twin.network_faults import placed_all
+from fieldtwin.twin.network import load_network
+from fieldtwin.twin.network_faults import placed_all
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from emulators.faults.schema import seconds
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.gateway.runtime.gateway import stale_limits
+from fieldtwin.gateway.runtime.learnt import describe_learnt
+from fieldtwin.gateway.runtime.status import describe
 from fieldtwin.running.age_oracle import AgeOracle
 from fieldtwin.running.driven import DrivenRun
 from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
@@ -25,16 +33,8 @@ from fieldtwin.running.summary import summarise
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.runner import TICK_S
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.core.statemachine import encode_period
-from gateway.core.values import Quality, TagValue
-from gateway.runtime.gateway import stale_limits
-from gateway.runtime.learnt import describe_learnt
-from gateway.runtime.status import describe
-from twin.field import FieldSide
-from twin.field_process import FieldConfig, resolve
+from fieldtwin.twin.field import FieldSide
+from fieldtwin.twin.field_process import FieldConfig, resolve
 
 SETTLE_S = 10.0
 """How long a command that is still under way may take after the run's time is over."""
@@ -105,9 +105,9 @@ class VirtualRun(DrivenRun):
         self.oracle = AgeOracle()
         self.messages = MessageOracle()
         """Compares the commands that reached the gateway through a mailbox with those that the far end sent."""
-        self.invariants = InvariantWatch(self.system)
-        self.watches_invariants = False
-        """Whether this run judges the invariants; a scenario judges them itself."""
+        self.invariants: InvariantWatch | None = None
+        """What this run judges; a scenario judges the invariants itself."""
+        self._stated = InvariantWatch(self.system)
         self.gateway_status: dict[str, Any] | None = None
         self.plc_status: dict[str, Any] | None = None
         self.field_status: dict[str, Any] | None = None
@@ -168,9 +168,9 @@ class VirtualRun(DrivenRun):
 
     def watch_invariants(self, bench: VirtualBench, nursery: Nursery) -> None:
         """Judge the invariants of the system file from now on, as long as `nursery` is open."""
-        self.watches_invariants = True
-        if self.invariants:
-            nursery.start(self.invariants.run(bench, TICK_S), "invariants")
+        self.invariants = self._stated
+        if self._stated:
+            nursery.start(self._stated.run(bench, TICK_S), "invariants")
 
     def attach(self, bench: VirtualBench) -> None:
         """From now on what happens on `bench` is judged."""

@@ -8,9 +8,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from emulators.virtual.chance import seeded
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.seal import sealed
+from fieldtwin.emulators.virtual.chance import seeded
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.report.coverage import Collector
 from fieldtwin.report.machines import machines_of
 from fieldtwin.report.model import ScenarioResult, Verdict
@@ -21,10 +24,7 @@ from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import ByChance, Runner, gone
 from fieldtwin.scenarios.trace import Trace, open_sink
-from gateway.core.errors import FieldtwinError
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
-from twin.prototype_file import load_prototype
+from fieldtwin.twin.prototype_file import load_prototype
 
 
 def run_virtual(

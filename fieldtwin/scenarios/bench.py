@@ -11,9 +11,9 @@ from enum import Enum
 from typing import Any, Literal, Protocol
 
 from fieldtwin.conformance.case import Danger
+from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.report.model import Struck
 from fieldtwin.scenarios.trace import Trace
-from gateway.core.errors import FieldtwinError
 
 
 class Can(Enum):

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from emulators.faults.schema import seconds
 from fieldtwin.decoding.exchange import SECRET, Exchange
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.scenarios.bench import Bench, Reading
 from fieldtwin.scenarios.words import Bounds, Expect, WireForm
-from gateway.core.clock import NS_PER_S
-from gateway.devices.codec import decode, decode_little
-from twin.system import System
+from fieldtwin.twin.system import System
 
 Said = tuple[str, str] | None
 LIKE_S = 0.5

@@ -14,9 +14,9 @@ from itertools import pairwise
 from math import isnan
 from typing import Any
 
-from gateway.core.errors import UsageError
-from gateway.core.nearest import did_you_mean
-from gateway.core.values import Quality, Reason
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.values import Quality, Reason
 
 FUNCTIONS = ("quality", "age", "value", "updates", "reason")
 """Of a tag: its quality in words, seconds since its source's time, its value, how often it was published, why it is bad."""

@@ -6,23 +6,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
+from fieldtwin.emulators.faults.schema import FaultSpec, checked, parse_fault, seconds
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.scenarios.bench import Can
 from fieldtwin.scenarios.expression import QUALITIES, Expression, NotUnderstood
 from fieldtwin.scenarios.invariants import Invariants, load_invariants
 from fieldtwin.scenarios.probe_form import Probe, read_probe
 from fieldtwin.scenarios.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.nearest import did_you_mean
-from gateway.core.yaml_file import Key, YamlFile, load, validate
-from twin.data_files import network_file
-from twin.fault_aims import target
-from twin.network import Network, load_network
-from twin.network_faults import check_network_fault
-from twin.system import System, load_system
-from twin.system_schema import InvariantsForm
+from fieldtwin.twin.data_files import network_file
+from fieldtwin.twin.fault_aims import target
+from fieldtwin.twin.network import Network, load_network
+from fieldtwin.twin.network_faults import check_network_fault
+from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.system_schema import NONE_STATED
 
-NONE_STATED = InvariantsForm()
 _TOGETHER = {
     "tag": ("tag", "value", "tolerance", "quality", "like", "within", "during"),
     "updates": ("tag", "quality", "updates_per_s", "during"),
@@ -92,7 +91,7 @@ class Scenario:
 def names_of(system: System, network: Network | None = None) -> dict[str, tuple[str, ...]]:
     """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE; in a network behind the name of their system. Of a program's state
     the words that it can be, of all else none."""
-    from twin.physical import image_layout
+    from fieldtwin.twin.physical import image_layout
 
     if network is not None:
         of_all = [(m.name, names_of(m.system)) for m in network.members.values()]

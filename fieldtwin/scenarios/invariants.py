@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from emulators.faults.schema import seconds
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.yaml_file import Key
 from fieldtwin.scenarios.expression import Expression
-from gateway.core.errors import UsageError
-from gateway.core.yaml_file import Key
-from twin.system import System
+from fieldtwin.twin.system import System
 
 
 @dataclass(frozen=True)

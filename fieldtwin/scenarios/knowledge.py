@@ -10,12 +10,12 @@ from collections.abc import Collection, Iterable
 from typing import Any
 
 from fieldtwin.decoding.exchange import SECRET
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.expectation import is_secret
 from fieldtwin.scenarios.expression import Expression
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.clock import NS_PER_S
-from twin.system import System
+from fieldtwin.twin.system import System
 
 PENDING_S = 5.0
 """How long ``command pending`` is true after the remote client's command."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import CheckResult, Verdict
-from gateway.core.clock import NS_PER_S
 
 SECONDS = 5
 """How long before the failed check an exchange may have ended and still be shown."""

@@ -15,11 +15,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from emulators.faults.schema import seconds
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.profile import DeviceProfile, resolve
-from gateway.core.yaml_file import Key, Position, YamlFile
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.yaml_file import Key, Position, YamlFile
 
 MIN_EVERY_S = 0.01
 _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")

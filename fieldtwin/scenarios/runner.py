@@ -11,9 +11,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
-from emulators.faults.schema import seconds
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.report.model import CheckResult, ScenarioResult, Struck, Verdict
 from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.bench import Bench, Can, NothingKnown
@@ -30,8 +32,6 @@ from fieldtwin.scenarios.target_limits import refusal
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.whole_run import WholeRun
 from fieldtwin.scenarios.words import Expect, Step, word_of
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FieldtwinError, UsageError
 
 TICK_S = 0.02
 """How often is looked while something is waited for."""

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import CheckResult, Verdict
 from fieldtwin.scenarios.bench import Bench, Part
 from fieldtwin.scenarios.expectation import said, wire_matches
@@ -20,7 +21,6 @@ from fieldtwin.scenarios.invariants import Invariants, Stated
 from fieldtwin.scenarios.knowledge import Knowledge
 from fieldtwin.scenarios.violation import Violation
 from fieldtwin.scenarios.words import WireForm
-from gateway.core.clock import NS_PER_S
 
 
 class Standing:

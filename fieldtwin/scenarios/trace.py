@@ -15,7 +15,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 CAPACITY = 200_000
 _AT_ONCE = 256
@@ -139,7 +139,8 @@ class Trace:
 
 
 REFUSAL_KEYS = ("value", "cause", "reason", "by", "program", "place", "fault")
-"""What an event of the kind REFUSED holds, of an entry of the gateway's journal (`gateway.runtime.refusals.Refusal`)."""
+"""What an event of the kind REFUSED holds, of an entry of the gateway's journal
+(`fieldtwin.gateway.runtime.refusals.Refusal`)."""
 
 
 def refusal_data(described: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from emulators.faults.schema import seconds
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import CheckResult, Verdict
 from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.expectation import bounds_text, inside
@@ -23,7 +24,6 @@ from fieldtwin.scenarios.lateness import allowance
 from fieldtwin.scenarios.trace import Event, Kind
 from fieldtwin.scenarios.violation import Violation
 from fieldtwin.scenarios.words import Cycle, Rate
-from gateway.core.clock import NS_PER_S
 
 SAMPLES = 500
 """Looks that a rate remembers: its windows begin that much apart at most."""

@@ -11,6 +11,8 @@ import sys
 from dataclasses import dataclass
 from types import TracebackType
 
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.running.session import RunSession
 from fieldtwin.service.events import Event, Priority, changes
 from fieldtwin.service.exposition import render
@@ -18,8 +20,6 @@ from fieldtwin.service.journal import EventLog, Format
 from fieldtwin.service.metrics import Snapshot, families
 from fieldtwin.service.metrics_server import MetricsServer, parse_place
 from fieldtwin.service.notify import Notifier
-from gateway.core.errors import FieldtwinError
-from gateway.core.nursery import Nursery
 
 LOOK_S = 0.5
 STATUS_S = 5.0

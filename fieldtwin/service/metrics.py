@@ -14,10 +14,10 @@ from itertools import islice
 from typing import Any
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters as CanopenCounters
+from fieldtwin.gateway.protocols.modbus.client import ClientCounters
 from fieldtwin.service.exposition import Family
-from gateway.core.values import Quality
-from gateway.protocols.canopen.sdo_channel import Counters as CanopenCounters
-from gateway.protocols.modbus.client import ClientCounters
 
 MOST_DEVICES = 1000
 """Devices with series of their own."""

@@ -11,8 +11,8 @@ import errno
 import re
 from collections.abc import Callable
 
+from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, UsageError
 from fieldtwin.service.exposition import CONTENT_TYPE
-from gateway.core.errors import EndpointBusy, Unreachable, UsageError
 
 MOST_CLIENTS = 16
 MOST_HEAD = 8192

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.conformance.case import Basis
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.sitereport.document import Deviation, Device, Document, Kind, Piece, Source, Table, Weight
 from fieldtwin.sitereport.reading_dump import dump_piece
-from gateway.core.errors import FileInvalid, UsageError
 
 MOST_BYTES = 1 << 28
 """Of one JSON file; dumps are read line by line."""

@@ -13,19 +13,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.errors import ConnectionLost, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.testhost.one_device import endpoint_words
 from fieldtwin.testhost.running_plc import RunningPlc
 from fieldtwin.testhost.wire_log import WireLog
-from gateway.core.clock import Clock
-from gateway.core.connection import CanConnection
-from gateway.core.errors import ConnectionLost, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.profile import Tag
-from gateway.devices.codec import decode, decode_little
-from twin.field import FieldSide
-from twin.mapping import mapped_endpoint
-from twin.prototype_file import Prototype
-from twin.system import System
+from fieldtwin.twin.field import FieldSide
+from fieldtwin.twin.mapping import mapped_endpoint
+from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.system import System
 
 
 class Bench:

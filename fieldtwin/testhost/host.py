@@ -15,18 +15,18 @@ from pathlib import Path
 from typing import Any
 
 from fieldtwin.__about__ import __version__
+from fieldtwin.gateway.core.control import MAX_LINE, ControlServer
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.template_here import Stranger, agree
 from fieldtwin.testhost.bench import Bench, new_folder
 from fieldtwin.testhost.one_device import Wanted, write_system
 from fieldtwin.testhost.running_plc import RunningPlc
 from fieldtwin.testhost.stepped_program import SteppedProgram
-from gateway.core.control import MAX_LINE, ControlServer
-from gateway.core.errors import UsageError
-from gateway.wallclock import WallClock
-from twin.data_files import find
-from twin.field_process import FieldConfig, resolve_files
-from twin.prototype_file import Prototype
-from twin.system import System, load_system
+from fieldtwin.twin.data_files import find
+from fieldtwin.twin.field_process import FieldConfig, resolve_files
+from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.system import System, load_system
 
 MOST = 1_000
 """Benches and programs at once: who forgets to end them is told."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.report.html import write_html
 from fieldtwin.report.model import CheckResult, Report, ScenarioResult, Verdict
-from gateway.core.errors import UsageError
 
 _VERDICTS = {verdict.value: verdict for verdict in Verdict}
 

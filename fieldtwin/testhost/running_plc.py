@@ -12,18 +12,18 @@ from typing import Any
 
 import msgspec
 
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.control import ControlClient, RemoteError
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.running.children import Child
 from fieldtwin.running.plc_client import step_and_wait
 from fieldtwin.running.shore import Shore
-from gateway.core.clock import Clock
-from gateway.core.control import ControlClient, RemoteError
-from gateway.core.errors import UsageError
-from gateway.core.nursery import Nursery
-from twin.controller import ControllerConfig
-from twin.field import FieldSide
-from twin.mapping import mapped_endpoint, mapping_to_json
-from twin.physical import PhysicalTwin
-from twin.system import System
+from fieldtwin.twin.controller import ControllerConfig
+from fieldtwin.twin.field import FieldSide
+from fieldtwin.twin.mapping import mapped_endpoint, mapping_to_json
+from fieldtwin.twin.physical import PhysicalTwin
+from fieldtwin.twin.system import System
 
 BY = "test"
 STEERING = ("force", "unforce", "pause", "go", "step", "restart", "why")
@@ -55,7 +55,7 @@ class RunningPlc:
         system, folder = self._system, self._folder
         config = folder / "plc.json"
         config.write_bytes(PhysicalTwin(system).ecs.prepare(folder, cold=True).to_json())
-        self._plc = await self._start("plc", "plc", config)
+        self._plc = await self._start("plc", "fieldtwin.plc", config)
         mapping = {}
         for bus, listening in self._field.listening.items():
             plant = system.buses[bus].endpoint
@@ -69,7 +69,7 @@ class RunningPlc:
         )
         config = folder / "gateway.json"
         config.write_bytes(msgspec.json.encode(told))
-        await self._start("gateway", "twin.controller", config)
+        await self._start("gateway", "fieldtwin.twin.controller", config)
         device = next(iter(self._field.far), None)
         if device is not None:
             self._shore = Shore(system, device, self._field.far[device], self._clock)

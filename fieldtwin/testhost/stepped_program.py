@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import UsageError
-from gateway.core.image import Message, TagKind
-from gateway.core.values import Quality, Reason, TagValue
-from plc.binding import BoundProgram, load_program
-from plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
-from plc.scan import failed
-from plc.states import StateMachine
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.image import Message, TagKind
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.plc.binding import BoundProgram, load_program
+from fieldtwin.plc.program import Outbox, Program, ProgramFailed, Role, ScanInfo
+from fieldtwin.plc.scan import failed
+from fieldtwin.plc.states import StateMachine
 
 MAX_SCANS = 10_000_000
 QUALITIES = {quality.name.lower(): quality for quality in Quality}

@@ -11,10 +11,10 @@ from typing import Any
 
 from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import Clock
-from twin.system import System
+from fieldtwin.twin.system import System
 
 MOST = 20_000
 AT_ONCE = 5_000

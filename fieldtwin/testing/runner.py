@@ -37,7 +37,7 @@ class FieldtwinRefused(Exception):
 def command_of(said: str = "") -> list[str]:
     """The command `fieldtwin`: what was `said`, else FIELDTWIN_COMMAND, else this very Python's."""
     text = said or os.environ.get(COMMAND_VARIABLE, "")
-    return shlex.split(text) if text else [sys.executable, "-m", "fieldtwin"]
+    return shlex.split(text) if text else [sys.executable, "-P", "-m", "fieldtwin"]
 
 
 class Runner:

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import msgspec
 
+from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.running.shore import Scripted
 from fieldtwin.whatif.asking import Asked
 from fieldtwin.whatif.fork import Fork, answer, check
 from fieldtwin.whatif.outcome import Outcome
 from fieldtwin.whatif.plan import Plan
 from fieldtwin.whatif.state import KnownState
-from gateway.core.errors import FieldtwinError
 
 NICE = 5
 """Whoever runs beside it, a plant or its twin, goes first."""

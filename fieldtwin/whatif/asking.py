@@ -13,16 +13,16 @@ from pathlib import Path
 
 import msgspec
 
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import Bug, FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.statemachine import decode_period
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.store.event import KnowledgeStore
+from fieldtwin.twin.child import command as child_command
+from fieldtwin.twin.mape.what_if import Question
+from fieldtwin.twin.system import System
 from fieldtwin.whatif.last_known import LastKnown
 from fieldtwin.whatif.state import Number
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.errors import Bug, FieldtwinError, Unreachable, UsageError
-from gateway.core.statemachine import decode_period
-from gateway.core.values import COMMAND
-from gateway.store.event import KnowledgeStore
-from twin.child import command as child_command
-from twin.mape.what_if import Question
-from twin.system import System
 
 TIMEOUT_S = 60.0
 TOLD_WITHIN_S = 12.0
@@ -35,7 +35,7 @@ MOST_KEPT = 1 << 16
 class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A question as it goes to the process `fieldtwin.whatif.asked`.
 
-    `require`, `finally_`, `horizon_s` and `settle_s` as in `twin.mape.what_if.Question`.
+    `require`, `finally_`, `horizon_s` and `settle_s` as in `fieldtwin.twin.mape.what_if.Question`.
     """
 
     system: str

@@ -6,12 +6,12 @@ import shutil
 from collections.abc import Mapping
 from pathlib import Path
 
-from emulators.distorted_registers import DistortedRegisters
-from emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.twin.virtual import VirtualPrototype
 from fieldtwin.whatif.state import KnownState, Number
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.statemachine import encode_period
-from twin.virtual import VirtualPrototype
 
 
 def retain_for(state: KnownState, run_dir: Path) -> None:

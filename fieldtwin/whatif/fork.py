@@ -13,25 +13,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from emulators.virtual.chance import seeded
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.seal import sealed
+from fieldtwin.emulators.virtual.chance import seeded
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.plc.publishing import Change
+from fieldtwin.plc.task import StopReason
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import state_words
 from fieldtwin.scenarios.expression import Expression
+from fieldtwin.twin.field_process import FieldConfig, resolve
+from fieldtwin.twin.virtual import VirtualPrototype
 from fieldtwin.whatif.begin import begin, otherwise, retain_for
 from fieldtwin.whatif.outcome import Outcome, Requirement
 from fieldtwin.whatif.plan import Plan
 from fieldtwin.whatif.state import KnownState
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FieldtwinError, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.values import Quality, Reason
-from gateway.wallclock import WallClock
-from plc.publishing import Change
-from plc.task import StopReason
-from twin.field_process import FieldConfig, resolve
-from twin.virtual import VirtualPrototype
 
 LOOK_S = 1.0
 """How often the requirements are looked at, besides each change of a program's variables."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.store.event import Event, KnowledgeStore
+from fieldtwin.gateway.store.knowledge import open_knowledge
+from fieldtwin.twin.system import System
 from fieldtwin.whatif.last_known import LastKnown
 from fieldtwin.whatif.state import KnownState
-from gateway.core.errors import UsageError
-from gateway.store.event import Event, KnowledgeStore
-from gateway.store.knowledge import open_knowledge
-from twin.system import System
 
 RECENT = 100_000
 """Events of the end of a log. A plant tells again every ten seconds what does not change, so the last minutes have everything."""

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.statemachine import STATES, encode_period
+from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.status import decode_status
+from fieldtwin.twin.system import System
 from fieldtwin.whatif.state import KnownState, Number
-from gateway.core.errors import Desync
-from gateway.core.statemachine import STATES, encode_period
-from gateway.core.values import Quality
-from gateway.store.event import Event, Kind
-from twin.model import DigitalModel
-from twin.status import decode_status
-from twin.system import System
 
 
 class LastKnown:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from gateway.core.values import Quality, TagValue
+from fieldtwin.gateway.core.values import Quality, TagValue
 
 
 @dataclass(slots=True)

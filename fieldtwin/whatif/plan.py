@@ -9,11 +9,11 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from emulators.faults.schema import seconds
+from fieldtwin.emulators.faults.schema import seconds
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.yaml_file import YamlFile, load, validate
 from fieldtwin.running.shore import Scripted
-from gateway.core.errors import FieldtwinError, UsageError
-from gateway.core.statemachine import encode_period
-from gateway.core.yaml_file import YamlFile, load, validate
 
 MAX_PLANS = 1000
 MOST_NAMED = 6

@@ -15,10 +15,10 @@ from typing import Any
 
 import msgspec
 
-from gateway.core.control import ControlClient
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import read_input
-from twin.system import System
+from fieldtwin.gateway.core.control import ControlClient
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import read_input
+from fieldtwin.twin.system import System
 
 VERSION = 1
 MAX_BYTES = 16 << 20

@@ -16,12 +16,12 @@ from typing import Any
 
 import can
 
-from gateway.connections.can_message import message_of
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CANConnection, CanConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Desync, EndpointBusy, Unreachable, UsageError, WireError
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.can_message import message_of
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Desync, EndpointBusy, Unreachable, UsageError, WireError
+from fieldtwin.gateway.wallclock import WallClock
 
 POLL_S = 0.05
 """How long the reading thread waits in the driver: closing takes as long at most."""

@@ -13,14 +13,14 @@ import socket
 
 import can
 
-from gateway.connections.can_link import query_link
-from gateway.connections.can_message import message_of
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CANConnection, CanConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Desync, Unreachable, UsageError, WireError
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.can_link import query_link
+from fieldtwin.gateway.connections.can_message import message_of
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Desync, Unreachable, UsageError, WireError
+from fieldtwin.gateway.wallclock import WallClock
 
 FRAMES_PER_TURN = 256
 """Frames taken from the kernel before the loop serves others; what is left keeps the descriptor readable."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +31,7 @@ def can_facts(endpoint: Endpoint) -> CanFacts:
         return CanFacts(interface)
     if interface == "socketcan":
         return _of_kernel(endpoint)
-    from gateway.connections.can_adapter import RATELESS, can_listen_only
+    from fieldtwin.gateway.connections.can_adapter import RATELESS, can_listen_only
 
     said = endpoint.param("bitrate", "")
     return CanFacts(
@@ -44,7 +44,7 @@ def can_facts(endpoint: Endpoint) -> CanFacts:
 
 
 def _of_kernel(endpoint: Endpoint) -> CanFacts:
-    from gateway.connections.can_link import query_link
+    from fieldtwin.gateway.connections.can_link import query_link
 
     try:
         link = query_link(endpoint.path)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import can
 
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 
 def message_of(frame: CanFrame, endpoint: Endpoint) -> can.Message:

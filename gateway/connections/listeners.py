@@ -12,12 +12,12 @@ import socket
 import ssl
 from collections.abc import Awaitable, Callable
 
-from gateway.connections.tcp import TcpConnection
-from gateway.connections.tls_listen import HANDSHAKE_LIMIT_S, server_context
-from gateway.connections.tls_role import role_in
-from gateway.core.connection import Client
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError, os_reason
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.connections.tls_listen import HANDSHAKE_LIMIT_S, server_context
+from fieldtwin.gateway.connections.tls_role import role_in
+from fieldtwin.gateway.core.connection import Client
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError, os_reason
 
 MAX_CLIENTS = 32
 BACKLOG = 64

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import sys
 
-from gateway.core.connection import ByteConnection, CanConnection, Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 BYTE_SCHEMES = "rtu:, ascii:, tcp:, rtu+tcp:, udp: or tls:"
 
@@ -25,22 +25,22 @@ class OsConnector(Connector):
         match endpoint.scheme:
             case "rtu" | "ascii":
                 if sys.platform == "win32":  # COM ports have no descriptors
-                    from gateway.connections.serial_threads import ThreadedSerialConnection
+                    from fieldtwin.gateway.connections.serial_threads import ThreadedSerialConnection
 
                     return await ThreadedSerialConnection.open(endpoint)
-                from gateway.connections.serial_line import SerialConnection
+                from fieldtwin.gateway.connections.serial_line import SerialConnection
 
                 return await SerialConnection.open(endpoint)
             case "tcp" | "rtu+tcp":
-                from gateway.connections.tcp import TcpConnection
+                from fieldtwin.gateway.connections.tcp import TcpConnection
 
                 return await TcpConnection.open(endpoint)
             case "tls":
-                from gateway.connections.tls import TlsConnection
+                from fieldtwin.gateway.connections.tls import TlsConnection
 
                 return await TlsConnection.open(endpoint)
             case "udp":
-                from gateway.connections.udp import UdpConnection
+                from fieldtwin.gateway.connections.udp import UdpConnection
 
                 return await UdpConnection.open(endpoint)
             case "can":
@@ -60,14 +60,14 @@ class OsConnector(Connector):
             raise UsageError(f"{endpoint} is no CAN bus", expected="can:INTERFACE/CHANNEL")
         match endpoint.interface:
             case "socketcan":
-                from gateway.connections.can_end import SocketCanConnection
+                from fieldtwin.gateway.connections.can_end import SocketCanConnection
 
                 return await SocketCanConnection.open(endpoint, bitrate)
             case "fieldtwin":
-                from gateway.connections.soft_bus import SoftBusConnection
+                from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
 
                 return await SoftBusConnection.open(endpoint, bitrate)
             case _:
-                from gateway.connections.can_adapter import AdapterConnection
+                from fieldtwin.gateway.connections.can_adapter import AdapterConnection
 
                 return await AdapterConnection.open(endpoint, bitrate)

@@ -14,11 +14,11 @@ import os
 from contextlib import suppress
 from typing import cast
 
-from gateway.connections.line_counters import LineCounters, read_control_lines, read_counters
-from gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
-from gateway.core.connection import ByteConnection, RS232Connection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.connections.line_counters import LineCounters, read_control_lines, read_counters
+from fieldtwin.gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError
 
 with suppress(ImportError):  # Windows: `serial_threads` is used there
     import termios

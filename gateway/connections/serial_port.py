@@ -15,8 +15,8 @@ from types import ModuleType
 import serial
 from serial.tools import list_ports
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
 
 grp: ModuleType | None
 _REFUSED: tuple[type[Exception], ...] = (ValueError,)
@@ -79,7 +79,7 @@ def _is_pty(path: str) -> bool:
 
 def _set_rs485(port: Port, endpoint: Endpoint) -> None:
     try:
-        from gateway.connections.rs485 import let_driver_switch
+        from fieldtwin.gateway.connections.rs485 import let_driver_switch
 
         let_driver_switch(int(port.fileno()))
     except (OSError, ImportError, AttributeError) as e:  # a system without descriptors of ports

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from gateway.connections.line_counters import LineCounters
-from gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
-from gateway.core.connection import ByteConnection, RS232Connection, closed_here
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.connections.serial_port import CHUNK, Port, close_unwanted, lost, open_port
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 POLL_S = 0.05
 """How long the reading thread waits in the driver: closing takes as long at most."""

@@ -19,14 +19,14 @@ import can
 from can.typechecking import CanFilters
 from msgspec.structs import replace
 
-from gateway.connections.addresses import address_of
-from gateway.connections.soft_bus_hello import Welcome, ask, read_answer
-from gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CANConnection, CanConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Desync, FieldtwinError, Unreachable, UsageError, os_reason
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.addresses import address_of
+from fieldtwin.gateway.connections.soft_bus_hello import Welcome, ask, read_answer
+from fieldtwin.gateway.core.canframe import FD_RECORD_SIZE, RECORD_SIZE, CanFrame, pack_record, unpack_record
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Desync, FieldtwinError, Unreachable, UsageError, os_reason
+from fieldtwin.gateway.wallclock import WallClock
 
 OPEN_TIMEOUT_S = 5.0
 CLOSE_TIMEOUT_S = 1.0

@@ -10,8 +10,8 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from gateway.core.canframe import RECORD_SIZE
-from gateway.core.errors import EndpointBusy, Unreachable, UsageError
+from fieldtwin.gateway.core.canframe import RECORD_SIZE
+from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable, UsageError
 
 _LAYOUT = struct.Struct("!BBBBIQ4sHH")
 _MARK = 0x80

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TextIO, cast
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import Clock
-from gateway.core.connection import ByteConnection, CANConnection, CanConnection, Connector, Direction, Tap
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import ByteConnection, CANConnection, CanConnection, Connector, Direction, Tap
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 
 
 class TappedConnector(Connector):

@@ -10,10 +10,10 @@ import socket
 import ssl
 from typing import Self, cast
 
-from gateway.connections.addresses import address_of
-from gateway.core.connection import ByteConnection, TCPConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.gateway.connections.addresses import address_of
+from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
 
 CHUNK = 4096
 """Most bytes taken in one read; with `max_pending` it bounds the memory of a connection (4 MiB)."""

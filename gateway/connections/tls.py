@@ -11,10 +11,10 @@ import ssl
 from functools import partial
 from typing import Self
 
-from gateway.connections.tcp import OPEN_TIMEOUT_S, TcpConnection
-from gateway.connections.tls_role import role_in
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.connections.tcp import OPEN_TIMEOUT_S, TcpConnection
+from fieldtwin.gateway.connections.tls_role import role_in
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
 
 
 class TlsConnection(TcpConnection):

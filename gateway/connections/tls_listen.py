@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ssl
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
 
 HANDSHAKE_LIMIT_S = 10.0
 """A client that has not shaken hands by then is not going to."""

@@ -10,11 +10,11 @@ import asyncio
 import socket
 from typing import cast
 
-from gateway.connections.addresses import address_of
-from gateway.connections.tcp import resolve
-from gateway.core.connection import ByteConnection, TCPConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable
+from fieldtwin.gateway.connections.addresses import address_of
+from fieldtwin.gateway.connections.tcp import resolve
+from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, Unreachable
 
 WRITE_HIGH_WATER = 64 * 1024
 OPEN_TIMEOUT_S = 5.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 CLASS_CONTROLLER = 0x004
 CLASS_VIOLATION = 0x008

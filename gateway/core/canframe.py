@@ -12,7 +12,7 @@ import struct
 
 import msgspec
 
-from gateway.core.errors import Desync, UsageError
+from fieldtwin.gateway.core.errors import Desync, UsageError
 
 _RECORD = struct.Struct("!BBxxIQ8s")
 _FD_RECORD = struct.Struct("!BBxxIQ64s")

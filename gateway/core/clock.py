@@ -1,7 +1,7 @@
 """Time enters by this door.
 
 Everything that needs to know what time it is, or to wait, is given a `Clock` or is passed ``now``. The wall
-implementation is in gateway/wallclock.py; a virtual one belongs to the prototype. No module of gateway.core imports
+implementation is in gateway/wallclock.py; a virtual one belongs to the prototype. No module of fieldtwin.gateway.core imports
 ``time``.
 """
 

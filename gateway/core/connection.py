@@ -3,7 +3,8 @@
 `Connection` is SPEC's schema to the letter: a protocol type and a FIFO of data that is empty after Init, appended to
 by `write` and read from its head. `ByteConnection` and `CanConnection` are what drivers and devices hold: one end of
 a duplex medium (SPEC ruling 4), whose inbound direction *is* such a stream. An operating-system end
-(gateway.connections), an emulator's end (emulators.endpoints) and an in-memory one differ only in who feeds it.
+(fieldtwin.gateway.connections), an emulator's end (fieldtwin.emulators.endpoints) and an in-memory one differ only in who feeds
+it.
 
 Nobody but a `Connector` opens a wire: the runtime receives one, and no driver knows what stands behind it.
 """
@@ -17,10 +18,10 @@ from collections.abc import Awaitable, Callable, Coroutine
 from enum import Enum
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
-from gateway.core.alarm import alarm, ring
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Bug, ConnectionLost, FieldtwinError
+from fieldtwin.gateway.core.alarm import alarm, ring
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Bug, ConnectionLost, FieldtwinError
 
 
 class PROTOCOL(Enum):

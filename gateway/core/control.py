@@ -17,7 +17,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from gateway.core.errors import (
+from fieldtwin.gateway.core.errors import (
     Bug,
     ConnectionLost,
     EndpointBusy,

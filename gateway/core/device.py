@@ -2,7 +2,7 @@
 
 Pure. A device holds one end of a wire of a concrete kind, has a command list, and answers each command that it reads with one
 response. It knows no driver, no clock (it is passed `now_ns`) and no framing: an item of its connection is a whole message.
-A driver is a stranger to this module (gateway.devices.driver).
+A driver is a stranger to this module (fieldtwin.gateway.devices.driver).
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import ClassVar, Generic
 
-from gateway.core.connection import PROTOCOL, Connection, T
-from gateway.core.errors import Bug, CommandListMismatch, UnknownCommand
-from gateway.core.values import COMMAND, RESPONSE
+from fieldtwin.gateway.core.connection import PROTOCOL, Connection, T
+from fieldtwin.gateway.core.errors import Bug, CommandListMismatch, UnknownCommand
+from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 
 
 class End(Generic[T]):

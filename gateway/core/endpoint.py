@@ -27,7 +27,7 @@ import re
 from dataclasses import dataclass, replace
 from urllib.parse import parse_qsl, urlencode
 
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 SERIAL_SCHEMES = ("rtu", "ascii")
 SOCKET_SCHEMES = ("tcp", "rtu+tcp", "udp", "tls")

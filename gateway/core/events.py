@@ -11,8 +11,8 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Generic, TypeVar
 
-from gateway.core.errors import Bug
-from gateway.core.values import DATA
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.values import DATA
 
 D = TypeVar("D", bound=DATA)
 

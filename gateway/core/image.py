@@ -19,10 +19,10 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
 
-from gateway.core.errors import FileInvalid
-from gateway.core.image_layout import LINE, RegionLayout, RegionShape, TagKind, TagSpec, message_tag
-from gateway.core.image_region import NotEncodable, RegionReader, RegionWriter
-from gateway.core.image_snapshot import Message, RegionFlag, Snapshot
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.image_layout import LINE, RegionLayout, RegionShape, TagKind, TagSpec, message_tag
+from fieldtwin.gateway.core.image_region import NotEncodable, RegionReader, RegionWriter
+from fieldtwin.gateway.core.image_snapshot import Message, RegionFlag, Snapshot
 
 __all__ = [
     "INPUTS",

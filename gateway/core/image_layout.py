@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 SLOTS = 4
 LINE = 64

@@ -18,10 +18,10 @@ from types import MappingProxyType
 
 from msgspec.structs import replace
 
-from gateway.core.errors import Bug, FileInvalid
-from gateway.core.image_layout import CHECK, RECORD_HEAD, SLOTS, RegionShape, RingShape, TagKind
-from gateway.core.image_snapshot import Message, RegionFlag, Snapshot
-from gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.core.errors import Bug, FileInvalid
+from fieldtwin.gateway.core.image_layout import CHECK, RECORD_HEAD, SLOTS, RegionShape, RingShape, TagKind
+from fieldtwin.gateway.core.image_snapshot import Message, RegionFlag, Snapshot
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 MAX_LOOKS = 16
 """How often a reader looks before it gives up for now. Trying four slots gave 0.0015 retries a read (DESIGN.md)."""

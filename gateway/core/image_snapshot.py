@@ -10,8 +10,8 @@ from enum import IntFlag
 
 import msgspec
 
-from gateway.core.image_layout import RegionShape
-from gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.core.image_layout import RegionShape
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 _QUALITIES = {int(quality): quality for quality in Quality}
 _REASONS = {int(reason): reason for reason in Reason}

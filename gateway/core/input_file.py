@@ -12,7 +12,7 @@ import os
 import stat
 from pathlib import Path
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 _KINDS = {
     stat.S_IFIFO: "a pipe",

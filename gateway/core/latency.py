@@ -6,7 +6,7 @@ from bisect import bisect_left
 from collections import deque
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 BOUNDS_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 """Upper ends of the buckets, inclusive; what took longer is in one more. From TCP on a switch to a slow line with a slow unit."""

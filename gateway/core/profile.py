@@ -1,7 +1,7 @@
 """A device profile with everything resolved: addresses as sent, sizes, groups, commands.
 
-Both sides of a wire read the same profile and nothing else in common: the driver decodes with gateway.devices.codec, the
-emulator encodes with a codec of its own (DESIGN.md, the one idea). Addresses are shown both ways, as printed in manuals
+Both sides of a wire read the same profile and nothing else in common: the driver decodes with fieldtwin.gateway.devices.codec,
+the emulator encodes with a codec of its own (DESIGN.md, the one idea). Addresses are shown both ways, as printed in manuals
 and as sent (decision 9).
 """
 
@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from gateway.core.errors import FileInvalid
-from gateway.core.profile_schema import BoxForm, MessageForm, ProfileForm, TagForm
-from gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile_schema import BoxForm, MessageForm, ProfileForm, TagForm
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
 
 Table = Literal["coil", "discrete", "input", "holding"]
 

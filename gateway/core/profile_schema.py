@@ -1,6 +1,6 @@
 """What a device profile may say: the pydantic models of the YAML form (see docs and `fieldtwin schema profile`).
 
-Only the form is here. gateway.core.profile turns it into frozen objects with resolved addresses.
+Only the form is here. fieldtwin.gateway.core.profile turns it into frozen objects with resolved addresses.
 """
 
 from __future__ import annotations

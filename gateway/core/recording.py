@@ -26,8 +26,8 @@ from typing import BinaryIO, Literal, TypeVar
 
 import msgspec
 
-from gateway.core.errors import Bug, FileInvalid
-from gateway.core.input_file import open_input
+from fieldtwin.gateway.core.errors import Bug, FileInvalid
+from fieldtwin.gateway.core.input_file import open_input
 
 MAX_LINE_BYTES = 65_536
 """Longer lines are refused: the longest Modbus exchange takes about 1,100."""

@@ -16,8 +16,8 @@ from __future__ import annotations
 import struct
 from abc import ABC, abstractmethod
 
-from gateway.core.errors import Desync
-from gateway.core.values import COMMAND
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.values import COMMAND
 
 _PERIOD = struct.Struct(">h")
 PERIOD_MIN, PERIOD_MAX = -32768, 32767

@@ -21,9 +21,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from gateway.core.errors import FileInvalid
-from gateway.core.input_file import read_input
-from gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.input_file import read_input
+from fieldtwin.gateway.core.nearest import did_you_mean
 
 MAX_BYTES = 8 * 1024 * 1024
 """A configuration file larger than this is a mistake (a recording given as a system file, say)."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from gateway.core.clock import NS_PER_MS
-from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
-from gateway.protocols.canopen.configure import PdoConfig
-from gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
+from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from gateway.core.clock import Clock
-from gateway.core.connection import PROTOCOL, CanConnection
-from gateway.core.errors import Bug, NotAllowed, SdoAborted, WrongDevice
-from gateway.core.profile import Tag
-from gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
-from gateway.devices.canopen_rpdo import BITS, Rpdo, is_gap, tags_in, usable
-from gateway.devices.codec import decode_little, encode, reorder
-from gateway.devices.config import DeviceConfig
-from gateway.devices.driver import DeviceDriver, TagSink
-from gateway.protocols.canopen.boot import download_configuration, holds_configuration, identity_differences
-from gateway.protocols.canopen.cob_id import RPDO1_BASE, TPDO_BASES
-from gateway.protocols.canopen.configure import (
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import PROTOCOL, CanConnection
+from fieldtwin.gateway.core.errors import Bug, NotAllowed, SdoAborted, WrongDevice
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, Reason, TagValue
+from fieldtwin.gateway.devices.canopen_rpdo import BITS, Rpdo, is_gap, tags_in, usable
+from fieldtwin.gateway.devices.codec import decode_little, encode, reorder
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.driver import DeviceDriver, TagSink
+from fieldtwin.gateway.protocols.canopen.boot import download_configuration, holds_configuration, identity_differences
+from fieldtwin.gateway.protocols.canopen.cob_id import RPDO1_BASE, TPDO_BASES
+from fieldtwin.gateway.protocols.canopen.configure import (
     PdoConfig,
     configure_rpdo,
     configure_tpdo,
@@ -32,9 +32,9 @@ from gateway.protocols.canopen.configure import (
     read_tpdos,
     set_heartbeat_producer,
 )
-from gateway.protocols.canopen.master import CanopenMaster, PdoCallback
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
-from gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch, PdoMapping
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster, PdoCallback
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch, PdoMapping
 
 _OPERATIONAL = NmtState.OPERATIONAL
 

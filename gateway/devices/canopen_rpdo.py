@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from gateway.core.canframe import CanFrame
-from gateway.core.profile import Tag
-from gateway.protocols.canopen.configure import PdoConfig
-from gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
+from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoMapping
 
 BITS = {
     "bool": 8, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,

@@ -12,9 +12,9 @@ import struct
 
 from msgspec.structs import replace
 
-from gateway.core.errors import NotAllowed
-from gateway.core.profile import REGISTERS_OF, Tag
-from gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.core.errors import NotAllowed
+from fieldtwin.gateway.core.profile import REGISTERS_OF, Tag
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 _FORMATS = {
     "int8": ">b", "uint8": ">B", "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q",

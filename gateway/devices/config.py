@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.profile import DeviceProfile
-from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
 
 
 @dataclass(frozen=True)

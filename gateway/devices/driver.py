@@ -9,11 +9,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Protocol
 
-from gateway.core.connection import PROTOCOL, ByteConnection, CanConnection
-from gateway.core.errors import Bug, DeviceRefused, FileInvalid, NotAllowed, UnknownCommand
-from gateway.core.events import Consumer, Producer
-from gateway.core.values import COMMAND, DATA, Reason, TagValue
-from gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection, CanConnection
+from fieldtwin.gateway.core.errors import Bug, DeviceRefused, FileInvalid, NotAllowed, UnknownCommand
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.values import COMMAND, DATA, Reason, TagValue
+from fieldtwin.gateway.devices.config import DeviceConfig
 
 
 class TagSink(Protocol):

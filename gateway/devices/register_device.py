@@ -12,17 +12,17 @@ from collections.abc import Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.connection import PROTOCOL, ByteConnection
-from gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
-from gateway.core.profile import RegisterRange, Tag
-from gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, TagValue
-from gateway.devices.codec import apply_scale, decode, encode
-from gateway.devices.config import DeviceConfig
-from gateway.devices.driver import DeviceDriver, TagSink
-from gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, place_of
-from gateway.protocols.modbus.client import ModbusClient, UnitPace
-from gateway.protocols.modbus.replies import BitsReply, RegistersReply
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection
+from fieldtwin.gateway.core.errors import Bug, ModbusExceptionReply, NotAllowed, VerifyFailed, WrongDevice
+from fieldtwin.gateway.core.profile import RegisterRange, Tag
+from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, Quality, Reason, TagValue
+from fieldtwin.gateway.devices.codec import apply_scale, decode, encode
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.driver import DeviceDriver, TagSink
+from fieldtwin.gateway.devices.read_plan import ILLEGAL_ADDRESS, TOO_LONG, GroupPlan, Learnt, Read, place_of
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
+from fieldtwin.gateway.protocols.modbus.replies import BitsReply, RegistersReply
 
 MOST_REGISTERS, MOST_COILS = 123, 1968
 """What one request may write (AP 6.11 and 6.12)."""

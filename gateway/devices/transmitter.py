@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import struct
 
-from gateway.core.connection import PROTOCOL
-from gateway.core.errors import Desync, FileInvalid, NotAllowed
-from gateway.core.profile import Box
-from gateway.core.values import COMMAND, DATA
-from gateway.devices.config import DeviceConfig
-from gateway.devices.driver import TagSink
-from gateway.devices.register_device import Reading, RegisterDriver
+from fieldtwin.gateway.core.connection import PROTOCOL
+from fieldtwin.gateway.core.errors import Desync, FileInvalid, NotAllowed
+from fieldtwin.gateway.core.profile import Box
+from fieldtwin.gateway.core.values import COMMAND, DATA
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.driver import TagSink
+from fieldtwin.gateway.devices.register_device import Reading, RegisterDriver
 
 LAST_SEQUENCE = 0xFFFF
 _SEQUENCE_AND_LENGTH = struct.Struct(">HH").unpack_from

@@ -12,8 +12,8 @@ import os
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from gateway.core.clock import Clock
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import Unreachable
 
 
 class AuditLog:

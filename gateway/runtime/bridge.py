@@ -14,11 +14,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from gateway.connections.listeners import TcpListener
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Connector, Listen
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import (
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Listen
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
     EndpointBusy,
     FieldtwinError,
     ModbusExceptionReply,
@@ -28,9 +28,9 @@ from gateway.core.errors import (
     VerifyFailed,
     WireError,
 )
-from gateway.protocols.modbus.framings import framing_of
-from gateway.protocols.modbus.refusals import refusal
-from gateway.protocols.modbus.server import (
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server import (
     BROADCAST_FUNCTIONS,
     ILLEGAL_FUNCTION,
     NO_PATH,
@@ -41,17 +41,17 @@ from gateway.protocols.modbus.server import (
     examine,
     exception_pdu,
 )
-from gateway.protocols.modbus.server_forward import ForwardedReply
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.backoff import Backoff
-from gateway.runtime.bridge_audit import WriteRecord
-from gateway.runtime.bridge_broadcast import when_all_are_out
-from gateway.runtime.bridge_cache import ReplyCache
-from gateway.runtime.bridge_line import LineFront
-from gateway.runtime.bridge_policy import Policy
-from gateway.runtime.bridge_queue import Guest
-from gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
-from gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.backoff import Backoff
+from fieldtwin.gateway.runtime.bridge_audit import WriteRecord
+from fieldtwin.gateway.runtime.bridge_broadcast import when_all_are_out
+from fieldtwin.gateway.runtime.bridge_cache import ReplyCache
+from fieldtwin.gateway.runtime.bridge_line import LineFront
+from fieldtwin.gateway.runtime.bridge_policy import Policy
+from fieldtwin.gateway.runtime.bridge_queue import Guest
+from fieldtwin.gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
 
 LAST_LINE_UNIT = 247
 """Unit ids 248 to 255 are reserved on a serial line (SL 2.2)."""

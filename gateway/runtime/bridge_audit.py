@@ -6,12 +6,12 @@ would fill the disk: at most one refusal a second and client is noted, with how 
 
 from __future__ import annotations
 
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import FieldtwinError, ModbusExceptionReply, Unreachable
-from gateway.protocols.modbus.refusals import refusal
-from gateway.protocols.modbus.server import SERVER_FAILURE
-from gateway.protocols.modbus.server_forward import ForwardedReply
-from gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import FieldtwinError, ModbusExceptionReply, Unreachable
+from fieldtwin.gateway.protocols.modbus.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server import SERVER_FAILURE
+from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
+from fieldtwin.gateway.runtime.audit import AuditLog
 
 MOST_CLIENTS = 256
 """Clients whose last refusal is remembered."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 MOST = 1024
 CACHED_FUNCTIONS = frozenset({0x01, 0x02, 0x03, 0x04})

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, Connector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable
-from gateway.protocols.modbus.server_line import LineRequest, RtuRequests
-from gateway.runtime.backoff import Backoff
-from gateway.runtime.bridge_policy import LINE
-from gateway.runtime.bridge_tcp import Answer, Ask, Caller
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.gateway.protocols.modbus.server_line import LineRequest, RtuRequests
+from fieldtwin.gateway.runtime.backoff import Backoff
+from fieldtwin.gateway.runtime.bridge_policy import LINE
+from fieldtwin.gateway.runtime.bridge_tcp import Answer, Ask, Caller
 
 
 @dataclass

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from ipaddress import IPv4Network, IPv6Address, IPv6Network, ip_address, ip_network
 
-from gateway.core.errors import UsageError
-from gateway.protocols.modbus.server import ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, NO_PATH, READ_FUNCTIONS, Asked
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.protocols.modbus.server import ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, NO_PATH, READ_FUNCTIONS, Asked
 
 Network = IPv4Network | IPv6Network
 

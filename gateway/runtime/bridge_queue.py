@@ -10,10 +10,10 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, WireError
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.server import Asked
-from gateway.protocols.modbus.server_forward import Forwarded, ForwardedReply
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, WireError
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.server import Asked
+from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded, ForwardedReply
 
 MAX_WAIT_NS = 10_000_000_000
 """Whoever waited for longer has given up: what asked for it then is not worth the wire."""

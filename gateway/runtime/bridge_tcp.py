@@ -14,16 +14,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from gateway.connections.listeners import TcpListener
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import Client, Clients, Listen
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable
-from gateway.core.nursery import Nursery
-from gateway.protocols.modbus.refusals import refusal
-from gateway.protocols.modbus.server import SERVER_BUSY, exception_pdu
-from gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
-from gateway.runtime.backoff import Backoff
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Client, Clients, Listen
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.protocols.modbus.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server import SERVER_BUSY, exception_pdu
+from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
+from fieldtwin.gateway.runtime.backoff import Backoff
 
 REQUEST_WITHIN_S = 10.0
 """A request that has begun is complete by then; otherwise its client is closed. Without this limit a client that sends one

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from gateway.core.clock import NS_PER_S
-from gateway.devices.config import DeviceConfig
-from gateway.devices.register_device import Reading, RegisterDriver
-from gateway.runtime.backoff import Backoff
-from gateway.runtime.poll_schedule import PollSchedule, Rate, spread
-from gateway.runtime.probing import MARGIN_NS, Probing
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import Reading, RegisterDriver
+from fieldtwin.gateway.runtime.backoff import Backoff
+from fieldtwin.gateway.runtime.poll_schedule import PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.probing import MARGIN_NS, Probing
 
 FOREVER_NS = 2**62
 """No device waits for its next poll."""

@@ -14,33 +14,40 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.connection import Connector
-from gateway.core.errors import ConnectionLost, FieldtwinError, NotAllowed, ReplyTimeout, Unreachable, UsageError
-from gateway.core.latency import Latencies
-from gateway.core.nursery import Nursery
-from gateway.core.values import COMMAND, Reason
-from gateway.devices.canopen_config import cycle_period_ns
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.canopen_rpdo import Rpdo
-from gateway.devices.config import BusConfig
-from gateway.protocols.canopen.cob_id import LSS_REPLY
-from gateway.protocols.canopen.emcy import parse_emcy
-from gateway.protocols.canopen.emcy_log import EmcyLog
-from gateway.protocols.canopen.lss import UNCONFIGURED, LssAddress
-from gateway.protocols.canopen.lss_master import LssMaster
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
-from gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
-from gateway.protocols.canopen.sync_watch import SyncWatch
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.backoff import Backoff
-from gateway.runtime.bus_turns import rates_of
-from gateway.runtime.coming import Coming
-from gateway.runtime.modbus_bus import MOST_LOCALS, reason_of
-from gateway.runtime.node_writes import Done, NodeWrites
-from gateway.runtime.poll_schedule import PollSchedule
-from gateway.runtime.tags import TagTable
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.errors import (
+    ConnectionLost,
+    FieldtwinError,
+    NotAllowed,
+    ReplyTimeout,
+    Unreachable,
+    UsageError,
+)
+from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import COMMAND, Reason
+from fieldtwin.gateway.devices.canopen_config import cycle_period_ns
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.canopen_rpdo import Rpdo
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
+from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
+from fieldtwin.gateway.protocols.canopen.emcy_log import EmcyLog
+from fieldtwin.gateway.protocols.canopen.lss import UNCONFIGURED, LssAddress
+from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
+from fieldtwin.gateway.protocols.canopen.sync import Producer, SyncProducer, TimeProducer
+from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.backoff import Backoff
+from fieldtwin.gateway.runtime.bus_turns import rates_of
+from fieldtwin.gateway.runtime.coming import Coming
+from fieldtwin.gateway.runtime.modbus_bus import MOST_LOCALS, reason_of
+from fieldtwin.gateway.runtime.node_writes import Done, NodeWrites
+from fieldtwin.gateway.runtime.poll_schedule import PollSchedule
+from fieldtwin.gateway.runtime.tags import TagTable
 
 SETTLE_NS = 100 * NS_PER_MS
 """A TPDO or reply that is this much younger than an RPDO shows what the RPDO did, or that it did not."""

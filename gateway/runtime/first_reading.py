@@ -6,10 +6,10 @@ be a default that reads the same by chance, so it is told again. A value that is
 
 from __future__ import annotations
 
-from gateway.core.clock import NS_PER_S
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.runtime.output import SAFE, Output
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.runtime.output import SAFE, Output
 
 READ_BACK_NS = 2 * NS_PER_S
 """How long the first write of an output waits, once its device is there, for the first reading of what the device holds."""

@@ -8,29 +8,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from gateway.connections.listeners import TcpListener
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.connection import Connector, Listen
-from gateway.core.events import Consumer
-from gateway.core.image import Image
-from gateway.core.nursery import Nursery
-from gateway.core.values import DATA, Reason
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.bridge import Bridge, BridgeConfig
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.image_io import ImageExchange
-from gateway.runtime.mailbox_pump import MailboxPump
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.output import Output
-from gateway.runtime.outputs import OutputWriter
-from gateway.runtime.serve import ServeConfig, TagServer
-from gateway.runtime.tags import TagTable
-from gateway.runtime.taken import TakenFile
-from gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector, Listen
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.image import Image
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import DATA, Reason
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.image_io import ImageExchange
+from fieldtwin.gateway.runtime.mailbox_pump import MailboxPump
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.output import Output
+from fieldtwin.gateway.runtime.outputs import OutputWriter
+from fieldtwin.gateway.runtime.serve import ServeConfig, TagServer
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.runtime.taken import TakenFile
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
 
 PLC_GRACE_NS = 10 * NS_PER_S
 """How long a PLC may take to appear after the gateway's start before the outputs are made safe."""

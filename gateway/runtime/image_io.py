@@ -7,11 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.events import Consumer
-from gateway.core.image import INPUTS, OUTPUTS, Image, Message, Snapshot, TagKind, TagSpec, consumed_name, taken_name
-from gateway.core.values import DATA, NEVER, Quality, Reason, Scalar, TagValue
-from gateway.runtime.tags import FOREVER_NS, TagTable
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.image import (
+    INPUTS,
+    OUTPUTS,
+    Image,
+    Message,
+    Snapshot,
+    TagKind,
+    TagSpec,
+    consumed_name,
+    taken_name,
+)
+from fieldtwin.gateway.core.values import DATA, NEVER, Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.runtime.tags import FOREVER_NS, TagTable
 
 _BAD = Quality.BAD  # an Enum's members are slow to look up
 

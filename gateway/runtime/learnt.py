@@ -15,11 +15,11 @@ from typing import Any
 
 import msgspec
 
-from gateway.core.errors import Unreachable
-from gateway.core.profile import RegisterRange, gap_text, resolve_gap
-from gateway.devices.config import BusConfig
-from gateway.devices.read_plan import Learnt
-from gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.profile import RegisterRange, gap_text, resolve_gap
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.read_plan import Learnt
+from fieldtwin.gateway.devices.register_device import RegisterDriver
 
 MOST_BYTES = 4_000_000
 """No file of ours is larger; one that is, is not read."""

@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import FieldtwinError, Unreachable
-from gateway.core.events import Consumer
-from gateway.core.values import COMMAND, DATA, RESPONSE
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.mailboxes import Mailboxes
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.refusals import Cause, Refusals, cause_of
-from gateway.runtime.taken import TakenFile
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.mailboxes import Mailboxes
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.refusals import Cause, Refusals, cause_of
+from fieldtwin.gateway.runtime.taken import TakenFile
 
 RETRY_NS = 1000 * NS_PER_MS
 

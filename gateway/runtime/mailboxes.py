@@ -6,12 +6,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import FieldtwinError
-from gateway.core.events import Consumer
-from gateway.core.values import DATA
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.values import DATA
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
 
 ASK_EVERY_NS = 50 * NS_PER_MS
 """How often a full outbox is looked at again."""

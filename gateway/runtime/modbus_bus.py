@@ -15,10 +15,10 @@ from collections.abc import Awaitable, Callable
 from dataclasses import asdict, dataclass
 from typing import TypeVar
 
-from gateway.core.alarm import alarm, ring
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.connection import Connector
-from gateway.core.errors import (
+from fieldtwin.gateway.core.alarm import alarm, ring
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.errors import (
     ConnectionLost,
     DeviceRefused,
     EndpointBusy,
@@ -28,21 +28,21 @@ from gateway.core.errors import (
     WireError,
     WrongDevice,
 )
-from gateway.core.latency import Latencies
-from gateway.core.values import Reason
-from gateway.devices.config import BusConfig
-from gateway.devices.register_device import RegisterDriver
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.framings import framing_of
-from gateway.protocols.modbus.refusals import Acknowledged, GatewayRefusal, ServerBusy
-from gateway.protocols.modbus.server import NO_RESPONSE
-from gateway.runtime.backoff import Backoff
-from gateway.runtime.bridge_queue import GuestQueue
-from gateway.runtime.bus_turns import DeviceState, Turns, rates_of, restate, states_of
-from gateway.runtime.coming import Coming
-from gateway.runtime.tags import TagTable
-from gateway.runtime.unanswered import MOST_UNANSWERED, Unanswered
+from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import framing_of
+from fieldtwin.gateway.protocols.modbus.refusals import Acknowledged, GatewayRefusal, ServerBusy
+from fieldtwin.gateway.protocols.modbus.server import NO_RESPONSE
+from fieldtwin.gateway.runtime.backoff import Backoff
+from fieldtwin.gateway.runtime.bridge_queue import GuestQueue
+from fieldtwin.gateway.runtime.bus_turns import DeviceState, Turns, rates_of, restate, states_of
+from fieldtwin.gateway.runtime.coming import Coming
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.runtime.unanswered import MOST_UNANSWERED, Unanswered
 
 T = TypeVar("T")
 

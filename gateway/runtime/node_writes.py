@@ -11,11 +11,11 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable
-from gateway.core.values import COMMAND
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.canopen_rpdo import Rpdo
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout, Unreachable
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.canopen_rpdo import Rpdo
 
 Done = Callable[[FieldtwinError | None], None]
 """Told once how a write ended."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from gateway.core.errors import FieldtwinError, NotAllowed
-from gateway.core.values import COMMAND, TagValue
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.core.errors import FieldtwinError, NotAllowed
+from fieldtwin.gateway.core.values import COMMAND, TagValue
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
 
 SAFE = "safe: "
 

@@ -14,12 +14,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from gateway.core.errors import FieldtwinError
-from gateway.core.values import COMMAND
-from gateway.devices.register_device import Progress, RegisterDriver
-from gateway.runtime.modbus_bus import Job, ModbusBus
-from gateway.runtime.output import Output
-from gateway.runtime.refusals import HeldBack
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.devices.register_device import Progress, RegisterDriver
+from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.output import Output
+from fieldtwin.gateway.runtime.refusals import HeldBack
 
 Ended = Callable[[Output, FieldtwinError | None], None]
 """Called once for each member with how its write ended."""

@@ -12,17 +12,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
-from gateway.core.values import Quality, Reason
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.first_reading import is_known, waits_for_reading
-from gateway.runtime.output import SAFE, Output, as_sent
-from gateway.runtime.output_groups import OutputGroup, groups_of
-from gateway.runtime.refusals import Cause, Refusals, cause_of
-from gateway.runtime.tags import TagTable
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, NotAllowed, Unreachable
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.first_reading import is_known, waits_for_reading
+from fieldtwin.gateway.runtime.output import SAFE, Output, as_sent
+from fieldtwin.gateway.runtime.output_groups import OutputGroup, groups_of
+from fieldtwin.gateway.runtime.refusals import Cause, Refusals, cause_of
+from fieldtwin.gateway.runtime.tags import TagTable
 
 MIN_SPACING_NS = 100 * NS_PER_MS
 """At most ten writes a second to one tag; what changes faster is written with its newest value."""

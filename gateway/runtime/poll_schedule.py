@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 K = TypeVar("K", bound=Hashable)
 SOONER = 8

@@ -14,7 +14,7 @@ answer are found soon. A device alone on its bus is asked with its own timeout. 
 
 from __future__ import annotations
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 LEAST_NS = 50 * NS_PER_MS
 """No timeout is shorter. A USB adapter alone may hold a reply back for 16 ms."""

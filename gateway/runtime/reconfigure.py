@@ -2,8 +2,8 @@
 The plant's switch with it, at once.
 
 Buses, devices, addresses, tags and what is bound to them have to be the same: whoever calls has compared the files
-(`twin.reloading`). A device has either its old configuration or its new one, never some of each; values that it holds are
-understood anew at once. Nothing here reads a file.
+(`fieldtwin.twin.reloading`). A device has either its old configuration or its new one, never some of each; values that it holds
+are understood anew at once. Nothing here reads a file.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import msgspec
 
-from gateway.core.profile import DeviceProfile
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.runtime.coming import AnyDriver, Coming
-from gateway.runtime.gateway import Gateway, GatewayConfig, stale_limits
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.runtime.coming import AnyDriver, Coming
+from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, stale_limits
 
 OF_DECODING = frozenset({Reason.NONE, Reason.OUT_OF_RANGE, Reason.NOT_A_NUMBER, Reason.SENTINEL})
 """Reasons that are found in the value itself."""

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import (
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import (
     DeviceRefused,
     FieldtwinError,
     ModbusExceptionReply,
@@ -23,7 +23,7 @@ from gateway.core.errors import (
     Unreachable,
     WrongDevice,
 )
-from gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.audit import AuditLog
 
 KEPT = 256
 """Entries that are kept."""

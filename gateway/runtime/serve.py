@@ -13,14 +13,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, Protocol
 
-from gateway.connections.listeners import TcpListener
-from gateway.core.clock import Clock
-from gateway.core.connection import Listen
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import EndpointBusy, FieldtwinError, ModbusExceptionReply, NotAllowed
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.protocols.modbus.refusals import refusal
-from gateway.protocols.modbus.server import (
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Listen
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import EndpointBusy, FieldtwinError, ModbusExceptionReply, NotAllowed
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.protocols.modbus.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.server import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
@@ -32,12 +32,12 @@ from gateway.protocols.modbus.server import (
     examine,
     exception_pdu,
 )
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.bridge_audit import WriteRecord
-from gateway.runtime.bridge_policy import EVERYONE, Network, within
-from gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
-from gateway.runtime.serve_codec import REGISTERS, not_a_number, pack, unpack
-from gateway.runtime.tags import TagTable
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.bridge_audit import WriteRecord
+from fieldtwin.gateway.runtime.bridge_policy import EVERYONE, Network, within
+from fieldtwin.gateway.runtime.bridge_tcp import Answer, Caller, TcpFront
+from fieldtwin.gateway.runtime.serve_codec import REGISTERS, not_a_number, pack, unpack
+from fieldtwin.gateway.runtime.tags import TagTable
 
 BIT_TABLES = ("coil", "discrete")
 DIRECT_UNITS = (0, 255)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import struct
 
-from gateway.core.values import Scalar
-from gateway.devices.codec import reorder
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.gateway.devices.codec import reorder
 
 FORMATS = {
     "bool": ">H", "int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "int64": ">q", "uint64": ">Q",

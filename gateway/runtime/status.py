@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.gateway import Gateway
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.gateway import Gateway
 
 
 def describe(gateway: Gateway, now_ns: int) -> dict[str, Any]:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Collection
 import msgspec
 from msgspec.structs import replace
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 
 FOREVER_NS = 2**63 - 1
 JOURNAL = 100_000

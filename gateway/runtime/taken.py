@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.errors import Unreachable
 
 MOST_BYTES = 1_000_000
 """No file of ours is larger; one that is, is not read."""

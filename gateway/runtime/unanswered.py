@@ -6,7 +6,7 @@ Pure: reads the counters of a `ModbusClient`, and never touches the connection.
 
 from __future__ import annotations
 
-from gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 
 MOST_UNANSWERED = 5
 """After so many timeouts in a row a socket is useless."""

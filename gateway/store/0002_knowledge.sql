@@ -10,7 +10,7 @@ CREATE TABLE event_name (
   id INTEGER PRIMARY KEY,
   text TEXT NOT NULL UNIQUE
 );
--- Numbered per origin, without holes in its writer's store. t_ms is UTC; kind, quality and reason as gateway.store.event says.
+-- Numbered per origin, without holes in its writer's store. t_ms is UTC; kind, quality and reason as fieldtwin.gateway.store.event says.
 CREATE TABLE event (
   origin INTEGER NOT NULL REFERENCES origin (id),
   sequence INTEGER NOT NULL,

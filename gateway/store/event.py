@@ -12,8 +12,8 @@ from collections.abc import AsyncIterator, Iterable, Sequence
 from enum import IntEnum
 from typing import NamedTuple, Protocol
 
-from gateway.core.errors import Unreachable
-from gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 INT_MIN, INT_MAX = -(1 << 63), (1 << 63) - 1
 MAX_VALUE_BYTES = 4096
@@ -30,7 +30,7 @@ class Kind(IntEnum):
     REFUSAL = 2
     """`value` says why a command or plan was refused; `name` by whom."""
     STATE = 3
-    """`value` is a STATUS, state and period (bytes, `twin.status`); `name` is whose state machine it is."""
+    """`value` is a STATUS, state and period (bytes, `fieldtwin.twin.status`); `name` is whose state machine it is."""
     VERDICT = 4
     """`value` is what an analysis found; `name` of what."""
     PAYLOAD = 5

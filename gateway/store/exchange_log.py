@@ -11,8 +11,8 @@ import sqlite3
 from collections import Counter, deque
 from pathlib import Path
 
-from gateway.core.errors import FileInvalid, Unreachable
-from gateway.store.schema import migrate, refuse_newer
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
+from fieldtwin.gateway.store.schema import migrate, refuse_newer
 
 QUEUE = 10_000
 KNOWN = 1_000

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gateway.core.errors import UsageError
-from gateway.core.url_secrets import has_password, without_password
-from gateway.store.event import KnowledgeStore
-from gateway.store.sqlite_knowledge import Offload, SqliteKnowledge
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.url_secrets import has_password, without_password
+from fieldtwin.gateway.store.event import KnowledgeStore
+from fieldtwin.gateway.store.sqlite_knowledge import Offload, SqliteKnowledge
 
 URLS = ("postgresql://", "postgres://")
 
@@ -27,7 +27,7 @@ async def open_knowledge(place: str, *, max_bytes: int = 0, offload: Offload | N
         return await SqliteKnowledge.open(Path(place), max_bytes=max_bytes, offload=offload)
     check_place(place)
     try:
-        from gateway.store.postgres_knowledge import PostgresKnowledge  # an extra
+        from fieldtwin.gateway.store.postgres_knowledge import PostgresKnowledge  # an extra
     except ModuleNotFoundError as e:
         raise UsageError("PostgreSQL needs an extra", hint="pip install 'fieldtwin[postgres]'") from e
     return await PostgresKnowledge.open(place)

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import asyncpg
 
-from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError
-from gateway.store.event import Event, StoreFull, Value, merged, without
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.store.event import Event, StoreFull, Value, merged, without
 
 T = TypeVar("T")
 SCRIPTS = {1: "postgres_0001.sql"}
@@ -32,7 +32,7 @@ _INSERT = (
 
 
 class PostgresKnowledge:
-    """See `gateway.store.event.KnowledgeStore`. ``store = await PostgresKnowledge.open("postgresql://user@host/database")``."""
+    """See `fieldtwin.gateway.store.event.KnowledgeStore`. ``store = await PostgresKnowledge.open("postgresql://user@host/database")``."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -99,7 +99,7 @@ class PostgresKnowledge:
                 got=f"schema {version}", hint="it is left as it is",
             )  # fmt: skip
         for number in range(version + 1, LATEST + 1):
-            await db.execute(files("gateway.store").joinpath(SCRIPTS[number]).read_text(encoding="utf-8"))
+            await db.execute(files("fieldtwin.gateway.store").joinpath(SCRIPTS[number]).read_text(encoding="utf-8"))
             await db.execute("INSERT INTO version VALUES ($1)", number)
 
     # -- origins ----------------------------------------------------------------------------------------------------------

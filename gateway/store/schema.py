@@ -10,7 +10,7 @@ import sqlite3
 from importlib.resources import files
 from pathlib import Path
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 SCRIPTS = {1: "0001_schema.sql", 2: "0002_knowledge.sql"}
 LATEST = max(SCRIPTS)
@@ -18,7 +18,7 @@ LATEST = max(SCRIPTS)
 
 def script(number: int) -> str:
     """The SQL that leads to version `number`."""
-    return files("gateway.store").joinpath(SCRIPTS[number]).read_text(encoding="utf-8")
+    return files("fieldtwin.gateway.store").joinpath(SCRIPTS[number]).read_text(encoding="utf-8")
 
 
 def refuse_newer(db: sqlite3.Connection, path: Path) -> int:

@@ -13,9 +13,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
-from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError
-from gateway.store.event import Event, StoreFull, merged, without
-from gateway.store.schema import migrate, refuse_newer
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.store.event import Event, StoreFull, merged, without
+from fieldtwin.gateway.store.schema import migrate, refuse_newer
 
 T = TypeVar("T")
 Work = Callable[[], Any]
@@ -34,7 +34,7 @@ async def in_place(work: Work) -> Any:
 
 
 class SqliteKnowledge:
-    """See `gateway.store.event.KnowledgeStore`. `max_bytes` bounds the file; 0 leaves it to the disk.
+    """See `fieldtwin.gateway.store.event.KnowledgeStore`. `max_bytes` bounds the file; 0 leaves it to the disk.
 
     ``store = await SqliteKnowledge.open(path)``. Raises `FileInvalid` for a file that is no store of ours.
     """

@@ -1,11 +1,11 @@
 """Function blocks for programs: the standard's (IEC 61131-3, 6.6.3.5) and those that every plant needs."""
 
-from plc.blocks.alarm import ALARM
-from plc.blocks.block import MS, SECOND, FunctionBlock
-from plc.blocks.control import HYSTERESIS, PID, RAMP
-from plc.blocks.counters import CTD, CTU, CTUD, VARIANTS
-from plc.blocks.edges import F_TRIG, R_TRIG, RS, SR
-from plc.blocks.timers import TOF, TON, TP
+from fieldtwin.plc.blocks.alarm import ALARM
+from fieldtwin.plc.blocks.block import MS, SECOND, FunctionBlock
+from fieldtwin.plc.blocks.control import HYSTERESIS, PID, RAMP
+from fieldtwin.plc.blocks.counters import CTD, CTU, CTUD, VARIANTS
+from fieldtwin.plc.blocks.edges import F_TRIG, R_TRIG, RS, SR
+from fieldtwin.plc.blocks.timers import TOF, TON, TP
 
 BLOCKS: dict[str, type[FunctionBlock]] = {
     block.__name__: block

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from math import inf
 
-from plc.blocks.block import FunctionBlock
+from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class _Limit:

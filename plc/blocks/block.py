@@ -14,7 +14,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 MS = NS_PER_MS
 """One millisecond in ns: ``PT=500 * MS``."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from math import isfinite
 
-from plc.blocks.block import SECOND, FunctionBlock
+from fieldtwin.plc.blocks.block import SECOND, FunctionBlock
 
 
 class HYSTERESIS(FunctionBlock):

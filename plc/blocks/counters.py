@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from plc.blocks.block import FunctionBlock
+from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class CTU(FunctionBlock):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from plc.blocks.block import FunctionBlock
+from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class R_TRIG(FunctionBlock):

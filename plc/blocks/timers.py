@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from plc.blocks.block import FunctionBlock
+from fieldtwin.plc.blocks.block import FunctionBlock
 
 
 class _Timer(FunctionBlock):

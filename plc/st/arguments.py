@@ -10,8 +10,8 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from plc.st import tree as t
-from plc.st.scope import Environment
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st.scope import Environment
 
 MAX_REPEATED = 1000
 """Inputs of an extensible function such as ADD or MUX."""

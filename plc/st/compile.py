@@ -1,7 +1,8 @@
 """A unit of Structured Text to Python, once: classes for structures and function blocks, functions, a class a PROGRAM.
 
 The Python's lines carry the line numbers of the source, so that whatever goes wrong in a scan names the line that an
-engineer wrote. What is compiled is code without state: each `plc.st.resource.Resource` runs it in a namespace of its own.
+engineer wrote. What is compiled is code without state: each `fieldtwin.plc.st.resource.Resource` runs it in a namespace of its
+own.
 """
 
 from __future__ import annotations
@@ -10,16 +11,16 @@ import ast
 from dataclasses import dataclass, replace
 from types import CodeType
 
-from gateway.core.errors import FileInvalid
-from plc.program import Program
-from plc.st import tree as t
-from plc.st import types as ty
-from plc.st.assignments import Assignments
-from plc.st.declarations import Declarations
-from plc.st.located import without_addresses
-from plc.st.parse import parse
-from plc.st.scope import Environment, Parameter, Signature, Symbol, Writer, by_reference
-from plc.st.statements import Statements
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.program import Program
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.assignments import Assignments
+from fieldtwin.plc.st.declarations import Declarations
+from fieldtwin.plc.st.located import without_addresses
+from fieldtwin.plc.st.parse import parse
+from fieldtwin.plc.st.scope import Environment, Parameter, Signature, Symbol, Writer, by_reference
+from fieldtwin.plc.st.statements import Statements
 
 MAX_CALLS = 64
 """POUs that call each other in a row."""

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from plc.st import tree as t
-from plc.st import types as ty
-from plc.st.scope import Compiling, Value
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.scope import Compiling, Value
 
 Write = Callable[[Compiling, t.Call, list[t.Expr]], Value]
 """Writes a call. Its arguments are given in the order of the function's parameters."""

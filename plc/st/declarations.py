@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from gateway.core.image_layout import MAX_DEPTH, MAX_MESSAGE_BYTES
-from plc.blocks import BLOCKS
-from plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
-from plc.st import tree as t
-from plc.st import types as ty
-from plc.st.expressions import Expressions
-from plc.st.scope import Environment, Symbol, Writer
+from fieldtwin.gateway.core.image_layout import MAX_DEPTH, MAX_MESSAGE_BYTES
+from fieldtwin.plc.blocks import BLOCKS
+from fieldtwin.plc.program import MESSAGE_BYTES, MESSAGE_DEPTH
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.expressions import Expressions
+from fieldtwin.plc.st.scope import Environment, Symbol, Writer
 
 MAX_REPEATED = 100
 """Characters of Python that are written out wherever they are needed."""

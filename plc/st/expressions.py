@@ -7,14 +7,24 @@ from __future__ import annotations
 from math import isfinite
 from typing import NoReturn
 
-from plc.st import tree as t
-from plc.st import types as ty
-from plc.st import values
-from plc.st.arguments import bind
-from plc.st.literals import Malformed, constant
-from plc.st.scope import COMPARISONS, Environment, Parameter, Signature, Symbol, Value, Writer, by_reference, wrapped
-from plc.st.standard import FUNCTIONS
-from plc.st.time_arithmetic import with_time
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st import values
+from fieldtwin.plc.st.arguments import bind
+from fieldtwin.plc.st.literals import Malformed, constant
+from fieldtwin.plc.st.scope import (
+    COMPARISONS,
+    Environment,
+    Parameter,
+    Signature,
+    Symbol,
+    Value,
+    Writer,
+    by_reference,
+    wrapped,
+)
+from fieldtwin.plc.st.standard import FUNCTIONS
+from fieldtwin.plc.st.time_arithmetic import with_time
 
 MAX_DEEP = 80
 """Calls, parentheses and indices inside each other."""

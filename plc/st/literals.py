@@ -9,10 +9,10 @@ from fractions import Fraction
 from math import isfinite
 from typing import Any
 
-from gateway.core.clock import NS_PER_S
-from plc.st import types as ty
-from plc.st.tree import Literal
-from plc.st.values import real
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.tree import Literal
+from fieldtwin.plc.st.values import real
 
 _UNITS_NS = {
     "d": 86_400_000_000_000, "h": 3_600_000_000_000, "m": 60_000_000_000, "s": 1_000_000_000, "ms": 1_000_000,

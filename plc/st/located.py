@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from plc.st import tree as t
+from fieldtwin.plc.st import tree as t
 
 _KINDS = {"I": "VAR_INPUT", "Q": "VAR_OUTPUT", "M": "VAR"}
 

@@ -13,9 +13,9 @@ from lark.lexer import PatternStr
 from lark.tree import Meta
 from lark.visitors import Transformer_NonRecursive
 
-from gateway.core.errors import FileInvalid
-from plc.st import tree as t
-from plc.st.source import MAX_NAME, blanked, shortened
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st.source import MAX_NAME, blanked, shortened
 
 MAX_EXPECTED = 8
 """How many of the tokens that could have stood somewhere an error names."""

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 MAX_ELEMENTS = 500_000
 _BLOCKS = {

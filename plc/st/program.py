@@ -12,17 +12,17 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.image import TagKind
-from gateway.core.input_file import read_input
-from gateway.core.values import Scalar
-from plc.program import Place, Program, Role, ScanInfo, Variable, message_input, message_output
-from plc.st import types as ty
-from plc.st import values
-from plc.st.assignments import is_line, line_of
-from plc.st.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
-from plc.st.plcopen import is_plcopen, to_st
-from plc.st.resource import Resource, Together, state_of
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.input_file import read_input
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.plc.program import Place, Program, Role, ScanInfo, Variable, message_input, message_output
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st import values
+from fieldtwin.plc.st.assignments import is_line, line_of
+from fieldtwin.plc.st.compile import CompiledProgram, CompiledUnit, ProgramVariable, compile_text
+from fieldtwin.plc.st.plcopen import is_plcopen, to_st
+from fieldtwin.plc.st.resource import Resource, Together, state_of
 
 MAX_SOURCE_BYTES = 8 * 1024 * 1024
 """A source file that is larger is a mistake."""

@@ -10,12 +10,12 @@ import copy
 from collections.abc import Callable
 from typing import Any, NoReturn
 
-from gateway.core.image import Message
-from gateway.core.values import Quality, TagValue
-from plc.blocks import BLOCKS, FunctionBlock
-from plc.program import Outbox, ScanInfo, ScanTooLong
-from plc.st import values
-from plc.st.compile import CompiledUnit
+from fieldtwin.gateway.core.image import Message
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.plc.blocks import BLOCKS, FunctionBlock
+from fieldtwin.plc.program import Outbox, ScanInfo, ScanTooLong
+from fieldtwin.plc.st import values
+from fieldtwin.plc.st.compile import CompiledUnit
 
 MAX_STEPS = 1_000_000
 """Loop iterations, and calls of functions and function blocks, that a program may make in one scan. The same in real and in

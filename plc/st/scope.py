@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Any, NoReturn, Protocol
 
-from gateway.core.errors import FileInvalid
-from plc.st import types as ty
-from plc.st.source import shortened
-from plc.st.tree import Expr, Pos
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.source import shortened
+from fieldtwin.plc.st.tree import Expr, Pos
 
 COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="}
 """Operators of Structured Text as Python writes them."""
@@ -20,7 +20,7 @@ COMPARISONS = {"=": "==", "<>": "!=", "<": "<", ">": ">", "<=": "<=", ">=": ">="
 @dataclass(frozen=True, slots=True)
 class Symbol:
     """A variable: its Python expression, and its value if it is a constant. `reference`: the expression of the object that
-    stands for a variable of the caller, where it is a VAR_IN_OUT of an elementary type (`plc.st.references`)."""
+    stands for a variable of the caller, where it is a VAR_IN_OUT of an elementary type (`fieldtwin.plc.st.references`)."""
 
     name: str
     type: ty.Type
@@ -144,7 +144,7 @@ class Writer:
         self._depth -= 1
 
     def step(self, pos: Pos | None = None) -> None:
-        """Count one loop iteration or call against the limit of the scan (`plc.st.resource.MAX_STEPS`)."""
+        """Count one loop iteration or call against the limit of the scan (`fieldtwin.plc.st.resource.MAX_STEPS`)."""
         self.line("_c.left -= 1", pos)
         self.line("if _c.left < 0: _c.too_long()", pos)
 

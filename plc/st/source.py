@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 MAX_CHARACTERS = 1_000_000
 """Of a file: some 30,000 lines."""

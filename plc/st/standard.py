@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from plc.st import tree as t
-from plc.st import types as ty
-from plc.st import values
-from plc.st.arguments import Formals, in_order
-from plc.st.conversions import Write, conversion
-from plc.st.scope import COMPARISONS, Compiling, Value, wrapped
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st import values
+from fieldtwin.plc.st.arguments import Formals, in_order
+from fieldtwin.plc.st.conversions import Write, conversion
+from fieldtwin.plc.st.scope import COMPARISONS, Compiling, Value, wrapped
 
 _TWO = Formals(("IN1", "IN2"))
 _SOME = Formals(repeats="IN", least=2)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from plc.st import tree as t
-from plc.st import types as ty
-from plc.st.arguments import bind
-from plc.st.expressions import Expressions
-from plc.st.scope import Environment, Symbol, Value, Writer, wrapped
+from fieldtwin.plc.st import tree as t
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.arguments import bind
+from fieldtwin.plc.st.expressions import Expressions
+from fieldtwin.plc.st.scope import Environment, Symbol, Value, Writer, wrapped
 
 MAX_DEEP = 60
 """Statements inside each other."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from plc.st import types as ty
-from plc.st.scope import Value, wrapped
+from fieldtwin.plc.st import types as ty
+from fieldtwin.plc.st.scope import Value, wrapped
 
 
 def with_time(op: str, left: Value, right: Value) -> Value | None:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import prod
 
-from plc.blocks import FunctionBlock
+from fieldtwin.plc.blocks import FunctionBlock
 
 DEFAULT_STRING = 80
 DAY_NS = 86_400_000_000_000

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import Blame, FieldtwinError
-from plc.st.references import Cell, Cut, Element, Member
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import Blame, FieldtwinError
+from fieldtwin.plc.st.references import Cell, Cut, Element, Member
 
 __all__ = ["Cell", "Cut", "Element", "LogicError", "Member"]  # and all that compiled code calls by its name
 

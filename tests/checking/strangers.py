@@ -17,16 +17,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from emulators.endpoints.pty import PtyEnd
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.modbus_cases import CASES
 from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus, traits_of
 from fieldtwin.checking.run import Plan
 from fieldtwin.conformance.case import Danger
-from gateway.connections.os_connector import OsConnector
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
 
 PROGRAM = Path(__file__).parents[1] / "interop" / "strange_slaves.py"
 A_SERVER = 2

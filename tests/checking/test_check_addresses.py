@@ -9,14 +9,14 @@ from __future__ import annotations
 import pytest
 from devices_in_memory import on_modbus
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.unit import ModbusUnit
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
 from fieldtwin.checking.run import Plan
 from fieldtwin.cli.check_device_command import _cell
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.errors import UsageError
 
 
 @pytest.mark.parametrize(

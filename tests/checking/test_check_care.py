@@ -10,9 +10,6 @@ import pytest
 from click.testing import CliRunner, Result
 from devices_in_memory import make_unit, on_modbus
 
-from emulators.modbus.unit import ModbusUnit
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.modbus_cases import CASES
 from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
@@ -21,9 +18,12 @@ from fieldtwin.checking.paper import canopen_on_paper, modbus_on_paper
 from fieldtwin.checking.run import Plan
 from fieldtwin.cli.check_command import command
 from fieldtwin.conformance.case import Danger
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.errors import Bug, NotAllowed, Unreachable, UsageError
 from fieldtwin.report.model import Verdict
-from gateway.core.connection import ByteConnection
-from gateway.core.errors import Bug, NotAllowed, Unreachable, UsageError
 
 URL = "tcp://127.0.0.1:0"
 

@@ -12,14 +12,14 @@ import pytest
 from click.testing import CliRunner, Result
 from devices_in_memory import make_unit
 
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
 from fieldtwin.cli.check_command import command
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.wallclock import WallClock
 
 
 @pytest.fixture(scope="module")

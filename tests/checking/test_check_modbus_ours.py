@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from devices_in_memory import on_modbus
 
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
 from fieldtwin.checking.run import Plan
 from fieldtwin.conformance.case import Danger
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.report.model import Verdict
 
 ALL = Plan(at_most=Danger.DISRUPT, has=frozenset({"holding", "coil", "i-know"}))

@@ -6,13 +6,13 @@ import pytest
 import wrong_devices as wrong
 from devices_in_memory import on_modbus
 
-from emulators.modbus.unit import ModbusUnit
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking.device_case import DeviceResult
 from fieldtwin.checking.modbus_session import ModbusOptions, check_modbus
 from fieldtwin.checking.run import Plan
 from fieldtwin.conformance.case import Danger
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
 from fieldtwin.report.model import Verdict
 
 HAS = frozenset({"holding", "coil", "i-know"})

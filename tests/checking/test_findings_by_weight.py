@@ -16,9 +16,6 @@ from click.testing import CliRunner
 from devices_in_memory import make_unit, on_modbus
 from wrong_devices import twisted
 
-from emulators.modbus.unit import ModbusUnit
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking import canopen_cases, modbus_cases
 from fieldtwin.checking.device_case import DeviceCase, DeviceResult
 from fieldtwin.checking.html import overall, render_html
@@ -30,11 +27,14 @@ from fieldtwin.cli.check_view import style_of
 from fieldtwin.cli.report_command import command as report
 from fieldtwin.conformance.case import Basis, failed, passed
 from fieldtwin.conformance.results import exit_code
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
 from fieldtwin.report.junit import render_junit
 from fieldtwin.report.model import Verdict
-from gateway.core.connection import ByteConnection
-from gateway.core.errors import ConnectionLost
-from gateway.protocols.modbus.crc import crc16, with_crc
 
 CASES: tuple[DeviceCase[object], ...] = (*modbus_cases.CASES, *canopen_cases.CASES)  # type: ignore[arg-type]
 CLAUSE = re.compile(r"^(?:(?:SL|AP|TG) )?\d+(?:\.\d+)*(?:$|[;,])")

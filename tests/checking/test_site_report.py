@@ -22,12 +22,12 @@ from fieldtwin.cli.compare_command import command as compare
 from fieldtwin.cli.diff_command import command as diff
 from fieldtwin.cli.report_command import command
 from fieldtwin.conformance.case import failed, inconclusive, passed, skipped
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.report.junit import render_junit
 from fieldtwin.sitereport.html import render_html
 from fieldtwin.sitereport.reading import read_site
 from fieldtwin.sitereport.reading_dump import dump_piece
-from gateway.core.connection import Direction
-from gateway.core.errors import FileInvalid, UsageError
 
 ROOT = Path(__file__).parents[2]
 NASTY = "<script>alert('1')</script>"

@@ -6,11 +6,11 @@ from collections.abc import Awaitable, Callable
 
 from devices_in_memory import make_unit
 
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.connection import ByteConnection
-from gateway.core.errors import ConnectionLost
-from gateway.protocols.modbus.ascii import lrc
-from gateway.protocols.modbus.crc import with_crc
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.protocols.modbus.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
 Twist = Callable[[ModbusUnit, bytes, bytes | None], bytes | None]
 """The unit, the request and the right answer -> what is answered."""

@@ -6,9 +6,6 @@ import asyncio
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.conformance.canopen_cases import CASES as CANOPEN_CASES
 from fieldtwin.conformance.canopen_cases import SILENT as CANOPEN_SILENT
 from fieldtwin.conformance.canopen_stage import CanopenStage
@@ -18,12 +15,15 @@ from fieldtwin.conformance.observation import Word
 from fieldtwin.conformance.probe import Classifier
 from fieldtwin.conformance.results import CaseResult
 from fieldtwin.conformance.run import MasterRun, Plan
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError, ReplyTimeout
-from gateway.core.nursery import Nursery
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
-from gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 
 WORDS = (1111, 2222, 3333)
 PERIOD_S = 0.3

@@ -133,7 +133,7 @@ def canopen(block: str = "") -> Master:
     import canopen as library
     from canopen.objectdictionary import ODVariable
 
-    from gateway.connections.soft_bus import SoftBus
+    from fieldtwin.gateway.connections.soft_bus import SoftBus
 
     network = library.Network()
     network.bus = SoftBus(channel=os.environ["FIELDTWIN_CHANNEL"])

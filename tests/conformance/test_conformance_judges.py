@@ -30,8 +30,8 @@ from fieldtwin.conformance.observation import (
     Told,
     Word,
 )
+from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.report.model import Verdict
-from gateway.core.clock import NS_PER_S
 
 READ = bytes((17, 3, 0, 107, 0, 2))
 S = NS_PER_S

@@ -15,14 +15,14 @@ import pytest
 from masters_in_memory import Publish, judge
 from test_strange_masters_judged import CANOPEN, run_check
 
-from emulators.modbus.rtu_receiver import crc16, with_crc
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.conformance.observation import Word
 from fieldtwin.conformance.probe import Classifier, MarkedOutputProbe, OutputProbe
+from fieldtwin.emulators.modbus.rtu_receiver import crc16, with_crc
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.report.model import Verdict
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint
 
 pytestmark = pytest.mark.long
 

@@ -16,14 +16,14 @@ from masters_in_memory import (
     ours,
 )
 
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.conformance.modbus_cases import CASES
 from fieldtwin.conformance.results import CaseResult
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, WireError
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.report.model import Verdict
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, FieldtwinError, WireError
-from gateway.protocols.modbus.client import ModbusClient
 
 NOT_ITS_BUSINESS = {
     "MB-021": "polls no sooner than its timeout",

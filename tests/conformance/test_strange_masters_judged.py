@@ -34,7 +34,7 @@ while True:
 
 CANOPEN = """
 import os, time, canopen
-from gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.connections.soft_bus import SoftBus
 network = canopen.Network()
 network.bus = SoftBus(channel=os.environ["FIELDTWIN_CHANNEL"])
 network.connect()

@@ -18,7 +18,7 @@ from test_strange_masters_judged import CANOPEN, environment
 
 from fieldtwin.conformance.evidence import reproduce
 from fieldtwin.decoding.canopen_wire import CanopenWire
-from gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 TAKES_ALL = """
 import os, socket, sys

@@ -57,8 +57,10 @@ def test_every_schema_of_the_paper_has_classes_that_there_are():
 
 
 def test_a_class_that_there_is_not_is_named():
-    with pytest.raises(paper_page.NoSuchClass, match="no class Twin in twin"):
-        paper_page.rows("## Schemas and classes\n| schema | class | where |\n| DigitalTwin | `Twin` | `twin.twin` |\n")
+    with pytest.raises(paper_page.NoSuchClass, match=r"no class Twin in fieldtwin\.twin\.twin"):
+        paper_page.rows(
+            "## Schemas and classes\n| schema | class | where |\n| DigitalTwin | `Twin` | `fieldtwin.twin.twin` |\n"
+        )
 
 
 def test_the_books_source_has_every_kind_of_file_every_fault_and_every_command(tmp_path):

@@ -13,14 +13,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local, var_output
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.clock import NS_PER_S
-from gateway.core.image import TagKind
-from gateway.runtime.canopen_bus import CanopenBus
-from plc.program import Program, ScanInfo, var_input, var_local, var_output
 
 LASTS_S, AFTER_S, FIRST_S = 2.0, 2.6, 5.0
 ROW_S = LASTS_S + AFTER_S

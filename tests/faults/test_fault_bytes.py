@@ -12,13 +12,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from emulators.faults.can_fault import BusFault, CanFault
-from emulators.faults.engine import WireFaults
-from emulators.faults.fault import Active, Aim, Hang, Outcome, Piece, ValueFault, WireFault
-from emulators.faults.frames import Assembler, Frame, Framing, Way, understood
-from emulators.faults.registry import FAULTS
-from emulators.faults.schema import parse_fault
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.faults.can_fault import BusFault, CanFault
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active, Aim, Hang, Outcome, Piece, ValueFault, WireFault
+from fieldtwin.emulators.faults.frames import Assembler, Frame, Framing, Way, understood
+from fieldtwin.emulators.faults.registry import FAULTS
+from fieldtwin.emulators.faults.schema import parse_fault
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 def crc(data: bytes) -> bytes:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from emulators.faults.fault import Aim
-from emulators.faults.schema import load_faults
+from fieldtwin.emulators.faults.fault import Aim
+from fieldtwin.emulators.faults.schema import load_faults
 
 TEXT = (Path(__file__).parents[2] / "docs" / "faults.md").read_text()
 

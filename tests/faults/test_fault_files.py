@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from emulators.faults.frames import Framing
-from emulators.faults.json_schema import fault_defs
-from emulators.faults.on_link import wire_faults
-from emulators.faults.registry import FAULTS
-from emulators.faults.schema import load_faults, parse_fault, seconds
 from fieldtwin.cli.faults_command import command
-from gateway.core.errors import FileInvalid, UsageError
-from twin.fault_aims import target
-from twin.system import load_system
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.faults.json_schema import fault_defs
+from fieldtwin.emulators.faults.on_link import wire_faults
+from fieldtwin.emulators.faults.registry import FAULTS
+from fieldtwin.emulators.faults.schema import load_faults, parse_fault, seconds
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.twin.fault_aims import target
+from fieldtwin.twin.system import load_system
 
 
 @pytest.mark.parametrize(

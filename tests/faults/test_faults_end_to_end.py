@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import pytest
 from faults_rig import Seen, through
 
-from emulators.faults.registry import FAULTS
+from fieldtwin.emulators.faults.registry import FAULTS
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.running.virtual_bench import VirtualBench
-from gateway.core.errors import UsageError
 
 NOBODY: frozenset[str] = frozenset()
 

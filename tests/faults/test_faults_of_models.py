@@ -9,20 +9,20 @@ from typing import Any
 
 import pytest
 
-from emulators.canopen.codec import decode as object_value
-from emulators.codec import decode
-from emulators.distorted_registers import DistortedRegisters
-from emulators.distortion import Distortions
-from emulators.faults.fault import Active, Aim
-from emulators.faults.registry import fault_class
-from emulators.modbus.bank import IllegalAddress
-from emulators.models.emulated_node import EmulatedNode, emulated_node
-from emulators.models.mailbox_modem import ModemPair
-from emulators.models.register_device import StatedRegisters
-from emulators.replay.can_log import CanLog
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.profile import load_profile
+from fieldtwin.emulators.canopen.codec import decode as object_value
+from fieldtwin.emulators.codec import decode
+from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.faults.fault import Active, Aim
+from fieldtwin.emulators.faults.registry import fault_class
+from fieldtwin.emulators.modbus.bank import IllegalAddress
+from fieldtwin.emulators.models.emulated_node import EmulatedNode, emulated_node
+from fieldtwin.emulators.models.mailbox_modem import ModemPair
+from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.replay.can_log import CanLog
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.profile import load_profile
 
 DEVICES = Path(__file__).parents[2] / "profiles" / "devices"
 TANK = """

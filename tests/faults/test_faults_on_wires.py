@@ -10,22 +10,22 @@ from typing import Any
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.faulty import FaultyEnd
-from emulators.endpoints.faulty_udp import FaultyDatagrams
-from emulators.endpoints.ports import OsPorts
-from emulators.endpoints.pty import PtyEnd
-from emulators.faults.frames import Framing
-from emulators.faults.on_link import wire_faults
-from emulators.link import Link
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_udp
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
+from fieldtwin.emulators.endpoints.ports import OsPorts
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.faults.on_link import wire_faults
+from fieldtwin.emulators.link import Link
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_udp
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.wallclock import WallClock
 
 REQUEST = bytes.fromhex("0001 0000 0006 01 03 0000 0001")
 REPLY = bytes.fromhex("0001 0000 0005 01 03 02 002A")

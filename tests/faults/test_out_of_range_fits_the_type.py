@@ -11,20 +11,20 @@ from pathlib import Path
 
 import pytest
 
-from emulators.faults.of_device import DeviceFaults, check_device
-from emulators.faults.schema import load_faults, parse_fault
-from emulators.recorded_device import RecordedDevice
-from emulators.replay.replay import ExchangeReplay
-from emulators.stated import cells_of
+from fieldtwin.emulators.faults.of_device import DeviceFaults, check_device
+from fieldtwin.emulators.faults.schema import load_faults, parse_fault
+from fieldtwin.emulators.recorded_device import RecordedDevice
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.stated import cells_of
+from fieldtwin.gateway.core.connection import RS232Connection
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import Exchange
 from fieldtwin.report.model import Verdict
 from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.running.scenario_targets import Target, run_scenario
 from fieldtwin.scenarios.form import load_scenario
-from gateway.core.connection import RS232Connection
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.profile import load_profile
-from gateway.core.recording import Exchange
-from twin.fault_aims import target
+from fieldtwin.twin.fault_aims import target
 
 PROFILE = """device: fieldtwin/tank
 source: "made for this test"

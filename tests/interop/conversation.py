@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
 
 SDO_REPLY, SDO_REQUEST, NMT = 0x580, 0x600, 0x000
 

@@ -14,28 +14,28 @@ from typing import Protocol
 
 from support import eventually
 
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.tap import Captured, CaptureTap, TappedConnector
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import DeviceRefused, FieldtwinError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.gateway import Gateway
+from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.children import Child
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.tap import Captured, CaptureTap, TappedConnector
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import DeviceRefused, FieldtwinError
-from gateway.core.nursery import Nursery
-from gateway.core.values import Quality
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.register_device import RegisterDriver
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.gateway import Gateway
-from gateway.runtime.modbus_bus import Job, ModbusBus
-from gateway.runtime.tags import TagTable
-from gateway.store.exchange_log import ExchangeLog
-from gateway.wallclock import WallClock
-from twin.mapping import MappedConnector
-from twin.physical import attached, gateway_config, image_layout, make_image, plc_config
-from twin.system import System, load_system
+from fieldtwin.twin.mapping import MappedConnector
+from fieldtwin.twin.physical import attached, gateway_config, image_layout, make_image, plc_config
+from fieldtwin.twin.system import System, load_system
 
 SYSTEM = Path(__file__).parents[2] / "profiles/systems/observatory.yaml"
 SAMPLES = 2
@@ -74,7 +74,7 @@ async def converse(target: Target, run_dir: Path, patience_s: float = 15.0) -> R
     layout = image_layout(system)
     make_image(layout, run_dir / "image")
     (run_dir / "plc.json").write_bytes(plc_config(system, run_dir).to_json())
-    plc = Child("plc", "plc", run_dir / "plc.json", run_dir)
+    plc = Child("plc", "fieldtwin.plc", run_dir / "plc.json", run_dir)
     audit = AuditLog(run_dir / "audit.jsonl", clock)
     log = ExchangeLog(run_dir / "store.sqlite", system=system.name, prototype=True)
     try:

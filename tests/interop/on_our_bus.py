@@ -18,9 +18,9 @@ import can.interfaces
 import pytest
 from canopen.sdo.client import SdoClient
 
-from emulators.endpoints.bus_server import SoftBusServer
-from gateway.connections.soft_bus import SoftBus
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 BITRATE = 500_000
 PATIENCE_S = 1.0

@@ -17,8 +17,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from gateway.protocols.modbus.ascii import lrc
-from gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 
 HERE = Path(__file__).parent
 VECTORS = HERE.parent / "vectors"

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from tshark import dissect, needs_tshark
 
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 pytestmark = [pytest.mark.interop, needs_tshark]
 ROWS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "canopen_slave.toml").read_text(encoding="utf-8"))["row"]

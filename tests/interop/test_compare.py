@@ -13,10 +13,10 @@ from compare import DeviceRules, compare, load_tolerances
 from conversation import Conversation, Exchange, Heard, canopen_conversation, crc16, rtu_conversation, tcp_conversation
 from pydantic import ValidationError
 
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 LINE = Endpoint.parse("rtu:/dev/ttyS0")
 S, R = Direction.SENT, Direction.RECEIVED

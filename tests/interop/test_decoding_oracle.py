@@ -9,11 +9,11 @@ from tshark import dissect, needs_tshark
 
 from fieldtwin.decoding.decoder import exchanges, frame_events
 from fieldtwin.decoding.exchange import Exchange
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.protocols.modbus.crc import with_crc
-from twin.system import load_system
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.twin.system import load_system
 
 pytestmark = [pytest.mark.interop, needs_tshark]
 MS = 1_000_000

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from emulators.canopen.dictionary import load_eds
-from gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
 from eds_agreement import NODE, differences

@@ -14,9 +14,9 @@ from held import Held
 from tshark import dissect, needs_tshark
 
 from fieldtwin.formats.pcap import read_capture
-from gateway.connections.tap import Captured
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 pytestmark = [pytest.mark.interop, pytest.mark.timeout(120), needs_tshark]
 

@@ -17,19 +17,19 @@ import pytest
 from support import eventually, run
 from targets import SYSTEM, at_time, device, field_side, recording
 
-from emulators.link import run_link
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
-from gateway.core.events import Consumer
-from gateway.core.nursery import Nursery
-from gateway.core.values import DATA
-from gateway.devices.config import BusConfig
-from gateway.devices.register_device import SensorDriver
-from gateway.runtime.modbus_bus import Job, ModbusBus
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
-from twin.system import load_system
+from fieldtwin.emulators.link import run_link
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import DATA
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.register_device import SensorDriver
+from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.system import load_system
 
 pytestmark = [
     pytest.mark.interop,

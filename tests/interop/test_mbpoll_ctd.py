@@ -13,19 +13,19 @@ from pathlib import Path
 import pytest
 from support import run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu
-from emulators.modbus.unit import ModbusUnit
-from emulators.models.sampled_sensor import SampledSensor
-from emulators.signals import SignalPlayer, SignalTrack
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.core.profile import load_profile
-from gateway.wallclock import WallClock
-from twin.field import unit_limits
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.field import unit_limits
 
 pytestmark = [
     pytest.mark.interop,

@@ -19,7 +19,7 @@ from targets import socat_pair
 from fieldtwin.commissioning.identify_modbus import identify_modbus
 from fieldtwin.commissioning.matching import Sureness
 from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
-from gateway.core.profile import load_profile
+from fieldtwin.gateway.core.profile import load_profile
 
 HERE = Path(__file__).parent
 PEERS = [

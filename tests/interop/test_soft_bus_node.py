@@ -12,8 +12,8 @@ import pytest
 from support import run
 from targets import field_side, recording
 
-from gateway.connections.soft_bus import SoftBus
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 pytestmark = pytest.mark.interop
 

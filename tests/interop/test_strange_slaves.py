@@ -22,14 +22,14 @@ import pytest
 from support import run
 from tshark import dissect
 
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.tap import Captured, TappedConnector
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ModbusExceptionReply
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.tap import Captured, TappedConnector
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.wallclock import WallClock
 
 pytestmark = pytest.mark.interop
 PROGRAM = Path(__file__).with_name("strange_slaves.py")

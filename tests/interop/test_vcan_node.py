@@ -17,7 +17,7 @@ from flagship import converse_on_can
 from support import eventually, run
 from targets import DEVICES, device, field_side, slopes_like
 
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 pytestmark = [
     pytest.mark.socketcan,

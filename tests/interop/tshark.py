@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.formats.pcap import write_pcap
-from gateway.connections.tap import Captured
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.connections.tap import Captured
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 needs_tshark = pytest.mark.skipif(shutil.which("tshark") is None, reason="tshark is not installed")
 

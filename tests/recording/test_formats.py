@@ -16,13 +16,13 @@ from fieldtwin.formats.can_files import SUFFIXES, read_can_file
 from fieldtwin.formats.candump import LeftOut, line_of, read_log
 from fieldtwin.formats.csv_table import import_csv
 from fieldtwin.formats.poll_text import read_polls
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, encode_exchange, encode_header
 from fieldtwin.recording.exporting import export
 from fieldtwin.recording.importing import import_can, import_polls, kind_of
 from fieldtwin.recording.rotating import exchanges_of
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import FieldtwinError, FileInvalid, UsageError
-from gateway.core.profile import load_profile
-from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, encode_exchange, encode_header
 
 ROOT = Path(__file__).parents[2]
 TSHARK = shutil.which("tshark")

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
 from fieldtwin.recording.exporting import export
 from fieldtwin.report.html import render_html
 from fieldtwin.report.junit import render_junit
 from fieldtwin.report.model import Report, ScenarioResult, Verdict
 from fieldtwin.service.exposition import Family, render
-from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo
 
 FORMULAS = ("=1+1", "+1+1", "-1+1", "@SUM(A1)", "\t=1+1", "\r=1+1", '=HYPERLINK("http://x","y")')
 NAMES = (*FORMULAS, "<script>alert(1)</script>", "\x1b[31mred", "a\x00b", "line\nbreak", '" onload="x')

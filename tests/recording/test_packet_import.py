@@ -14,10 +14,10 @@ from test_pairing import crc
 
 from fieldtwin.formats.packet_file import PacketFile
 from fieldtwin.formats.pcap import read_capture
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import Exchange, RecordingReader
 from fieldtwin.recording.from_packets import PacketImport, PacketSummary
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import load_profile
-from gateway.core.recording import Exchange, RecordingReader
 
 
 def exchanges(path: Path) -> list[Exchange]:

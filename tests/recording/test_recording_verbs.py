@@ -18,8 +18,8 @@ from click.testing import CliRunner
 from fieldtwin.cli.compare_command import command as compare
 from fieldtwin.cli.export_command import command as export
 from fieldtwin.cli.record_command import command as record
-from gateway.core.errors import FileInvalid, NotAllowed, Unreachable, UsageError
-from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, encode_exchange, encode_header
+from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed, Unreachable, UsageError
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, encode_exchange, encode_header
 
 ROOT = Path(__file__).parents[2]
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from packets import read, values
 
-from emulators.context import WhenUsedUp
-from emulators.replay import learning
-from emulators.replay.replay import ExchangeReplay, NeverRecorded
-from gateway.core.recording import Exchange
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.replay import learning
+from fieldtwin.emulators.replay.replay import ExchangeReplay, NeverRecorded
+from fieldtwin.gateway.core.recording import Exchange
 
 
 def asked(request: bytes, reply: bytes | None, t_s: float = 0.0, unit: int = 1) -> Exchange:

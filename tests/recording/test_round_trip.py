@@ -17,16 +17,27 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from support import eventually, run
 
-from emulators.canopen.serve import serve_node
-from emulators.context import WhenUsedUp
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.models.emulated_node import emulated_node
-from emulators.replay.can_log import CanLog
-from emulators.replay.replay import NeverRecorded
-from emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.commissioning.reading import target_of
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.emulators.replay.can_log import CanLog
+from fieldtwin.emulators.replay.replay import NeverRecorded
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.formats.candump import read_log
 from fieldtwin.formats.pcap import read_capture
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, encode_exchange, encode_header
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.asking import asker_at
 from fieldtwin.recording.comparing import Comparer, Comparison, Rules, pairs_of, request_of
 from fieldtwin.recording.comparing_can import Frames, compare_logs
@@ -45,17 +56,6 @@ from fieldtwin.recording.rotating import RotatingFile, exchanges_of, part, parts
 from fieldtwin.recording.sinks import CanLogSink, ExchangeSink, LineSink
 from fieldtwin.recording.tapping import LineTap
 from fieldtwin.running.device_here import DeviceHost, as_it_was_recorded
-from gateway.connections.os_connector import OsConnector
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.profile import load_profile
-from gateway.core.recording import Exchange, RecordingHeader, encode_exchange, encode_header
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.requests import ReadRegisters
-from gateway.wallclock import WallClock
 
 ROOT = Path(__file__).parents[2]
 HEADER = RecordingHeader(version=1, device="a/b", kind="exchanges", source="measured")
@@ -411,7 +411,7 @@ def test_a_killed_recorder_loses_the_last_record_at_most(tmp_path: Path) -> None
     program = (
         "import sys; from pathlib import Path\n"
         "from fieldtwin.recording.rotating import RotatingFile\n"
-        "from gateway.core.recording import *\n"
+        "from fieldtwin.gateway.core.recording import *\n"
         "head = encode_header(RecordingHeader(version=1, device='a/b', kind='exchanges', source='measured'))\n"
         "file = RotatingFile(Path(sys.argv[1]), head, max_bytes=20_000)\n"
         "for n in range(10**9):\n"

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.report.model import ScenarioResult
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.scenarios.runner import Runner
 from fieldtwin.scenarios.trace import Trace
-from twin.prototype_file import load_prototype
+from fieldtwin.twin.prototype_file import load_prototype
 
 HEAD = "scenario: a test\nsystem: observatory\n"
 

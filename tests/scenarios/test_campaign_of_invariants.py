@@ -15,14 +15,14 @@ from click.testing import CliRunner
 
 from fieldtwin.cli.run_command import command as run_command
 from fieldtwin.cli.test_command import command as judge_command
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.report.model import Verdict
 from fieldtwin.running.campaign import Campaign, run_campaign, run_seed, verdict_of
 from fieldtwin.running.confirming import CONFIRMED
 from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
-from gateway.core.errors import FileInvalid, UsageError
-from twin.system import load_system
+from fieldtwin.twin.system import load_system
 
 pytestmark = pytest.mark.long
 

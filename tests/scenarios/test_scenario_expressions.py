@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.scenarios.expression import Expression
-from gateway.core.errors import UsageError
 
 KNOWN = ["ctd.pressure", "ctd.status", "relay.state"]
 NOW: dict[tuple[str, str], Any] = {

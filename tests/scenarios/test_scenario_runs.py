@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.test_command import command
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.about import danger_of
 from fieldtwin.scenarios.form import load_scenario
-from gateway.core.errors import FileInvalid
 
 SHIPPED = sorted((Path(__file__).resolve().parents[2] / "profiles" / "systems").glob("*.scenario.yaml"))
 

@@ -21,8 +21,8 @@ from fieldtwin.scenarios.form import load_scenario
 
 WELL = DIVIDES_BY_ZERO.replace("3 / zero > 3", "FALSE AND zero > level")
 LATER = DIVIDES_BY_ZERO.replace("3 / zero > 3", "100 / (level - 7) > 1000")
-PYTHON = """from gateway.core.image import TagKind
-from plc.program import Program, ScanInfo, var_input, var_local
+PYTHON = """from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, ScanInfo, var_input, var_local
 
 
 class Pump(Program):

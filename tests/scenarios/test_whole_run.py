@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.report.model import ScenarioResult, Verdict
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
-from gateway.core.errors import FileInvalid
 
 ACTIVE = "  - send: {period_s: 1}\n  - wait: {until: \"quality(ctd.pressure) == 'good'\", within: 15s}\n"
 SILENT_AT_ONCE = "  - fault: {name: silence, device: ctd}\n  - pause: 1ms\n"

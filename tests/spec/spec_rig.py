@@ -8,20 +8,20 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from emulators.emulator import EmulatedUnit
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.register_device import RegisterDriver
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
-from twin.field import FieldSide
-from twin.mapping import MappedConnector, mapped_endpoint
-from twin.physical import make_drivers
-from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import Prototype, load_prototype
-from twin.system import System, load_system
+from fieldtwin.emulators.emulator import EmulatedUnit
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.field import FieldSide
+from fieldtwin.twin.mapping import MappedConnector, mapped_endpoint
+from fieldtwin.twin.physical import make_drivers
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.prototype_file import Prototype, load_prototype
+from fieldtwin.twin.system import System, load_system
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SYSTEMS = CHECKOUT / "profiles" / "systems"

@@ -18,12 +18,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from spec_rig import CHECKOUT, CLOCK, SYSTEMS, observatory
 
-from emulators.models.sampled_sensor import SampledSensor
-from emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.recording import RecordingReader, shown
 from fieldtwin.recording.importing import import_capture
-from gateway.core.clock import NS_PER_S
-from gateway.core.recording import RecordingReader, shown
-from twin.system import load_system
+from fieldtwin.twin.system import load_system
 
 WITNESS = """
 import os, sys
@@ -105,7 +105,9 @@ def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(dese
     assert prototype.summary["system_hash"] == plant.summary["system_hash"]
     for ended in (prototype, plant):
         read = {
-            path for process, path in ended.opened if " twin.controller " in process and path.parent == deserted.parent
+            path
+            for process, path in ended.opened
+            if " fieldtwin.twin.controller " in process and path.parent == deserted.parent
         }
         assert read == {deserted}
     told = [json.loads((ended.run_dir / "gateway.json").read_text()) for ended in (prototype, plant)]
@@ -121,13 +123,16 @@ def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(dese
 
 def test_prose_2_the_plants_run_never_opens_a_prototype_file(deserted: Path, tmp_path: Path) -> None:
     ended = Ended(tmp_path / "run", str(deserted), "--plant", "--for", "1s")
-    assert ended.files_of("twin.controller") >= {"observatory.yaml", "ctd-reference.yaml"}  # the witness was there
+    assert ended.files_of("fieldtwin.twin.controller") >= {
+        "observatory.yaml",
+        "ctd-reference.yaml",
+    }  # the witness was there
     assert [path for _, path in ended.opened if path.name.endswith(".prototype.yaml")] == []
 
 
 def test_prose_2_what_is_emulated_is_known_to_the_field_side_alone(standby: Ended) -> None:
-    assert "observatory.prototype.yaml" in standby.files_of("twin.field_process")
-    for module in ("twin.controller", "plc"):
+    assert "observatory.prototype.yaml" in standby.files_of("fieldtwin.twin.field_process")
+    for module in ("fieldtwin.twin.controller", "fieldtwin.plc"):
         assert "observatory.prototype.yaml" not in standby.files_of(module), module
 
 
@@ -137,8 +142,8 @@ def test_prose_2_the_emulated_connection_belongs_to_neither_device_nor_driver() 
         for path in (CHECKOUT / folder).rglob("*.py"):
             text = path.read_text(encoding="utf-8")
             for stranger in strangers:
-                assert f"from {stranger}" not in text, path
-                assert f"import {stranger}" not in text, path
+                assert f"from fieldtwin.{stranger}" not in text, path
+                assert f"import fieldtwin.{stranger}" not in text, path
 
 
 def test_DigitalTwinPrototype_values_are_simply_good_and_what_its_run_leaves_says_that_it_was_one(
@@ -204,8 +209,8 @@ def test_prose_3_ACTIVE_samples_at_the_commanded_period_and_OFF_and_STANDBY_take
 CAST = SignalTrack.load(CHECKOUT / "recordings" / "cast.jsonl")
 
 PROGRAM = """
-from gateway.core.image import TagKind
-from plc.program import Program, ScanInfo, var_output
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, ScanInfo, var_output
 
 
 class Sample(Program):
@@ -271,7 +276,7 @@ def test_prose_2_a_plant_needs_no_emulators(deserted: Path, tmp_path: Path) -> N
     bare = tmp_path / "bare"
     bare.mkdir()
     for folder in ("gateway", "plc", "twin", "fieldtwin", "profiles", "recordings"):
-        shutil.copytree(CHECKOUT / folder, bare / folder)  # with what was compiled: times and sizes stay
+        shutil.copytree(CHECKOUT / folder, bare / folder, symlinks=True)  # with what was compiled: times and sizes stay
     without = Ended(tmp_path / "without", str(deserted), "--plant", "--for", "2s", code=bare)
     whole = Ended(tmp_path / "with", str(deserted), "--plant", "--for", "2s")
     assert without.code == whole.code == 1, without.err

@@ -17,43 +17,43 @@ from spec_rig import CHECKOUT, CLOCK, Rig, observatory, rig
 from support import eventually, run
 from wire_rig import Crossed, relay, strange_device
 
-from emulators.distorted_registers import DistortedRegisters
-from emulators.replay.replay import ExchangeReplay
-from emulators.replay.unit import ReplayUnit
 from fieldtwin.cli.compare_command import command as compare_command
 from fieldtwin.cli.shadow_command import print_shadow
+from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
+from fieldtwin.gateway.core.statemachine import decode_period, encode_period
+from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS, Quality, Reason
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.running.shadowing import Shadowing
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.mape.execute import Bounds
+from fieldtwin.twin.mape.messages import SeenMeasurement, SeenStatus
+from fieldtwin.twin.mape.plan import Rule, RulePlanner
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.shadow import DigitalShadow
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.thread import schema_of
+from fieldtwin.twin.thread_end import ThreadEnd
+from fieldtwin.twin.thread_frames import ACK, ASK, REFUSED
+from fieldtwin.twin.thread_process import ReceivingEnd
+from fieldtwin.twin.thread_tcp import WHO, TcpListening
+from fieldtwin.twin.twin import DigitalTwin
 from fieldtwin.whatif.asked import objection
 from fieldtwin.whatif.asking import Asked
 from fieldtwin.whatif.fork import Fork, answer
 from fieldtwin.whatif.last_known import of_period
 from fieldtwin.whatif.plan import Plan
 from fieldtwin.whatif.state import KnownState
-from gateway.connections.listeners import TcpListener
-from gateway.core.endpoint import Endpoint
-from gateway.core.events import Consumer, Producer
-from gateway.core.nursery import Nursery
-from gateway.core.recording import Exchange, RecordingHeader, RecordingReader, RecordingWriter
-from gateway.core.statemachine import decode_period, encode_period
-from gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS, Quality, Reason
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.store.event import Event, Kind
-from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from twin.declared import declared_variables
-from twin.instance import Instance
-from twin.mape.execute import Bounds
-from twin.mape.messages import SeenMeasurement, SeenStatus
-from twin.mape.plan import Rule, RulePlanner
-from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import load_prototype
-from twin.shadow import DigitalShadow
-from twin.system import load_system
-from twin.thread import schema_of
-from twin.thread_end import ThreadEnd
-from twin.thread_frames import ACK, ASK, REFUSED
-from twin.thread_process import ReceivingEnd
-from twin.thread_tcp import WHO, TcpListening
-from twin.twin import DigitalTwin
 
 # -- 1: the driver cannot tell an emulator from the device ----------------------------------------------------------------
 
@@ -135,15 +135,20 @@ def test_prose_1_a_planted_difference_is_seen(tmp_path: Path) -> None:
 
 def test_prose_4_the_shadows_modules_load_nothing_that_could_send() -> None:
     """By construction: what is not imported is not held. The contract of the same name is checked at every commit."""
-    program = "import sys, twin.shadow; print(*sys.modules)"
+    program = "import sys, fieldtwin.twin.shadow; print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", program], cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=30
     ).stdout.split()
     contracts = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     (contract,) = [c for c in contracts if c["name"] == "a shadow holds nothing that can send a command"]
     forbidden = contract["forbidden_modules"]
-    assert {"gateway.connections", "gateway.devices", "twin.thread", "twin.thread_end"} <= set(forbidden)
-    assert "twin.shadow" in loaded
+    assert {
+        "fieldtwin.gateway.connections",
+        "fieldtwin.gateway.devices",
+        "fieldtwin.twin.thread",
+        "fieldtwin.twin.thread_end",
+    } <= set(forbidden)
+    assert "fieldtwin.twin.shadow" in loaded
     assert not [m for m in loaded if any(m == f or m.startswith(f"{f}.") for f in forbidden)]
 
 

@@ -13,28 +13,28 @@ from click.testing import CliRunner
 from spec_rig import CHECKOUT, CLOCK, observatory, rig
 from support import run
 
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.seal import sealed
 from fieldtwin.cli.write_command import command as write_command
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import NotAllowed
+from fieldtwin.gateway.core.image import INPUTS, OUTPUTS
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.values import COMMAND, Quality, Reason
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.runtime.gateway import make_driver
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.plc.runner import Runner
 from fieldtwin.running.shore import Shore
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import NotAllowed
-from gateway.core.image import INPUTS, OUTPUTS
-from gateway.core.nursery import Nursery
-from gateway.core.profile import load_profile
-from gateway.core.values import COMMAND, Quality, Reason
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.runtime.gateway import make_driver
-from gateway.runtime.tags import TagTable
-from plc.runner import Runner
-from twin.declared import declared_variables
-from twin.physical import plc_lost_ms
-from twin.plant_thread import ImageProcess
-from twin.shadow import DigitalShadow
-from twin.system import System
-from twin.thread_process import ReceivingEnd
-from twin.variables import Variable
-from twin.virtual import VirtualPrototype
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.physical import plc_lost_ms
+from fieldtwin.twin.plant_thread import ImageProcess
+from fieldtwin.twin.shadow import DigitalShadow
+from fieldtwin.twin.system import System
+from fieldtwin.twin.thread_process import ReceivingEnd
+from fieldtwin.twin.variables import Variable
+from fieldtwin.twin.virtual import VirtualPrototype
 
 PROFILES = sorted((CHECKOUT / "profiles" / "devices").glob("*.yaml"))
 

@@ -11,17 +11,17 @@ from hypothesis import strategies as st
 from spec_rig import CLOCK, Rig, copy_systems, observatory, rig
 from support import run
 
-from emulators.emulator import EmulatedCommunication, SensorEmulator
-from emulators.link import Link
-from gateway.core.connection import PROTOCOL
-from gateway.core.device import Communication
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import CommandListMismatch
-from gateway.core.events import Consumer
-from gateway.core.values import DATA
-from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.emulators.emulator import EmulatedCommunication, SensorEmulator
+from fieldtwin.emulators.link import Link
+from fieldtwin.gateway.core.connection import PROTOCOL
+from fieldtwin.gateway.core.device import Communication
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import CommandListMismatch
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.values import DATA
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 NAMES = st.frozensets(st.sampled_from([f"command_{letter}" for letter in "abcdef"]))
 

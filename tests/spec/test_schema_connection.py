@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from spec_rig import rig
 from support import run
 
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import PROTOCOL, CANConnection, Connection, RS232Connection, TCPConnection
-from gateway.core.device import wire
-from gateway.core.errors import Bug
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import PROTOCOL, CANConnection, Connection, RS232Connection, TCPConnection
+from fieldtwin.gateway.core.device import wire
+from fieldtwin.gateway.core.errors import Bug
 
 BYTES: list[type[Connection[bytes]]] = [RS232Connection, TCPConnection]
 

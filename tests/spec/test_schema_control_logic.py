@@ -1,4 +1,4 @@
-"""Schema ControlLogic: the object inside the program that the PLC runs (plc.relay.Relay)."""
+"""Schema ControlLogic: the object inside the program that the PLC runs (fieldtwin.plc.relay.Relay)."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spec_rig import observatory
 
-from gateway.core.errors import Bug, Desync
-from gateway.core.events import Consumer, Producer
-from gateway.core.statemachine import encode_period
-from gateway.core.values import COMMAND, MEASUREMENT, RESPONSE
-from plc.relay import LOG_CAPACITY, ControlLogic, DataLog, LogEntry, Relay
-from twin.physical import EmbeddedControlSystem
+from fieldtwin.gateway.core.errors import Bug, Desync
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE
+from fieldtwin.plc.relay import LOG_CAPACITY, ControlLogic, DataLog, LogEntry, Relay
+from fieldtwin.twin.physical import EmbeddedControlSystem
 
 PERIODS = st.integers(-32768, 32767)
 PAYLOADS = st.lists(st.binary(max_size=20), max_size=10)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.values import COMMAND, DATA, MEASUREMENT, RECORDING, RESPONSE, STATUS
+from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, RECORDING, RESPONSE, STATUS
 
 KINDS = (DATA, COMMAND, RESPONSE, MEASUREMENT, STATUS, RECORDING)
 

@@ -10,15 +10,15 @@ from hypothesis import strategies as st
 from spec_rig import CLOCK, observatory, rig
 from support import run
 
-from emulators.emulator import Emulator, SensorEmulator, TransmitterEmulator, UnitEmulator, emulator_kind
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.connection import PROTOCOL, CANConnection, Connection, RS232Connection, TCPConnection
-from gateway.core.device import Device, End, Sensor, Transmitter, wire
-from gateway.core.errors import Bug, UnknownCommand
-from gateway.core.profile import load_profile, resolve
-from gateway.core.values import COMMAND, RESPONSE
-from gateway.core.yaml_file import parse
+from fieldtwin.emulators.emulator import Emulator, SensorEmulator, TransmitterEmulator, UnitEmulator, emulator_kind
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.connection import PROTOCOL, CANConnection, Connection, RS232Connection, TCPConnection
+from fieldtwin.gateway.core.device import Device, End, Sensor, Transmitter, wire
+from fieldtwin.gateway.core.errors import Bug, UnknownCommand
+from fieldtwin.gateway.core.profile import load_profile, resolve
+from fieldtwin.gateway.core.values import COMMAND, RESPONSE
+from fieldtwin.gateway.core.yaml_file import parse
 
 SYSTEM, _ = observatory()
 CTD, MODEM = SYSTEM.devices["ctd"].profile, SYSTEM.devices["modem"].profile

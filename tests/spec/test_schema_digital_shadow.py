@@ -11,16 +11,16 @@ from hypothesis import strategies as st
 from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 
 from fieldtwin.cli.shadow_command import told_of
-from gateway.core.events import Consumer, Producer
-from gateway.core.statemachine import STATE_CODES, delta
-from gateway.core.values import DATA, STATUS, Quality, Reason
-from gateway.store.event import Event, Kind
-from twin.mape.messages import SeenMeasurement, SeenStatus, Verdict
-from twin.mape.monitor import Monitor
-from twin.model import DigitalModel
-from twin.shadow import DigitalShadow
-from twin.status import decode_status, encode_status
-from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.statemachine import STATE_CODES, delta
+from fieldtwin.gateway.core.values import DATA, STATUS, Quality, Reason
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.twin.mape.messages import SeenMeasurement, SeenStatus, Verdict
+from fieldtwin.twin.mape.monitor import Monitor
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.shadow import DigitalShadow
+from fieldtwin.twin.status import decode_status, encode_status
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
 
 PERIODS = st.integers(-32768, 32767)
 

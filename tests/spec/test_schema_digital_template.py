@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from spec_rig import CLOCK, observatory
 
-from gateway.core.errors import FileInvalid
-from twin.declared import declared_variables
-from twin.model import DigitalModel
-from twin.physical import EmbeddedControlSystem
-from twin.prototype import DigitalTwinPrototype
-from twin.system import load_system
-from twin.template import (
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.physical import EmbeddedControlSystem
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.template import (
     DOCUMENTS,
     BillOfMaterials,
     BluePrint,
@@ -25,9 +25,9 @@ from twin.template import (
     Generic,
     TechnicalManual,
 )
-from twin.template_check import examine, put_together
-from twin.template_pack import Extras, collect, pack
-from twin.template_package import FolderPackage
+from fieldtwin.twin.template_check import examine, put_together
+from fieldtwin.twin.template_pack import Extras, collect, pack
+from fieldtwin.twin.template_package import FolderPackage
 
 
 def template(tmp_path: Path) -> DigitalTemplate:

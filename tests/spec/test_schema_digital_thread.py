@@ -13,20 +13,20 @@ from hypothesis import strategies as st
 from spec_rig import CLOCK, observatory
 from support import run
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.errors import Bug
-from gateway.core.statemachine import encode_period
-from gateway.core.values import COMMAND, DATA, RESPONSE, Quality, Reason, TagValue
-from gateway.devices.config import BusConfig
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.store.event import Kind
-from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from twin.knowledge import KnowledgeWriter
-from twin.status import decode_status, encode_status
-from twin.thread import DigitalThread, DTtoPTConnection, Operator, PTtoDTConnection, schema_of
-from twin.thread_end import ThreadEnd
-from twin.thread_modem import ModemCarrier
-from twin.thread_process import DigitalThreadProcess, DTDigitalThreadProcess, PTDigitalThreadProcess
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import COMMAND, DATA, RESPONSE, Quality, Reason, TagValue
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.store.event import Kind
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from fieldtwin.twin.knowledge import KnowledgeWriter
+from fieldtwin.twin.status import decode_status, encode_status
+from fieldtwin.twin.thread import DigitalThread, DTtoPTConnection, Operator, PTtoDTConnection, schema_of
+from fieldtwin.twin.thread_end import ThreadEnd
+from fieldtwin.twin.thread_modem import ModemCarrier
+from fieldtwin.twin.thread_process import DigitalThreadProcess, DTDigitalThreadProcess, PTDigitalThreadProcess
 
 
 def modem() -> ModemCarrier:

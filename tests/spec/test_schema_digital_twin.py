@@ -9,19 +9,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shadow_rig import DECLARED, NOW_MS, Hands, status, value
 
-from gateway.core.events import Consumer, Producer
-from gateway.core.statemachine import decode_period, delta, encode_period
-from gateway.core.values import COMMAND, DATA, Quality, Reason
-from gateway.store.event import Kind
-from twin.mape.execute import Bounds, Execute
-from twin.mape.messages import verdict
-from twin.mape.plan import Plan, Planner, Rule, RulePlanner
-from twin.mape.what_if import Question
-from twin.model import DigitalModel
-from twin.shadow import DigitalShadow
-from twin.thread import Operator
-from twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
-from twin.twin import DigitalTwin
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.statemachine import decode_period, delta, encode_period
+from fieldtwin.gateway.core.values import COMMAND, DATA, Quality, Reason
+from fieldtwin.gateway.store.event import Kind
+from fieldtwin.twin.mape.execute import Bounds, Execute
+from fieldtwin.twin.mape.messages import verdict
+from fieldtwin.twin.mape.plan import Plan, Planner, Rule, RulePlanner
+from fieldtwin.twin.mape.what_if import Question
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.shadow import DigitalShadow
+from fieldtwin.twin.thread import Operator
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.twin.twin import DigitalTwin
 
 PERIODS = st.integers(-32768, 32767)
 RULES = (Rule("outside", "ctd.pressure", 1), Rule("inside", "ctd.pressure", 10), Rule("bad", "", -1))

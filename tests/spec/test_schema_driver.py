@@ -11,18 +11,18 @@ from hypothesis import strategies as st
 from spec_rig import CLOCK, observatory, rig
 from support import run
 
-from emulators.distorted_registers import DistortedRegisters
-from gateway.connections.os_connector import OsConnector
-from gateway.core.connection import PROTOCOL, ByteConnection, RS232Connection, TCPConnection
-from gateway.core.errors import Bug, FileInvalid, UnknownCommand
-from gateway.core.events import Consumer, Producer
-from gateway.core.profile import Box
-from gateway.core.values import COMMAND, DATA, MEASUREMENT, RESPONSE
-from gateway.devices.driver import DeviceDriver
-from gateway.devices.register_device import SensorDriver
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.tags import TagTable
-from twin.physical import make_drivers
+from fieldtwin.emulators.distorted_registers import DistortedRegisters
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.connection import PROTOCOL, ByteConnection, RS232Connection, TCPConnection
+from fieldtwin.gateway.core.errors import Bug, FileInvalid, UnknownCommand
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.profile import Box
+from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT, RESPONSE
+from fieldtwin.gateway.devices.driver import DeviceDriver
+from fieldtwin.gateway.devices.register_device import SensorDriver
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.twin.physical import make_drivers
 
 SYSTEM, _ = observatory()
 

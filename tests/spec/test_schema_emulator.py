@@ -10,16 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spec_rig import observatory
 
-from emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
-from emulators.emulator import Emulator, SensorEmulator
-from emulators.link import EmulatedConnection
-from emulators.replay.replay import ExchangeReplay
-from emulators.replay.unit import ReplayUnit
-from gateway.core.connection import PROTOCOL, Connection, RS232Connection, TCPConnection
-from gateway.core.device import Device, End, Sensor, wire
-from gateway.core.errors import Bug, UnknownCommand
-from gateway.core.recording import Exchange
-from gateway.core.values import COMMAND, RECORDING
+from fieldtwin.emulators.context import Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.emulators.emulator import Emulator, SensorEmulator
+from fieldtwin.emulators.link import EmulatedConnection
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.gateway.core.connection import PROTOCOL, Connection, RS232Connection, TCPConnection
+from fieldtwin.gateway.core.device import Device, End, Sensor, wire
+from fieldtwin.gateway.core.errors import Bug, UnknownCommand
+from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.core.values import COMMAND, RECORDING
 
 CTD = observatory()[0].devices["ctd"].profile
 READ_STATUS = bytes.fromhex("03 0000 0001")
@@ -106,7 +106,7 @@ def test_Emulator_virtualContext_is_a_collection_of_RECORDINGs(words: list[int])
 
 def test_Emulator_virtualContext_of_the_running_ctd_is_its_recorded_cast() -> None:
     """Ruling 3: signals are read at the emulator's clock; they are recordings all the same."""
-    from emulators.signals import SignalTrack
+    from fieldtwin.emulators.signals import SignalTrack
 
     prototype = observatory()[1]
     recording = prototype.devices["ctd"].recording

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import Bug
-from gateway.core.events import Consumer, EventHandler, Producer
-from gateway.core.values import DATA
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.events import Consumer, EventHandler, Producer
+from fieldtwin.gateway.core.values import DATA
 
 ITEMS = st.lists(st.builds(DATA, st.binary(max_size=3)), max_size=12)
 

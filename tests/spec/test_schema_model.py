@@ -11,15 +11,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from spec_rig import CLOCK, observatory
 
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.statemachine import (
+    ACCEPTING,
+    ACTIVE,
+    OFF,
+    STANDBY,
+    STATE,
+    STATES,
+    EventStateMachine,
+    encode_period,
+)
+from fieldtwin.gateway.core.values import COMMAND, Quality, Reason, Scalar
 from fieldtwin.running.states import expected_states
-from gateway.core.errors import Desync
-from gateway.core.statemachine import ACCEPTING, ACTIVE, OFF, STANDBY, STATE, STATES, EventStateMachine, encode_period
-from gateway.core.values import COMMAND, Quality, Reason, Scalar
-from twin.declared import declared_variables
-from twin.model import DigitalModel
-from twin.prototype import DigitalTwinPrototype
-from twin.template import describe_model
-from twin.variables import Variable, Variables
+from fieldtwin.twin.declared import declared_variables
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.template import describe_model
+from fieldtwin.twin.variables import Variable, Variables
 
 PERIODS = st.integers(-32768, 32767)
 

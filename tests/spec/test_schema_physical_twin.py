@@ -7,22 +7,22 @@ from pathlib import Path
 from spec_rig import CLOCK, copy_systems, observatory
 from support import run
 
-from emulators.emulator import EmulatedUnit
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.register_device import SensorDriver
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.gateway import Gateway
-from gateway.store.exchange_log import ExchangeLog
-from plc.relay import ControlLogic, Relay
-from twin.mapping import MappedConnector
-from twin.model import DigitalModel
-from twin.physical import EmbeddedControlSystem, PhysicalTwin, attached
-from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.emulators.emulator import EmulatedUnit
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.register_device import SensorDriver
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.gateway import Gateway
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.plc.relay import ControlLogic, Relay
+from fieldtwin.twin.mapping import MappedConnector
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.physical import EmbeddedControlSystem, PhysicalTwin, attached
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 
 def gateway_of(ecs: EmbeddedControlSystem, run_dir: Path, mapping: dict[Endpoint, Endpoint] | None) -> dict[str, type]:

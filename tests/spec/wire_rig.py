@@ -11,7 +11,7 @@ import struct
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 
 @dataclass

@@ -58,8 +58,8 @@ END_PROGRAM
 """Asks for 60 Hz in line 5, and starts the drive."""
 
 TOO_FAST_PYTHON = """\
-from gateway.core.image import TagKind
-from plc.program import Program, ScanInfo, var_input, var_output
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
 
 
 class Pump(Program):

@@ -16,15 +16,15 @@ from procs import Fieldtwin, no_tracebacks
 from pymodbus.client import AsyncModbusTcpClient
 from support import eventually, run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_rtu
-from emulators.modbus.unit import ModbusUnit
 from fieldtwin.cli.main import main
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import serve_rtu
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock
 
 LINE = "baudrate=115200&frame=8N1"
 

@@ -15,16 +15,16 @@ import pytest
 from procs import fieldtwin, no_tracebacks, wait_for
 from support import run
 
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
-from emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.bridge_cable import BridgeCable
-from gateway.connections.serial_line import SerialConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
 
 LINE = "baudrate=115200&frame=8N1"
 SYSTEM = """
@@ -48,7 +48,7 @@ bridge:
     allow: [{functions: [read, write]}]
 """
 PROGRAM = """
-from plc.program import Program, ScanInfo
+from fieldtwin.plc.program import Program, ScanInfo
 
 
 class Idle(Program):

@@ -12,11 +12,11 @@ import pytest
 from procs import CHECKOUT, Asking, fieldtwin, no_tracebacks, wait_for
 from support import run
 
-from gateway.connections.tcp import TcpConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ModbusExceptionReply
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.wallclock import WallClock
 
 SYSTEMS = CHECKOUT / "profiles" / "systems"
 SECTIONS = """

@@ -21,13 +21,13 @@ import yaml
 from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
 from fieldtwin.cli.main import cli
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.running.field_contact import reachable
 from fieldtwin.running.shadowing import Shadowing
 from fieldtwin.running.twinning import Twinning
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 IMAGE_SHARE = "/opt/fieldtwin/share/"
 SYSTEMS = CHECKOUT / "profiles" / "systems"

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wait_for
 
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.running.control_bench import ControlBench, Where
 from fieldtwin.scenarios.trace import Trace
-from gateway.core.errors import UsageError
-from twin.system import load_system
+from fieldtwin.twin.system import load_system
 
 HERE = CHECKOUT / "examples" / "own-plc"
 MODBUS_H = Path("/usr/include/modbus/modbus.h")

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from procs import fieldtwin, wait_for
 
 from fieldtwin.cli.main import cli
-from gateway.core.errors import FieldtwinError, Unreachable, UsageError
-from gateway.core.yaml_file import parse
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.yaml_file import parse
 
 
 def plc(*args: str) -> str:
@@ -82,13 +82,16 @@ def test_the_observatorys_relay_is_drawn_and_proved(tmp_path: Path) -> None:
 
 def test_a_counterexample_is_a_scenario(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "profiles/systems/observatory.yaml").read_text(encoding="utf-8")
-    (tmp_path / "site.yaml").write_text(text.replace("plc.relay:Relay", "wrong_relay:Wrong"), encoding="utf-8")
+    (tmp_path / "site.yaml").write_text(
+        text.replace("fieldtwin.plc.relay:Relay", "wrong_relay:Wrong"), encoding="utf-8"
+    )
     (tmp_path / "wrong_relay.py").write_text(
-        "from plc.relay_proof import Watched\n\n\nclass Wrong(Watched):\n    def execute(self, scan):\n"
+        "from fieldtwin.plc.relay_proof import Watched\n\n\nclass Wrong(Watched):\n    def execute(self, scan):\n"
         "        super().execute(scan)\n        if self.period_s < 0 and self.commands == 2:\n            self.state = 1\n"
     )
     (tmp_path / "wrong_relay_proof.py").write_text(
-        "from dataclasses import replace\n\nfrom plc.relay_proof import PROOF as RIGHT\nfrom wrong_relay import Wrong\n\n"
+        "from dataclasses import replace\n\nfrom fieldtwin.plc.relay_proof import PROOF as RIGHT\n"
+        "from wrong_relay import Wrong\n\n"
         "PROOF = replace(RIGHT, make=Wrong, key=lambda r: (r.key, min(r.commands, 2)))\n"
     )
     out = tmp_path / "found.scenario.yaml"
@@ -107,18 +110,19 @@ def test_values_and_bad_inputs_of_a_counterexample_are_steps(tmp_path: Path) -> 
     text = (Path(__file__).parents[2] / "profiles/systems/observatory.yaml").read_text(encoding="utf-8")
     inputs = "command: {tag: modem.inbox}\n        sample:  {tag: ctd.sample}"
     assert inputs in text
-    text = text.replace(inputs, "depth: {tag: ctd.pressure}").replace("plc.relay:Relay", "winch:Winch")
+    text = text.replace(inputs, "depth: {tag: ctd.pressure}").replace("fieldtwin.plc.relay:Relay", "winch:Winch")
     text = text.replace("outputs: {period_s: ctd.sample_period_s, response: modem.outbox}", "outputs: {}")
     (tmp_path / "site.yaml").write_text(text, encoding="utf-8")
     (tmp_path / "winch.py").write_text(
-        "from gateway.core.image import TagKind\nfrom plc.program import var_input\n"
-        "from plc.states import StateMachine, StateTable, Transition\n\n\nclass Winch(StateMachine):\n"
+        "from fieldtwin.gateway.core.image import TagKind\nfrom fieldtwin.plc.program import var_input\n"
+        "from fieldtwin.plc.states import StateMachine, StateTable, Transition\n\n\nclass Winch(StateMachine):\n"
         "    depth = var_input(TagKind.REAL)\n    table = StateTable(\n"
         "        Transition('UP', 'DOWN', when='depth is not None and depth < 5'),\n"
         "        Transition('DOWN', 'LOST', when='depth is None', after_ms=30),\n    )\n"
     )
     (tmp_path / "winch_proof.py").write_text(
-        "from plc.prove import Proof, machine_key\nfrom winch import Winch\n\nPROOF = Proof(Winch, {'depth': [9.0, 2.5, None]},\n"
+        "from fieldtwin.plc.prove import Proof, machine_key\nfrom winch import Winch\n\n"
+        "PROOF = Proof(Winch, {'depth': [9.0, 2.5, None]},\n"
         "    {'never \"lost\"': lambda w: w.state_name != 'LOST'}, machine_key, requirement={'never \"lost\"': 'REQ-9'})\n"
     )
     out = tmp_path / "found.scenario.yaml"

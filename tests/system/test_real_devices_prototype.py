@@ -27,7 +27,7 @@ plc:
     idle: {source: "python: idle:Idle", inputs: {}, outputs: {}}
 """
 PROGRAM = """
-from plc.program import Program, ScanInfo
+from fieldtwin.plc.program import Program, ScanInfo
 
 
 class Idle(Program):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -17,7 +18,7 @@ from typing import Any
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("gateway", "plc", "emulators", "twin", "fieldtwin", "profiles", "recordings")
+TREES = ("gateway", "plc", "emulators", "twin", "fieldtwin", "profiles", "recordings")
 BUGS = tomllib.loads((ROOT / "tests" / "mutations" / "seeded_bugs.toml").read_text())["mutation"]
 CAUGHT_AS = {
     "a late reply is published as good": "ctd.",
@@ -85,18 +86,13 @@ def run(program: Path, files: Path, faults: str = "faults.yaml") -> tuple[int, d
 
 
 def copy_with(bug: dict[str, str], program: Path) -> None:
-    """A copy of the program in which `bug` is planted. All that has not changed is a link, so that it costs nothing."""
-    broken = Path(bug["file"])
-    (program / broken.parent).mkdir(parents=True)
-    for folder in (program, *(program / parent for parent in broken.parents if parent.parts)):
-        original = ROOT / folder.relative_to(program)
-        names = PACKAGES if folder == program else [one.name for one in original.iterdir() if one.name != "__pycache__"]
-        for name in names:
-            if not (folder / name).exists() and folder / name != program / broken:
-                (folder / name).symlink_to(original / name)
-    text = (ROOT / broken).read_text()
+    """A copy of the program in which `bug` is planted."""
+    for tree in TREES:
+        shutil.copytree(ROOT / tree, program / tree, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    broken = program / bug["file"]
+    text = broken.read_text()
     assert text.count(bug["before"]) == 1
-    (program / broken).write_text(text.replace(bug["before"], bug["after"]))
+    broken.write_text(text.replace(bug["before"], bug["after"]))
 
 
 def test_the_run_with_all_faults_is_ok_without_a_bug(files: Path) -> None:

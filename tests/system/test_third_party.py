@@ -17,7 +17,7 @@ from canopen.sdo.exceptions import SdoError
 from procs import Fieldtwin, fieldtwin, free_port, wait_for
 from test_canopen_nodes import PROGRAM, PROTOTYPE, SYSTEM
 
-from gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.connections.soft_bus import SoftBus
 
 pytestmark = pytest.mark.long
 

@@ -71,7 +71,7 @@ def test_what_makes_no_sense_is_refused(words: list[str], told: str) -> None:
     from click.testing import CliRunner
 
     from fieldtwin.cli.run_command import command
-    from gateway.core.errors import UsageError
+    from fieldtwin.gateway.core.errors import UsageError
 
     result = CliRunner().invoke(command, ["observatory", *words])
     assert isinstance(result.exception, UsageError)

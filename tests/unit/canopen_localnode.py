@@ -16,8 +16,8 @@ import canopen
 from canopen_rows import Row, key_of, parse_frame
 from canopen_slave_rig import NODE, RICH
 
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
 
 FILE = Path(__file__).parents[1] / "vectors" / "canopen_localnode.toml"
 DUMMIES = "".join(f"Dummy{n:04}={n // 5 % 2}\n" for n in range(1, 8))

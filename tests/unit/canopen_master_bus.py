@@ -9,10 +9,10 @@ from typing import Any, TypeVar
 
 from msgspec.structs import replace
 
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CANConnection, CanConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
 T = TypeVar("T")
 

@@ -11,10 +11,10 @@ from contextlib import asynccontextmanager
 
 from canopen_master_bus import MemoryEnd, bus
 
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
 
 Objects = dict[tuple[int, int], bytes]
 

@@ -9,14 +9,14 @@ from typing import Any
 
 from canopen_slave_rig import NODE, RICH
 
-from emulators.canopen.aborts import Abort
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.lss import LssStore
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.time_of_day import TimeOfDay
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen.aborts import Abort
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.lss import LssStore
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.time_of_day import TimeOfDay
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 FILE = Path(__file__).parents[1] / "vectors" / "canopen_slave.toml"
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 ROOT = Path(__file__).parents[2]
 INCLINOMETER = ROOT / "profiles" / "devices" / "inclinometer-cia410.eds"

@@ -8,14 +8,14 @@ from contextlib import asynccontextmanager
 
 from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_runner import BusRunner
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.unit import ModbusUnit, UnitLimits
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 __all__ = ["CAN_URL", "URL", "Mute", "Wired", "bank", "can_bus", "loop", "run_virtually", "unit"]
 

@@ -6,12 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from emulators.virtual.chance import seeded
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.seal import sealed
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.virtual import VirtualPrototype
+from fieldtwin.emulators.virtual.chance import seeded
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.virtual import VirtualPrototype
 
 THERMOMETER = """
 device: test/thermometer
@@ -37,8 +37,8 @@ VAR_OUTPUT mode : INT; END_VAR
 END_PROGRAM
 """
 PYTHON = """
-from gateway.core.image import TagKind
-from plc.program import Program, var_input, var_output
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, var_input, var_output
 
 class Fan(Program):
     temperature = var_input(TagKind.REAL)

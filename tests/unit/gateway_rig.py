@@ -7,28 +7,28 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
-from emulators.modbus.bank import MapBank
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.connection import (
+from fieldtwin.emulators.modbus.bank import MapBank
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.connection import (
     ByteConnection,
     CanConnection,
     Direction,
     RS232Connection,
     TCPConnection,
 )
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable
-from gateway.core.nursery import Nursery
-from gateway.core.profile import DeviceProfile, resolve
-from gateway.core.yaml_file import parse
-from gateway.devices.config import BusConfig
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.yaml_file import parse
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
 
 LINE = Endpoint.parse("rtu:/dev/ttyMEM?baudrate=115200&frame=8E1")
 LAN = Endpoint.parse("tcp://mem:502")

@@ -18,31 +18,31 @@ from typing import Any
 
 import yaml
 
-from emulators.canopen.dictionary import load_eds
-from emulators.faults.schema import load_faults
-from emulators.replay.can_log import CanLog
 from fieldtwin.conformance.waivers import load_waivers
 from fieldtwin.decoding.trace_file import read_events
+from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.faults.schema import load_faults
+from fieldtwin.emulators.replay.can_log import CanLog
 from fieldtwin.formats.can_files import read_can_file
 from fieldtwin.formats.candump import LeftOut, read_log
 from fieldtwin.formats.csv_table import import_csv
 from fieldtwin.formats.packet_file import PacketFile
 from fieldtwin.formats.pcap import read_capture
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.plc.st.program import load_file
 from fieldtwin.recording.importing import kind_of
 from fieldtwin.running.twin_rules import load_planner
 from fieldtwin.scenarios.form import load_scenario
+from fieldtwin.twin.data_files import network_file
+from fieldtwin.twin.network import load_network
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.template_package import open_package
 from fieldtwin.whatif.plan import load_plans
 from fieldtwin.whatif.state import read_state
-from gateway.core.errors import FieldtwinError
-from gateway.core.profile import load_profile
-from gateway.core.recording import RecordingReader
-from gateway.protocols.canopen.dictionary import load_dictionary
-from plc.st.program import load_file
-from twin.data_files import network_file
-from twin.network import load_network
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.template_package import open_package
 
 MEMORY_BYTES = 192 * 1024 * 1024
 """What reading may take on top of the program itself."""

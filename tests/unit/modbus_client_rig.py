@@ -7,15 +7,15 @@ from collections.abc import Awaitable, Callable
 
 from support import run
 
-from gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import (
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import (
     ConnectionLost,
 )
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.crc import with_crc
-from gateway.protocols.modbus.framings import Framing
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()
 LINE = SerialSettings(19200, "8E1")

@@ -11,9 +11,9 @@ import selectors
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
 
-from gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.core.connection import ByteConnection, RS232Connection, TCPConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
 
 T = TypeVar("T")
 

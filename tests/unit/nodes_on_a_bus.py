@@ -9,15 +9,15 @@ from typing import TypeVar
 from canopen_localnode import LocalNodeOnBus
 from canopen_slave_rig import NODE, RICH
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import serve_node
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
 
 T = TypeVar("T")
 LONG = RICH.replace("DefaultValue=hello", "DefaultValue=twenty bytes of text")

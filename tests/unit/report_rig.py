@@ -6,9 +6,9 @@ import struct
 from functools import cache
 from typing import Any
 
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.protocols.modbus.crc import with_crc
-from twin.system import System, load_system
+from fieldtwin.twin.system import System, load_system
 
 MS = 1_000_000
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from plc.program import ScanInfo
-from plc.st.compile import compile_text
-from plc.st.program import StProgram, program_class
+from fieldtwin.plc.program import ScanInfo
+from fieldtwin.plc.st.compile import compile_text
+from fieldtwin.plc.st.program import StProgram, program_class
 
 
 def program(text: str, name: str = "") -> StProgram:

@@ -11,17 +11,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fieldtwin.running.template_here import Stranger
-from twin.system import load_system
-from twin.template import Manifest
-from twin.template_pack import Extras, collect, pack
-from twin.template_package import open_package, unpack
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.template import Manifest
+from fieldtwin.twin.template_pack import Extras, collect, pack
+from fieldtwin.twin.template_package import open_package, unpack
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHIPPED = CHECKOUT / "profiles"
 BLINKER = """
 import helper
-from plc.program import Output, Program
-from gateway.core.image import TagKind
+from fieldtwin.plc.program import Output, Program
+from fieldtwin.gateway.core.image import TagKind
 
 class Blinker(Program):
     def execute(self, scan):

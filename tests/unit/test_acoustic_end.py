@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.acoustic_end import ROOM, AcousticEnd, AcousticServer
-from emulators.wires.acoustic import AcousticMedium, Water
-from gateway.core.errors import Unreachable
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.acoustic_end import ROOM, AcousticEnd, AcousticServer
+from fieldtwin.emulators.wires.acoustic import AcousticMedium, Water
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock
 
 PLACES = {"a": (0.0, 0.0), "b": (15.0, 0.0)}
 WATER = Water(range_m=100.0, bytes_per_s=10_000.0)

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.models.acoustic_link import AcousticLink
-from emulators.wires.acoustic import HEARD, QUEUE, AcousticMedium, Water
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.wires.acoustic import HEARD, QUEUE, AcousticMedium, Water
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
 
 ROW = {"west": (0.0, 0.0), "middle": (3000.0, 0.0), "east": (6000.0, 0.0)}
 """East and west do not hear each other; the middle hears both, 2 s after they speak."""

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from emulators.wires.acoustic import AcousticMedium, Water
-from gateway.core.image import Message
-from gateway.core.statemachine import encode_period
-from gateway.core.values import Quality, Reason, TagValue
-from plc.binding import load_program
-from plc.program import Program, ScanInfo
+from fieldtwin.emulators.wires.acoustic import AcousticMedium, Water
+from fieldtwin.gateway.core.image import Message
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.plc.binding import load_program
+from fieldtwin.plc.program import Program, ScanInfo
 
 SYSTEMS = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 NAMES = ("west", "middle", "east")

@@ -10,20 +10,20 @@ import pytest
 from bridge_rig import ANY_PORT, CLOCK, LINE, WRITERS, a_unit, refused, rig, take
 from support import eventually, run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
-from emulators.modbus.unit import ModbusUnit
-from gateway.connections.os_connector import OsConnector
-from gateway.core.errors import ReplyTimeout
-from gateway.core.nursery import Nursery
-from gateway.devices.config import BusConfig
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.bridge import Bridge, BridgeConfig, Route
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.errors import ReplyTimeout
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig, Route
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
 
 
 def test_the_cache_answers_within_its_age_and_forgets_on_a_write(tmp_path: Path) -> None:

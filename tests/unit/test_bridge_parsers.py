@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import ModbusExceptionReply, UsageError
-from gateway.protocols.modbus.crc import crc16, with_crc
-from gateway.protocols.modbus.framings import make_framer
-from gateway.protocols.modbus.server import READ_FUNCTIONS, Access, examine
-from gateway.protocols.modbus.server_forward import Forwarded
-from gateway.protocols.modbus.server_line import LineRequest, RtuRequests
-from gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
-from gateway.protocols.modbus.transaction import Transaction
-from gateway.runtime.bridge_cache import ReplyCache
-from gateway.runtime.bridge_policy import ALLOWED, AllowRule, Policy, network, within
+from fieldtwin.gateway.core.errors import ModbusExceptionReply, UsageError
+from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.framings import make_framer
+from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, Access, examine
+from fieldtwin.gateway.protocols.modbus.server_forward import Forwarded
+from fieldtwin.gateway.protocols.modbus.server_line import LineRequest, RtuRequests
+from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests, TcpRequest
+from fieldtwin.gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.gateway.runtime.bridge_cache import ReplyCache
+from fieldtwin.gateway.runtime.bridge_policy import ALLOWED, AllowRule, Policy, network, within
 
 PDUS = st.binary(min_size=1, max_size=253)
 

@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from emulators.modbus.bank import MapBank, Span
-from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError
-from gateway.devices.config import DeviceConfig
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.protocols.modbus.server import examine
-from gateway.protocols.modbus.server_forward import ForwardedReply
-from gateway.runtime.bridge_queue import MAX_WAIT_NS, Guest, GuestQueue
-from gateway.runtime.modbus_bus import Job, ModbusBus
-from gateway.runtime.tags import TagTable
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.protocols.modbus.server import examine
+from fieldtwin.gateway.protocols.modbus.server_forward import ForwardedReply
+from fieldtwin.gateway.runtime.bridge_queue import MAX_WAIT_NS, Guest, GuestQueue
+from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
 
 READ = bytes.fromhex("03 0064 0001")
 Result = ForwardedReply | FieldtwinError

@@ -11,10 +11,10 @@ import pytest
 from bridge_rig import ANY_PORT, WRITERS, read_adu, refused, rig, take
 from support import eventually, run
 
-from gateway.connections.tcp import TcpConnection
-from gateway.core.errors import ConnectionLost
-from gateway.protocols.modbus.refusals import GatewayRefusal
-from gateway.runtime.bridge import BridgeConfig, Route
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.protocols.modbus.refusals import GatewayRefusal
+from fieldtwin.gateway.runtime.bridge import BridgeConfig, Route
 
 
 def test_a_client_reads_units_of_the_line(tmp_path: Path) -> None:

@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 from modbus_virtual import run_virtually
 from virtual_bus import LINE, VirtualBus, run_bus
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import FieldtwinError, Unreachable, UsageError
-from gateway.core.values import Reason
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.protocols.modbus.client import UnitPace
-from gateway.runtime.modbus_bus import Job
-from gateway.runtime.poll_schedule import PollSchedule, Rate, spread
-from gateway.runtime.tags import TagTable
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.protocols.modbus.client import UnitPace
+from fieldtwin.gateway.runtime.modbus_bus import Job
+from fieldtwin.gateway.runtime.poll_schedule import PollSchedule, Rate, spread
+from fieldtwin.gateway.runtime.tags import TagTable
 
 ONE = profile('tags:\n  level: {at: "holding:0"}\n')
 IDENTIFIED = profile('tags:\n  level: {at: "holding:0"}\n  name: {at: "holding:50", poll: identity}\n')

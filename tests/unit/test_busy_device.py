@@ -11,14 +11,14 @@ import pytest
 from gateway_rig import LAN, profile
 from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
-from gateway.core.nursery import Nursery
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.register_device import SensorDriver
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.register_device import SensorDriver
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
 
 GROUPS = ("a", "b", "c", "d")
 MAP = "tags:\n" + "".join(f'  {g}: {{at: "holding:{10 * n}", poll: {g}}}\n' for n, g in enumerate(GROUPS))

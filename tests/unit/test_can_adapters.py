@@ -7,20 +7,20 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.slcan_port import SlcanPort
 from fieldtwin.commissioning.scan_canopen import CanScanner, CanScanOptions
-from gateway.connections.can_adapter import AdapterConnection
-from gateway.connections.os_connector import OsConnector
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, UsageError
-from gateway.core.nursery import Nursery
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
+from fieldtwin.gateway.connections.can_adapter import AdapterConnection
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock
 
 FRAMES = (
     CanFrame(0x705, b"\x05"),

@@ -11,12 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.wires.can_bus import CanBus
-from emulators.wires.can_events import Delivery, Notice
-from emulators.wires.can_faults import Disturbance, spoil
-from emulators.wires.can_timing import bits_on_wire, bits_to_end, error_flag_bits, plain_bits, stuff, wire_bits
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.wires.can_bus import CanBus
+from fieldtwin.emulators.wires.can_events import Delivery, Notice
+from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
+from fieldtwin.emulators.wires.can_timing import (
+    bits_on_wire,
+    bits_to_end,
+    error_flag_bits,
+    plain_bits,
+    stuff,
+    wire_bits,
+)
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
 
 US = 1000
 BIT_NS = 8 * US

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.wires.can_bus import CanBus
-from emulators.wires.can_events import Delivery
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import Bug, EndpointBusy, UsageError
+from fieldtwin.emulators.wires.can_bus import CanBus
+from fieldtwin.emulators.wires.can_events import Delivery
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import Bug, EndpointBusy, UsageError
 
 US = 1000
 END = 10**12

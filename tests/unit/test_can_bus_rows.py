@@ -14,21 +14,21 @@ from canopen_rows import parse_frame
 from canopen_slave_rig import RICH
 from modbus_virtual import VirtualLoop, run_virtually
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_runner import AttachedConnection, BusRunner
-from emulators.endpoints.faulty_can import FaultyCan
-from emulators.faults.engine import WireFaults
-from emulators.faults.frames import Framing
-from emulators.wires.can_bus import CanBus
-from emulators.wires.can_events import Delivery
-from emulators.wires.can_faults import Disturbance, spoil
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame, pack_record, unpack_record
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Desync, UsageError
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_runner import AttachedConnection, BusRunner
+from fieldtwin.emulators.endpoints.faulty_can import FaultyCan
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.wires.can_bus import CanBus
+from fieldtwin.emulators.wires.can_events import Delivery
+from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame, pack_record, unpack_record
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Desync, UsageError
 
 BIT_NS = 8000
 END = 10**11

@@ -6,11 +6,11 @@ import asyncio
 
 import pytest
 
-from emulators.endpoints.bus_runner import BusRunner
-from emulators.virtual.loop import VirtualLoop
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
 
 ENDPOINT = Endpoint.parse("can:fieldtwin/127.0.0.1:1")
 FRAMES = 6

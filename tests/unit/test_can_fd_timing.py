@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.wires.can_bus import CanBus
-from emulators.wires.can_fd_timing import data_phase, fd_bits
-from emulators.wires.can_timing import bits_to_end, wire_bits
-from gateway.core.canframe import FD_LENGTHS, FD_RECORD_SIZE, CanFrame, pack_record, unpack_record
-from gateway.core.errors import Desync, UsageError
+from fieldtwin.emulators.wires.can_bus import CanBus
+from fieldtwin.emulators.wires.can_fd_timing import data_phase, fd_bits
+from fieldtwin.emulators.wires.can_timing import bits_to_end, wire_bits
+from fieldtwin.gateway.core.canframe import FD_LENGTHS, FD_RECORD_SIZE, CanFrame, pack_record, unpack_record
+from fieldtwin.gateway.core.errors import Desync, UsageError
 
 FRAMES = st.builds(
     lambda can_id, length, extended, brs, esi, random: CanFrame(

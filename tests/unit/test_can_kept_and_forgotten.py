@@ -13,32 +13,32 @@ from typing import Any
 import pytest
 from canopen_slave_rig import NODE, RICH, U16, Rig, pdo, var
 
-from emulators.canopen.behaviour import DeviceModel, Outcome, Situation
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_runner import BusRunner
-from emulators.endpoints.faulty_can import FaultyCan
-from emulators.faults.engine import WireFaults
-from emulators.faults.frames import Framing
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.wires.can_bus import CanBus
-from emulators.wires.can_faults import spoil
-from gateway.core.can_error import CanErrorState
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.core.profile import load_profile
-from gateway.core.values import Reason, TagValue
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import DeviceConfig
-from gateway.protocols.canopen.configure import PdoConfig
-from gateway.protocols.canopen.heartbeat import HeartbeatConsumer
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtState
-from gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.emulators.canopen.behaviour import DeviceModel, Outcome, Situation
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.endpoints.faulty_can import FaultyCan
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.frames import Framing
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.wires.can_bus import CanBus
+from fieldtwin.emulators.wires.can_faults import spoil
+from fieldtwin.gateway.core.can_error import CanErrorState
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.values import Reason, TagValue
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
+from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
 
 BUS_OFF = CanErrorState.BUS_OFF
 WHERE = Endpoint.parse("can:fieldtwin/127.0.0.1:1")
@@ -298,7 +298,7 @@ def test_what_a_node_raises_by_its_timer_ends_it() -> None:
 
 
 class Sink:
-    """`gateway.devices.driver.TagSink`."""
+    """`fieldtwin.gateway.devices.driver.TagSink`."""
 
     def __init__(self) -> None:
         self.values: dict[str, Any] = {}

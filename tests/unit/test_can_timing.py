@@ -7,8 +7,8 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.wires.can_timing import arbitration_key, bits_on_wire, bits_to_end, crc15, plain_bits, stuff
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.wires.can_timing import arbitration_key, bits_on_wire, bits_to_end, crc15, plain_bits, stuff
+from fieldtwin.gateway.core.canframe import CanFrame
 
 
 @st.composite

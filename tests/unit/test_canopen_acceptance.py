@@ -6,11 +6,11 @@ from canopen_slave_rig import NODE, RICH
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CANConnection, CanConnection
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 EDS = parse_eds(RICH)
 

@@ -17,22 +17,22 @@ from canopen_peer_node import PeerBus, PeerNode, closing
 from modbus_virtual import VirtualLoop, run_virtually
 from test_lss_master import Slave
 
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
-from gateway.core.nursery import Nursery
-from gateway.core.profile import load_profile
-from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat
-from gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
-from gateway.protocols.canopen.concise_dcf import Setting
-from gateway.protocols.canopen.configure import PdoConfig
-from gateway.protocols.canopen.lss import LssAddress
-from gateway.protocols.canopen.pdo import PdoMapping
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.tags import TagTable
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat
+from fieldtwin.gateway.protocols.canopen.boot import Configuration, ExpectedIdentity
+from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting
+from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.tags import TagTable
 
 PROFILE = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "inclinometer-cia410.yaml")
 NODE = 5

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from test_concise_dcf import TPDO1, var
 
-from gateway.core.errors import FileInvalid
-from gateway.devices.canopen_config import CanopenBusConfig, RpdoConfig
-from gateway.protocols.canopen.boot import ExpectedIdentity
-from gateway.protocols.canopen.lss import LssAddress
-from twin.system import load_system
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, RpdoConfig
+from fieldtwin.gateway.protocols.canopen.boot import ExpectedIdentity
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.twin.system import load_system
 
 SYSTEM = """\
 fieldtwin: 1
@@ -23,7 +23,7 @@ devices:
   incl: {profile: inclinometer-cia410, bus: can0, node: 5, NODE}
   ctd: {profile: ctd-reference, bus: lan, unit: 1, CTD}
 plc:
-  programs: {p: {source: "python: plc.relay:Relay"}}
+  programs: {p: {source: "python: fieldtwin.plc.relay:Relay"}}
 """
 DCF = "[DeviceInfo]\nVendorName=x\n\n" + TPDO1 + var("2001", 6, "rw", "0", "0x1234")
 

@@ -8,12 +8,12 @@ import pytest
 from canopen_master_bus import LoopClock, MemoryEnd, bus, frame, run_virtual, running
 from support import eventually
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted, UsageError
-from gateway.protocols.canopen.emcy import parse_emcy
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
-from gateway.protocols.canopen.sdo_channel import NodeRestarted
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted, UsageError
+from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from fieldtwin.gateway.protocols.canopen.sdo_channel import NodeRestarted
 
 
 class Bench:

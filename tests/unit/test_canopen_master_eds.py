@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.protocols.canopen.concise_dcf import settings_of
-from gateway.protocols.canopen.datatypes import DataType
-from gateway.protocols.canopen.dictionary import DictionaryEntry, load_dictionary, parse_dictionary
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.protocols.canopen.concise_dcf import settings_of
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, load_dictionary, parse_dictionary
 
 EDS = """\
 [FileInfo]

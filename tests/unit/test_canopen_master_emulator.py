@@ -16,26 +16,26 @@ from canopen_slave_rig import RICH
 from modbus_virtual import VirtualLoop, run_virtually
 from test_concise_dcf import TPDO1, record, var
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_runner import BusRunner
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import SdoAborted
-from gateway.protocols.canopen.boot import (
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import SdoAborted
+from fieldtwin.gateway.protocols.canopen.boot import (
     Configuration,
     ExpectedIdentity,
     download_configuration,
     identity_differences,
 )
-from gateway.protocols.canopen.cob_id import LSS_REPLY
-from gateway.protocols.canopen.concise_dcf import Setting, decode_concise, encode_concise, settings_of
-from gateway.protocols.canopen.configure import read_tpdos
-from gateway.protocols.canopen.dictionary import parse_dictionary
-from gateway.protocols.canopen.lss_master import LssMaster
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NodeEvent
-from gateway.protocols.canopen.scan import scan_nodes
+from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
+from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting, decode_concise, encode_concise, settings_of
+from fieldtwin.gateway.protocols.canopen.configure import read_tpdos
+from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
+from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NodeEvent
+from fieldtwin.gateway.protocols.canopen.scan import scan_nodes
 
 HERE = Endpoint.parse("can:fieldtwin/127.0.0.1:1")
 DOMAIN_EDS = "[DeviceInfo]\nVendorName=x\n" + var("1000", 7, "ro", "0") + var("2000", 0xF, "rw")

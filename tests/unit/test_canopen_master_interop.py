@@ -14,32 +14,32 @@ import pytest
 from canopen_master_bus import running
 from support import eventually, run
 
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CANConnection, CanConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import SdoAborted, UsageError, VerifyFailed
-from gateway.protocols.canopen.boot import (
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import SdoAborted, UsageError, VerifyFailed
+from fieldtwin.gateway.protocols.canopen.boot import (
     Configuration,
     ExpectedIdentity,
     download_configuration,
     holds_configuration,
     identity_differences,
 )
-from gateway.protocols.canopen.concise_dcf import Setting
-from gateway.protocols.canopen.configure import (
+from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting
+from fieldtwin.gateway.protocols.canopen.configure import (
     Identity,
     configure_tpdo,
     read_identity,
     read_tpdo,
     set_heartbeat_producer,
 )
-from gateway.protocols.canopen.datatypes import DataType, decode
-from gateway.protocols.canopen.dictionary import parse_dictionary
-from gateway.protocols.canopen.emcy import parse_emcy
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
-from gateway.protocols.canopen.pdo import PdoMapping
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType, decode
+from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
+from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent
+from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.wallclock import WallClock
 
 NODE = 5
 

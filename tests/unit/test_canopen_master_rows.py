@@ -15,23 +15,23 @@ import pytest
 from canopen_master_bus import bus, frame
 from modbus_virtual import VirtualLoop, run_virtually
 
-from gateway.core import errors
-from gateway.core.canframe import CanFrame
-from gateway.core.profile import load_profile
-from gateway.core.values import Reason, TagValue
-from gateway.devices.canopen_config import CanopenNodeConfig
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import DeviceConfig
-from gateway.protocols.canopen.cob_id import LSS_REPLY
-from gateway.protocols.canopen.configure import PdoConfig
-from gateway.protocols.canopen.emcy import parse_emcy
-from gateway.protocols.canopen.emcy_log import EmcyLog
-from gateway.protocols.canopen.lss import LssAddress, LssRefused
-from gateway.protocols.canopen.lss_master import LssMaster
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
-from gateway.protocols.canopen.pdo import PdoMapping
-from gateway.protocols.canopen.sync import SyncProducer, TimeProducer
+from fieldtwin.gateway.core import errors
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.values import Reason, TagValue
+from fieldtwin.gateway.devices.canopen_config import CanopenNodeConfig
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.protocols.canopen.cob_id import LSS_REPLY
+from fieldtwin.gateway.protocols.canopen.configure import PdoConfig
+from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
+from fieldtwin.gateway.protocols.canopen.emcy_log import EmcyLog
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress, LssRefused
+from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NodeEvent
+from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.protocols.canopen.sync import SyncProducer, TimeProducer
 
 ROOT = Path(__file__).parents[2]
 ROWS = tomllib.loads((ROOT / "tests" / "vectors" / "canopen_master.toml").read_text())["row"]

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import Desync, UsageError
-from gateway.core.values import Scalar
-from gateway.protocols.canopen.datatypes import DataType, LengthMismatch, decode, encode, is_signed, size_of
-from gateway.protocols.canopen.emcy import parse_emcy
-from gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch, PdoMapping
+from fieldtwin.gateway.core.errors import Desync, UsageError
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType, LengthMismatch, decode, encode, is_signed, size_of
+from fieldtwin.gateway.protocols.canopen.emcy import parse_emcy
+from fieldtwin.gateway.protocols.canopen.pdo import PdoEntry, PdoLengthMismatch, PdoMapping
 
 
 @pytest.mark.parametrize(

@@ -14,29 +14,29 @@ import canopen
 import pytest
 from support import eventually, run
 
-from emulators.canopen.dictionary import load_eds
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.journal import HeldJournal
-from emulators.models.emulated_node import emulated_node
-from emulators.signals import SignalPlayer, SignalTrack
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import RecordingReader
-from gateway.core.values import Quality
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
-from gateway.protocols.canopen.dictionary import load_dictionary
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
+from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 DEVICES = ROOT / "profiles" / "devices"

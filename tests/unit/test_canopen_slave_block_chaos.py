@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from emulators.canopen.node import NodeContext
+from fieldtwin.emulators.canopen.node import NodeContext
 
 BLOB, NAME = 0x2009, 0x1008
 BLOCK = 5

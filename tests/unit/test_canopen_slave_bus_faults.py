@@ -8,15 +8,15 @@ import contextlib
 from canopen_slave_rig import NODE, RICH
 from modbus_virtual import VirtualLoop, run_virtually
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_runner import BusRunner
-from emulators.wires.can_faults import Disturbance, spoil
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError
 
 
 async def spoiled(times: int) -> tuple[list[str], CanopenNode]:

@@ -10,11 +10,11 @@ from canopen_slave_rig import INCLINOMETER, ROOT, U8, U32, record, var
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.canopen import codec
-from emulators.canopen.dictionary import load_eds, parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.node_data import NodeData
-from gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.dictionary import load_eds, parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.node_data import NodeData
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 SHARED = ROOT.parent / "shared" / "data" / "eds"
 """Real data sheets beside the checkout; tests that want them skip without."""

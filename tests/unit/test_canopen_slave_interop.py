@@ -13,14 +13,14 @@ import pytest
 from canopen_slave_rig import INCLINOMETER
 from support import eventually, run
 
-from emulators.canopen.dictionary import load_eds
-from emulators.canopen.node import CanopenNode, NmtState, NodeContext
-from emulators.canopen.serve import serve_node
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CANConnection, CanConnection, closed_here
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NmtState, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CANConnection, CanConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
+from fieldtwin.gateway.wallclock import WallClock
 
 
 class VirtualEnd(CanConnection):

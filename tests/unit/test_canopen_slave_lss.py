@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_virtual import VirtualLoop, run_virtually
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.lss import FROM_MASTER, FROM_SLAVE, UNCONFIGURED
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_runner import AttachedConnection, BusRunner
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.lss import FROM_MASTER, FROM_SLAVE, UNCONFIGURED
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_runner import AttachedConnection, BusRunner
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError
 
 IDENTIFIED = "7E4#4F00000000000000"
 DICTIONARY = parse_eds(RICH)

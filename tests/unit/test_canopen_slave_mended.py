@@ -13,10 +13,10 @@ import pytest
 from canopen_slave_rig import Rig, record, var
 from support import eventually, run
 
-from emulators.canopen.dictionary import load_eds, parse_eds
-from emulators.canopen.eds_text import MAX_LINES
-from emulators.canopen.node import CanopenNode
-from gateway.core.errors import FileInvalid
+from fieldtwin.emulators.canopen.dictionary import load_eds, parse_eds
+from fieldtwin.emulators.canopen.eds_text import MAX_LINES
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.gateway.core.errors import FileInvalid
 
 CHECKOUT = Path(__file__).parents[2]
 LEAST = var("1000", 7, "ro", "0x0")

@@ -9,12 +9,12 @@ from canopen_slave_rig import INCLINOMETER, NODE, RICH, U32, Rig, mux, var
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.canopen.dictionary import load_eds
-from emulators.canopen.node import CanopenNode, NmtState, NodeContext
-from emulators.canopen.service import SentPdo
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NmtState, NodeContext
+from fieldtwin.emulators.canopen.service import SentPdo
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import UsageError
 
 START, STOP, PRE, RESET_NODE, RESET_COMM = 1, 2, 128, 129, 130
 

@@ -14,15 +14,15 @@ from canopen_localnode import DUMMIES
 from canopen_slave_rig import NODE, RICH
 from support import run
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.lss import UNCONFIGURED
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.canopen.service import NmtState
-from emulators.endpoints.bus_server import SoftBusServer
-from gateway.connections.soft_bus import SoftBus
-from gateway.core.endpoint import Endpoint
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.lss import UNCONFIGURED
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.canopen.service import NmtState
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.wallclock import WallClock
 
 BIT_RATE = 1_000_000
 BLOB = bytes(range(256)) * 20 + b"and a little more"

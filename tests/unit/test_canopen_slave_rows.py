@@ -9,13 +9,13 @@ import pytest
 from canopen_rows import Row, happen, load, parse_frame, play
 from modbus_virtual import VirtualLoop, run_virtually
 
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import Poke, serve_node
-from emulators.endpoints.bus_runner import BusRunner
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FieldtwinError
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import Poke, serve_node
+from fieldtwin.emulators.endpoints.bus_runner import BusRunner
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError
 
 ROWS = load()
 BIT_RATE = 1_000_000

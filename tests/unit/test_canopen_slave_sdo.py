@@ -8,7 +8,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from emulators.canopen.node import NmtState, NodeContext
+from fieldtwin.emulators.canopen.node import NmtState, NodeContext
 
 NAME = b"a node for tests"
 

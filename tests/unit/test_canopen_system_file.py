@@ -13,18 +13,18 @@ from typing import Any
 
 import pytest
 
-from emulators.canopen.node import CanopenNode
-from emulators.virtual.loop import VirtualLoop
 from fieldtwin import scan_can_bus
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.errors import UsageError
-from gateway.core.values import Quality
-from gateway.protocols.canopen.nmt import NmtState
-from gateway.runtime.status import describe
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.virtual import VirtualPrototype
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.runtime.status import describe
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.virtual import VirtualPrototype
 
 DEVICES = Path(__file__).parents[2] / "profiles" / "devices"
 NODE = 9

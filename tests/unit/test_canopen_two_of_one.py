@@ -17,18 +17,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_scan_canopen import URL, scan
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode
 from fieldtwin.commissioning.can_ear import BusEar
 from fieldtwin.commissioning.identify_canopen import identify_canopen
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS
-from gateway.core.nursery import Nursery
-from gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, cycle_period_ns
-from gateway.protocols.canopen.boot import Configuration
-from gateway.protocols.canopen.concise_dcf import Setting
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.sync_watch import SyncWatch
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, CanopenNodeConfig, cycle_period_ns
+from fieldtwin.gateway.protocols.canopen.boot import Configuration
+from fieldtwin.gateway.protocols.canopen.concise_dcf import Setting
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.sync_watch import SyncWatch
 
 
 def node(number: int, device_type: int, serial: int) -> CanopenNode:
@@ -83,7 +83,7 @@ def test_identify_is_certain_of_nothing_where_two_nodes_answer() -> None:
 
 
 def _endpoint():  # type: ignore[no-untyped-def]
-    from gateway.core.endpoint import Endpoint
+    from fieldtwin.gateway.core.endpoint import Endpoint
 
     return Endpoint.parse(URL)
 

@@ -9,17 +9,17 @@ import pytest
 from canopen_slave_rig import NODE
 from nodes_on_a_bus import LONG, on_bus
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import serve_node
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.ports import MemoryNet
 from fieldtwin.checking.canopen_session import CanopenOptions, check_canopen
 from fieldtwin.checking.run import Plan
 from fieldtwin.conformance.case import Danger
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
 from fieldtwin.report.model import Verdict
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
 
 Twist = Callable[[CanFrame, list[CanFrame]], list[CanFrame]]
 """What was heard and what a right node sends for it -> what is sent."""

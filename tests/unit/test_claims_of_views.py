@@ -19,8 +19,8 @@ from test_gateway_canopen_bus import rig
 
 from fieldtwin.cli.run_command import command as run_system
 from fieldtwin.cli.talk import data, talk
-from gateway.core.recording import looks_like_another_file
-from gateway.devices.config import Heartbeat
+from fieldtwin.gateway.core.recording import looks_like_another_file
+from fieldtwin.gateway.devices.config import Heartbeat
 
 SILENT = "faults: [{name: silence, device: ctd}]\n"
 VIRTUAL = ["observatory", "--prototype", "--virtual", "--for", "5s"]

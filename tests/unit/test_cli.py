@@ -135,7 +135,7 @@ def test_a_field_side_that_is_not_there_is_unreachable(invoke: Invoke) -> None:
         ("map: [slope_long, slope_lateral]", "map: [slope_long, slope_lat]", "map: [slope_long, slope_lat]", "slope_lateral"),
         ("url: \"tcp://modem:502\"", "url: \"tpc://modem:502\"", "tpc://modem:502", "tcp:"),
         ("expect: {serial: \"0042\"}", "expect: {seriel: \"0042\"}", "expect: {seriel", "did you mean 'serial'?"),
-        ("plc.relay:Relay", "plc.relay:Realy", "plc.relay:Realy", "Realy"),
+        ("fieldtwin.plc.relay:Relay", "fieldtwin.plc.relay:Realy", "fieldtwin.plc.relay:Realy", "Realy"),
         ("response: modem.outbox", "respons: modem.outbox", "respons: modem.outbox", "response"),
         ("fieldtwin: 1", "fieldtwin: 2", "fieldtwin: 2", "fieldtwin"),
         ("    relay:\n", "    relay:\n      task: fats\n", "task: fats", "expected main; got fats"),

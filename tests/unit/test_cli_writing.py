@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner
 
 from fieldtwin.cli.main import cli
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.scenarios.trace import open_sink
-from gateway.core.errors import FileInvalid
 
 ROOT = Path(__file__).parents[2]
 

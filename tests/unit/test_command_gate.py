@@ -10,19 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import run
 
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.statemachine import decode_period, encode_period
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.running.twin_rules import load_planner
 from fieldtwin.running.twinning import Twinning
-from gateway.core.errors import FileInvalid
-from gateway.core.statemachine import decode_period, encode_period
-from gateway.core.values import COMMAND
-from gateway.store.event import Event, Kind
-from twin.command_gate import CommandGate
-from twin.instance import Instance
-from twin.mape.execute import Bounds
-from twin.mape.messages import verdict
-from twin.mape.plan import Plan, RulePlanner
-from twin.model import DigitalModel
-from twin.system import load_system
+from fieldtwin.twin.command_gate import CommandGate
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.mape.execute import Bounds
+from fieldtwin.twin.mape.messages import verdict
+from fieldtwin.twin.mape.plan import Plan, RulePlanner
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.system import load_system
 
 OBSERVATORY = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.yaml"
 NOW_MS = 1_790_000_000_000

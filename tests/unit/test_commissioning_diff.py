@@ -11,17 +11,17 @@ from canopen_slave_rig import RICH
 from click.testing import CliRunner
 from commissioning_rig import CAN_URL, URL, Wired, bank, can_bus, loop, run_virtually, unit
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.modbus.bank import MapBank, Span
 from fieldtwin.cli.diff_command import command
 from fieldtwin.commissioning.diff import Leave, diff_dictionary, diff_dumps, diff_profile, spans
 from fieldtwin.commissioning.dump import Job
 from fieldtwin.commissioning.dump_file import Dump, load_dump
 from fieldtwin.commissioning.dumping import dump, register_spans
 from fieldtwin.commissioning.reading import Target
-from gateway.core.profile import load_profile
-from gateway.protocols.canopen.dictionary import parse_dictionary
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.protocols.canopen.dictionary import parse_dictionary
 
 ROOT = Path(__file__).parents[2]
 SDM = load_profile(ROOT / "profiles/devices/eastron-sdm630.yaml")

@@ -11,7 +11,6 @@ from commissioning_rig import URL, Wired, bank, loop, run_virtually, unit
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.modbus.bank import Span
 from fieldtwin.cli import dump_command, read_command, watch_command, write_command
 from fieldtwin.commissioning.address import tags_of
 from fieldtwin.commissioning.plotting import check_plot, plot
@@ -19,8 +18,9 @@ from fieldtwin.commissioning.point import Answer
 from fieldtwin.commissioning.reading import Target, point_at
 from fieldtwin.commissioning.watching import BLOCKS, MOST_SAMPLES, History, samples, sparkline
 from fieldtwin.commissioning.writing import before, plan_write
-from gateway.core.errors import FileInvalid, ModbusExceptionReply, UsageError
-from gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply, UsageError
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
 
 
 @given(st.lists(st.one_of(st.none(), st.floats(allow_nan=False, allow_infinity=False)), max_size=40))

@@ -6,17 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import Desync, FileInvalid, UsageError
-from gateway.protocols.canopen.concise_dcf import (
+from fieldtwin.gateway.core.errors import Desync, FileInvalid, UsageError
+from fieldtwin.gateway.protocols.canopen.concise_dcf import (
     Setting,
     configuration_date,
     decode_concise,
     encode_concise,
     settings_of,
 )
-from gateway.protocols.canopen.configure import tpdos_of
-from gateway.protocols.canopen.dictionary import ObjectDictionary, parse_dictionary
-from gateway.protocols.canopen.pdo import PdoMapping
+from fieldtwin.gateway.protocols.canopen.configure import tpdos_of
+from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, parse_dictionary
+from fieldtwin.gateway.protocols.canopen.pdo import PdoMapping
 
 
 def var(section: str, kind: int, access: str, default: str = "", value: str = "") -> str:

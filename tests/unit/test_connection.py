@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import run
 
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import (
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import (
     PROTOCOL,
     ByteConnection,
     CANConnection,
@@ -21,8 +21,8 @@ from gateway.core.connection import (
     TCPConnection,
     closed_here,
 )
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Bug, ConnectionLost, DeviceRefused, ModbusExceptionReply
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Bug, ConnectionLost, DeviceRefused, ModbusExceptionReply
 
 ENDPOINT = Endpoint.parse("tcp://h:1")
 

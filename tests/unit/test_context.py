@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.context import RELEASE_AT, Recorded, UsedUp, VirtualContext, WhenUsedUp
-from gateway.core.errors import Bug, FileInvalid, UnknownCommand
-from gateway.core.values import COMMAND, RECORDING, RESPONSE
+from fieldtwin.emulators.context import RELEASE_AT, Recorded, UsedUp, VirtualContext, WhenUsedUp
+from fieldtwin.gateway.core.errors import Bug, FileInvalid, UnknownCommand
+from fieldtwin.gateway.core.values import COMMAND, RECORDING, RESPONSE
 
 A, B = COMMAND(b"a"), COMMAND(b"b")
 

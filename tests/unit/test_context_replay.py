@@ -9,13 +9,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.context import WhenUsedUp
-from emulators.replay.counters import CounterSpan
-from emulators.replay.replay import Answer, ExchangeReplay, NeverRecorded
-from emulators.replay.situation import Situations
-from emulators.replay.unit import ReplayUnit
-from gateway.core.errors import UsageError
-from gateway.core.recording import Exchange, RecordingHeader, RecordingWriter
+from fieldtwin.emulators.context import WhenUsedUp
+from fieldtwin.emulators.replay.counters import CounterSpan
+from fieldtwin.emulators.replay.replay import Answer, ExchangeReplay, NeverRecorded
+from fieldtwin.emulators.replay.situation import Situations
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.recording import Exchange, RecordingHeader, RecordingWriter
 
 
 def read(address: int, count: int = 1, function: int = 4) -> bytes:

@@ -14,9 +14,16 @@ from typing import Any
 import pytest
 from support import eventually, run
 
-from gateway.core import control
-from gateway.core.control import ControlClient, ControlServer, RemoteError
-from gateway.core.errors import ConnectionLost, EndpointBusy, NotAllowed, ReplyTimeout, Unreachable, UsageError
+from fieldtwin.gateway.core import control
+from fieldtwin.gateway.core.control import ControlClient, ControlServer, RemoteError
+from fieldtwin.gateway.core.errors import (
+    ConnectionLost,
+    EndpointBusy,
+    NotAllowed,
+    ReplyTimeout,
+    Unreachable,
+    UsageError,
+)
 
 
 async def echo(args: dict[str, Any]) -> Any:

@@ -8,8 +8,8 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from gateway.core.events import Consumer
-from gateway.core.image import (
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.image import (
     INPUTS,
     OUTPUTS,
     Image,
@@ -23,14 +23,23 @@ from gateway.core.image import (
     message_tag,
     taken_name,
 )
-from gateway.core.values import DATA, Quality, Reason, TagValue
-from gateway.runtime.image_io import ImageExchange
-from gateway.runtime.tags import TagTable
-from plc.binding import BoundProgram, InputBinding, image_for
-from plc.forces import Forces
-from plc.program import Message, Outbox, Program, ScanInfo, message_input, message_output, var_input, var_output
-from plc.publishing import OutputImage
-from plc.scan import Scan
+from fieldtwin.gateway.core.values import DATA, Quality, Reason, TagValue
+from fieldtwin.gateway.runtime.image_io import ImageExchange
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.forces import Forces
+from fieldtwin.plc.program import (
+    Message,
+    Outbox,
+    Program,
+    ScanInfo,
+    message_input,
+    message_output,
+    var_input,
+    var_output,
+)
+from fieldtwin.plc.publishing import OutputImage
+from fieldtwin.plc.scan import Scan
 
 MS = 1_000_000
 LIMIT_MS = 30

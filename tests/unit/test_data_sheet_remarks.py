@@ -16,13 +16,13 @@ import pytest
 from canopen_slave_rig import record, var
 from support import eventually, run
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.remarks import remarks
 from fieldtwin.commissioning.live import canopen_at
-from gateway.core.errors import FileInvalid
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.remarks import remarks
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 CHECKOUT = Path(__file__).parents[2]
 DRIVE = (CHECKOUT / "profiles" / "devices" / "drive-cia402.eds").read_text("ascii")

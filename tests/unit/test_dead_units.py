@@ -15,14 +15,14 @@ from gateway_rig import profile
 from modbus_virtual import run_virtually
 from virtual_bus import VirtualBus, run_bus
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import Endpoint
-from gateway.core.values import Reason
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.tags import TagTable
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.values import Reason
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.tags import TagTable
 
 LINE = Endpoint.parse("rtu:/dev/ttyVIRT?baudrate=19200&frame=8N1")
 LAN = Endpoint.parse("tcp://gateway:502")

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from emulators.canopen import codec
-from emulators.canopen.dictionary import Dictionary, load_eds, parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.models.by_profile import MODELS, model_for
-from emulators.models.io_module import IoModule
-from emulators.models.measuring_device import ZERO
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.emulators.canopen import codec
+from fieldtwin.emulators.canopen.dictionary import Dictionary, load_eds, parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.models.by_profile import MODELS, model_for
+from fieldtwin.emulators.models.io_module import IoModule
+from fieldtwin.emulators.models.measuring_device import ZERO
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 DEVICES = Path(__file__).parents[2] / "profiles" / "devices"
 NODE = 5

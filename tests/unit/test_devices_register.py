@@ -13,23 +13,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import run
 
-from emulators import codec as emulated
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.unit import ModbusUnit
-from emulators.models.sampled_sensor import SampledSensor
-from emulators.signals import SignalPlayer, SignalTrack
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid, UnknownCommand, VerifyFailed
-from gateway.core.events import Consumer
-from gateway.core.profile import load_profile
-from gateway.core.recording import SignalRow
-from gateway.core.values import COMMAND, DATA, MEASUREMENT
-from gateway.devices.codec import decode, decode_little, encode, reorder
-from gateway.devices.config import DeviceConfig
-from gateway.devices.register_device import SensorDriver
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.emulators import codec as emulated
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.sampled_sensor import SampledSensor
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid, UnknownCommand, VerifyFailed
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import SignalRow
+from fieldtwin.gateway.core.values import COMMAND, DATA, MEASUREMENT
+from fieldtwin.gateway.devices.codec import decode, decode_little, encode, reorder
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import SensorDriver
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
 
 CTD = load_profile(PROFILES / "ctd-reference.yaml")
 SAMPLED = ("pressure", "temperature", "conductivity", "instrument_time")

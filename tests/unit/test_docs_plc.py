@@ -11,8 +11,8 @@ from st_bench import program
 from st_bench import scan as st_scan
 
 from fieldtwin.cli.plc_command import command
-from plc.program import Role, ScanInfo
-from plc.prove import prove
+from fieldtwin.plc.program import Role, ScanInfo
+from fieldtwin.plc.prove import prove
 
 PAGE = (Path(__file__).parents[2] / "docs" / "plc.md").read_text(encoding="utf-8")
 MS = 1_000_000

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.canopen.dictionary import load_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.service import NmtState
-from emulators.models.drive import Drive
-from emulators.models.drive_states import STATE_MASK, TRANSITIONS, Cause, DriveState, command_of, transition
-from emulators.models.motion import Motion, to_place, to_speed
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.service import NmtState
+from fieldtwin.emulators.models.drive import Drive
+from fieldtwin.emulators.models.drive_states import STATE_MASK, TRANSITIONS, Cause, DriveState, command_of, transition
+from fieldtwin.emulators.models.motion import Motion, to_place, to_speed
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 EDS = load_eds(Path(__file__).parents[2] / "profiles" / "devices" / "drive-cia402.eds")
 NODE = 7

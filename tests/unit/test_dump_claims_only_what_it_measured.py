@@ -21,7 +21,7 @@ from fieldtwin.commissioning.coverage import INVALID, NOT_ASKED, READABLE, REFUS
 from fieldtwin.commissioning.dump_beyond import beyond_silence, other_lengths
 from fieldtwin.commissioning.dump_file import load_dump
 from fieldtwin.commissioning.dump_sweep import Invalid, Outcome, Refused, Silent, Sweep, Taken
-from gateway.core.profile import RegisterRange
+from fieldtwin.gateway.core.profile import RegisterRange
 
 BLOCKS = (range(20), range(1000, 1032))
 

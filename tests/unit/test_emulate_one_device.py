@@ -16,16 +16,16 @@ from pathlib import Path
 import pytest
 from test_cli import invoke as invoke_command
 
-from emulators.faults.frames import Framing, Way, understood
-from emulators.faults.on_link import wire_faults
-from emulators.faults.schema import parse_fault
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.unit import ModbusUnit
-from emulators.stated import parts_of
-from gateway.core.errors import UsageError
-from gateway.core.profile import DeviceProfile, resolve
-from gateway.core.yaml_file import parse
+from fieldtwin.emulators.faults.frames import Framing, Way, understood
+from fieldtwin.emulators.faults.on_link import wire_faults
+from fieldtwin.emulators.faults.schema import parse_fault
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.stated import parts_of
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, resolve
+from fieldtwin.gateway.core.yaml_file import parse
 
 METER = """
 device: test/meter

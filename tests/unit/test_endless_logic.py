@@ -14,15 +14,15 @@ from pathlib import Path
 import pytest
 from st_bench import program, run, scan
 
+from fieldtwin.gateway.core.image import INPUTS
+from fieldtwin.plc.binding import image_for
+from fieldtwin.plc.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.program import ProgramFailed, ProgramStuck, ScanTooLong
+from fieldtwin.plc.prove import Proof, prove
+from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.st.resource import MAX_STEPS
+from fieldtwin.plc.task import StopReason
 from fieldtwin.testhost.stepped_program import SteppedProgram
-from gateway.core.image import INPUTS
-from plc.binding import image_for
-from plc.config import PlcConfig, ProgramConfig
-from plc.program import ProgramFailed, ProgramStuck, ScanTooLong
-from plc.prove import Proof, prove
-from plc.runner import Runner
-from plc.st.resource import MAX_STEPS
-from plc.task import StopReason
 
 ENDLESS = {
     "WHILE": "WHILE go DO\nn := n + 1;\nEND_WHILE",
@@ -85,7 +85,7 @@ def test_the_prover_reports_it() -> None:
 
 SPINS = """
 import asyncio, signal, sys
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.loop import VirtualLoop
 
 def told(number, frame):
     sys.exit(128 + number)

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.endpoint import SOCKET_SCHEMES, TLS_PARAMS, Endpoint, SerialSettings
-from gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.endpoint import SOCKET_SCHEMES, TLS_PARAMS, Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 
 NAME = st.text(string.ascii_lowercase + string.digits + "-", min_size=1, max_size=12)
 PATH = st.text(string.ascii_letters + string.digits + "/._-:#%&=+ é", min_size=1, max_size=30)

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.commissioning.plotting import check_plot
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.store.knowledge import open_knowledge
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.exporting import Column, _write_parquet
 from fieldtwin.running import loops
-from gateway.core.errors import UsageError
-from gateway.store.knowledge import open_knowledge
-from gateway.wallclock import WallClock
-from twin.system import load_system
-from twin.thread_place import twin_carrier
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.thread_place import twin_carrier
 
 CHECKOUT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -44,8 +44,8 @@ def use_parquet(folder: Path) -> None:
 
 
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "mqtt": ("aiomqtt", use_mqtt, "twin.thread_mqtt"),
-    "postgres": ("asyncpg", use_postgres, "gateway.store.postgres_knowledge"),
+    "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread_mqtt"),
+    "postgres": ("asyncpg", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "plot": ("matplotlib", use_plot, ""),
     "parquet": ("pyarrow", use_parquet, ""),
 }

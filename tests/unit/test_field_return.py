@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from support import eventually, run
 
+from fieldtwin.gateway.core.control import ControlClient, ControlServer
 from fieldtwin.running.field_contact import FieldContact, connect_control
 from fieldtwin.running.field_return import FieldReturn
 from fieldtwin.running.oracle import Oracle
-from gateway.core.control import ControlClient, ControlServer
-from twin.system import System, load_system
+from fieldtwin.twin.system import System, load_system
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from fan_hall import VirtualHall, hall, writes
 
-from gateway.core.clock import NS_PER_S
-from twin.virtual import VirtualPrototype
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.twin.virtual import VirtualPrototype
 
 
 @pytest.mark.parametrize("if_bad", ["pass", "hold", "trip", 5.0])

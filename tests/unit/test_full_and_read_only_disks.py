@@ -20,10 +20,10 @@ from sqlite3 import connect
 import pytest
 from postgres_here import cluster
 
-from gateway.core.errors import FieldtwinError, Unreachable
-from gateway.store.event import Event, Kind, KnowledgeStore, StoreFull
-from gateway.store.exchange_log import ExchangeLog
-from gateway.store.knowledge import open_knowledge
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
+from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore, StoreFull
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.store.knowledge import open_knowledge
 
 SIZE = "256k"
 

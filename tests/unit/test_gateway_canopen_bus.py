@@ -13,25 +13,25 @@ import pytest
 from gateway_rig import PROFILES
 from support import eventually, run
 
-from emulators.canopen.dictionary import load_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.models.played_objects import PlayedObjects
-from emulators.signals import SignalPlayer, SignalTrack
-from gateway.connections.os_connector import OsConnector
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, NotAllowed
-from gateway.core.nursery import Nursery
-from gateway.core.profile import load_profile
-from gateway.core.recording import SignalRow
-from gateway.devices.canopen_device import CanopenDriver
-from gateway.devices.config import BusConfig, CanopenBusConfig, DeviceConfig, Heartbeat, Tpdo
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.canopen_bus import CanopenBus
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.dictionary import load_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.models.played_objects import PlayedObjects
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, NotAllowed
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import SignalRow
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import BusConfig, CanopenBusConfig, DeviceConfig, Heartbeat, Tpdo
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
 
 PROFILE = load_profile(PROFILES / "inclinometer-cia410.yaml")
 NODE = 5

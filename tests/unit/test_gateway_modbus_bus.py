@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from emulators.modbus.bank import DeviceFailure, MapBank, Span, Table
-from gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable
-from gateway.core.profile import DeviceProfile
-from gateway.devices.config import DeviceConfig
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.runtime.backoff import Backoff
-from gateway.runtime.modbus_bus import MAX_JOBS, Job
-from gateway.runtime.tags import TagTable
+from fieldtwin.emulators.modbus.bank import DeviceFailure, MapBank, Span, Table
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, FieldtwinError, Unreachable
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.runtime.backoff import Backoff
+from fieldtwin.gateway.runtime.modbus_bus import MAX_JOBS, Job
+from fieldtwin.gateway.runtime.tags import TagTable
 
 TWO_GROUPS = """
 tags:

@@ -15,18 +15,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from emulators.modbus.bank import MapBank, Span
-from gateway.core.errors import NotAllowed, Unreachable
-from gateway.core.nursery import Nursery
-from gateway.core.values import COMMAND
-from gateway.devices.codec import decode, encode
-from gateway.devices.config import DeviceConfig
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.output import Output
-from gateway.runtime.outputs import OutputWriter
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.gateway.core.errors import NotAllowed, Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.devices.codec import decode, encode
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.output import Output
+from fieldtwin.gateway.runtime.outputs import OutputWriter
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
 
 PROFILE = """
 tags:

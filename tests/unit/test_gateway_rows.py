@@ -15,19 +15,19 @@ from typing import Any
 import pytest
 from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
-from gateway.connections.listeners import ClientConnection
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable
-from gateway.core.nursery import Nursery
-from gateway.devices.config import BusConfig
-from gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.bridge import Bridge, BridgeConfig, Route
-from gateway.runtime.bridge_policy import AllowRule, Policy
-from gateway.runtime.bridge_tcp import TcpFront
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
+from fieldtwin.gateway.connections.listeners import ClientConnection
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.protocols.modbus.server import READ_FUNCTIONS, WRITE_FUNCTIONS
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.bridge import Bridge, BridgeConfig, Route
+from fieldtwin.gateway.runtime.bridge_policy import AllowRule, Policy
+from fieldtwin.gateway.runtime.bridge_tcp import TcpFront
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
 
 ROWS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "modbus_gateway.toml").read_text())["row"]
 MS = 1_000_000

@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import FileInvalid, Unreachable
-from gateway.core.values import NEVER, Quality, Reason, TagValue
-from gateway.runtime import tags as tags_module
-from gateway.runtime.tags import TagTable
-from gateway.store import exchange_log
-from gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
+from fieldtwin.gateway.core.values import NEVER, Quality, Reason, TagValue
+from fieldtwin.gateway.runtime import tags as tags_module
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.store import exchange_log
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
 
 
 class Hands:
@@ -200,7 +200,7 @@ def test_a_disk_that_refuses_loses_nothing(tmp_path: Path) -> None:
 CRASH = """
 import os, signal, sys
 from pathlib import Path
-from gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
 log = ExchangeLog(Path(sys.argv[1]), system="obs", prototype=True)
 for n in range(1, 1001):
     log.append([("t", n, n, bytes(100))])

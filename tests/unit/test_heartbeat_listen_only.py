@@ -14,10 +14,10 @@ from pydantic import ValidationError
 from support import eventually, run
 from test_gateway_canopen_bus import NODE, SDO_TO_NODE, rig
 
-from gateway.core.canframe import CanFrame
-from gateway.devices.config import Heartbeat
-from gateway.protocols.canopen.heartbeat import HeartbeatConsumer
-from twin.system_schema import HeartbeatForm
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.devices.config import Heartbeat
+from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
+from fieldtwin.twin.system_schema import HeartbeatForm
 
 LISTEN = Heartbeat(None, 150)
 

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from fieldtwin.commissioning.identify_canopen import CanIdentity, identify_canopen
 from fieldtwin.commissioning.matching import CanClues, Sureness, judge_canopen
-from gateway.core.profile import load_profile
-from gateway.protocols.canopen.configure import Identity
-from gateway.protocols.canopen.dictionary import load_dictionary
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.protocols.canopen.configure import Identity
+from fieldtwin.gateway.protocols.canopen.dictionary import load_dictionary
 
 URL = "can:fieldtwin/h:1"
 SHIPPED = [load_profile(path) for path in sorted(Path("profiles/devices").glob("*cia*.yaml"))]

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.core.errors import Bug, FileInvalid
-from gateway.core.image import (
+from fieldtwin.gateway.core.errors import Bug, FileInvalid
+from fieldtwin.gateway.core.image import (
     INPUTS,
     OUTPUTS,
     Image,
@@ -26,7 +26,7 @@ from gateway.core.image import (
     process_image,
     taken_name,
 )
-from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
 
 I64 = st.integers(-(2**63), 2**63 - 1)
 BY_KIND: dict[TagKind, st.SearchStrategy[Scalar]] = {

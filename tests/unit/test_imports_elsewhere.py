@@ -1,5 +1,5 @@
 """Every module is imported on a system that has none of Unix's own modules, in a process of its own: Windows' standard library
-minus what else it lacks. What needs them says so when it is used."""
+minus what else it lacks. What needs them says so when it is used. And none is imported under a second name."""
 
 from __future__ import annotations
 
@@ -34,25 +34,26 @@ for module, names in (
             delattr(module, name)
 
 failed, count = [], 0
-for package in ("gateway", "plc", "emulators", "twin", "fieldtwin"):
-    for found in pkgutil.walk_packages(importlib.import_module(package).__path__, package + "."):
-        if found.name.endswith("__main__"):
-            continue
-        count += 1
-        try:
-            importlib.import_module(found.name)
-        except ImportError as e:
-            if e.name in HIDDEN:
-                failed.append(f"{found.name}: {e}")
-            elif e.name not in OPTIONAL:
-                failed.append(f"{found.name}: {e!r}")
-        except AttributeError as e:
+import fieldtwin
+for found in pkgutil.walk_packages(fieldtwin.__path__, "fieldtwin."):
+    if found.name.endswith("__main__"):
+        continue
+    count += 1
+    try:
+        importlib.import_module(found.name)
+    except ImportError as e:
+        if e.name in HIDDEN:
+            failed.append(f"{found.name}: {e}")
+        elif e.name not in OPTIONAL:
             failed.append(f"{found.name}: {e!r}")
+    except AttributeError as e:
+        failed.append(f"{found.name}: {e!r}")
+failed += sorted({"gateway", "plc", "emulators", "twin"} & set(sys.modules))  # a second name of a module of ours
 print(count, *failed, sep="\\n")
 from fieldtwin.cli.main import cli
-from emulators.endpoints.pty import PtyEnd
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
 import pathlib
 try:
     PtyEnd.open(pathlib.Path("x"), Endpoint.parse("pty:x")).send(None)  # not a loop: socketpair has lost AF_UNIX

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from emulators.journal import CAPACITY, LEAST, SHARED, Held, HeldJournal, share_of
+from fieldtwin.emulators.journal import CAPACITY, LEAST, SHARED, Held, HeldJournal, share_of
 
 
 def filled(count: int, capacity: int) -> HeldJournal:

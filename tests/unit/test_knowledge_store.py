@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from postgres_here import server
 from support import run
 
-from gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.store.event import Event, Kind, KnowledgeStore, StoreFull, merged, of_tag, plain, without
-from gateway.store.exchange_log import ExchangeLog
-from gateway.store.knowledge import open_knowledge
-from gateway.store.schema import LATEST, SCRIPTS, script
-from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore, StoreFull, merged, of_tag, plain, without
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.store.knowledge import open_knowledge
+from fieldtwin.gateway.store.schema import LATEST, SCRIPTS, script
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 
@@ -177,7 +177,7 @@ def test_what_is_forgotten_is_no_gap_and_its_numbers_are_never_given_again(place
 
 
 def test_a_time_is_replayed_in_blocks(place: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gateway.store.sqlite_knowledge.BLOCK", 7)
+    monkeypatch.setattr("fieldtwin.gateway.store.sqlite_knowledge.BLOCK", 7)
 
     async def main() -> None:
         store = await opened(place)
@@ -418,7 +418,8 @@ def test_nothing_that_was_acknowledged_is_lost_when_the_process_is_killed(tmp_pa
     """It says each number when `append` has returned; killed at once, at least so many are there, whole and without holes."""
     program = (
         "import asyncio, sys; from pathlib import Path\n"
-        "from gateway.store.event import Event; from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place\n"
+        "from fieldtwin.gateway.store.event import Event\n"
+        "from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place\n"
         "async def main():\n"
         f"    store = await SqliteKnowledge.open(Path({str(tmp_path / 'k.db')!r}), offload=in_place)\n"
         "    origin = await store.own('plant', system='s', prototype=True, log='aa')\n"

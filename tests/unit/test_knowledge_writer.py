@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from gateway.core.errors import Unreachable
-from gateway.store.event import Event, Kind, StoreFull
-from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from gateway.wallclock import WallClock
-from twin.knowledge import KnowledgeWriter, known_at
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.store.event import Event, Kind, StoreFull
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.knowledge import KnowledgeWriter, known_at
 
 
 def value(number: float) -> Event:

@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from modbus_virtual import run_virtually
 from virtual_bus import LINE, VirtualBus, run_bus
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.register_functions import UnitLimits
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.runtime.learnt import LearntFile, describe_learnt
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.register_functions import UnitLimits
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.runtime.learnt import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
 
 TAGS = """
 tags:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.running.ledger import Ledger
 from fieldtwin.running.many_seeds import SeedResult, fingerprint
-from gateway.core.errors import FileInvalid
 
 
 def result(seed: int, ok: bool = True, wrong: int = 0) -> SeedResult:

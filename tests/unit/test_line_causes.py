@@ -17,10 +17,10 @@ from fieldtwin.commissioning.can_ear import BusHeard
 from fieldtwin.commissioning.causes import Probe, SerialEvidence, can_causes, serial_causes, tcp_causes
 from fieldtwin.commissioning.line import LineLook, LineReport, look_at_line, probe_of
 from fieldtwin.commissioning.traffic import Heard, LineEar
-from gateway.connections.can_facts import CanFacts
-from gateway.connections.line_counters import LineCounters, unpack_counters
-from gateway.core.endpoint import SerialSettings
-from gateway.core.errors import NotAllowed
+from fieldtwin.gateway.connections.can_facts import CanFacts
+from fieldtwin.gateway.connections.line_counters import LineCounters, unpack_counters
+from fieldtwin.gateway.core.endpoint import SerialSettings
+from fieldtwin.gateway.core.errors import NotAllowed
 
 PORT = "rtu:/dev/ttyX"
 N81 = SerialSettings(9600, "8N1")

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from modbus_virtual import VirtualLoop, run_virtually
 from support import eventually
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import ReplyTimeout, UsageError
-from gateway.protocols.canopen.lss import LssAddress, LssRefused
-from gateway.protocols.canopen.lss_master import LssMaster
-from gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import ReplyTimeout, UsageError
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress, LssRefused
+from fieldtwin.gateway.protocols.canopen.lss_master import LssMaster
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
 REPLY_S = 0.01
 

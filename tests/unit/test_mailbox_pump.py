@@ -5,15 +5,15 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.runtime.mailboxes import Patience
 from fieldtwin.running.shore import Shore
-from gateway.core.clock import NS_PER_MS
-from gateway.core.nursery import Nursery
-from gateway.core.values import COMMAND
-from gateway.runtime.mailboxes import Patience
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.virtual import VirtualPrototype
 
 MESSAGES = 12
 

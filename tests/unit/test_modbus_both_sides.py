@@ -9,18 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.errors import FieldtwinError, ModbusExceptionReply
-from gateway.protocols.modbus.ascii import AsciiFramer
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
-from gateway.protocols.modbus.replies import Reply
-from gateway.protocols.modbus.request import Request
-from gateway.protocols.modbus.requests import (
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.errors import FieldtwinError, ModbusExceptionReply
+from fieldtwin.gateway.protocols.modbus.ascii import AsciiFramer
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
+from fieldtwin.gateway.protocols.modbus.replies import Reply
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import (
     ReadBits,
     ReadRegisters,
     ReadWriteRegisters,
@@ -29,9 +29,9 @@ from gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from gateway.protocols.modbus.rtu import RtuFramer
-from gateway.protocols.modbus.server import examine
-from gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.server import examine
+from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 UNIT = 1
 TIMEOUT_NS = 200_000_000

@@ -9,8 +9,8 @@ import pytest
 from modbus_client_rig import CLOCK, LINE, RTU, Device, answering, wire, with_client
 from support import eventually
 
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import (
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import (
     ConnectionLost,
     CrcError,
     Desync,
@@ -20,8 +20,8 @@ from gateway.core.errors import (
     UsageError,
     VerifyFailed,
 )
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import Framing
 
 
 def test_a_read_over_rtu() -> None:

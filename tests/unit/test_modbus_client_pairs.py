@@ -8,13 +8,13 @@ import pytest
 from modbus_client_rig import CLOCK, Device, answering, mbap_answer, register_frame, with_client
 from support import eventually
 
-from gateway.core.errors import (
+from fieldtwin.gateway.core.errors import (
     CrcError,
     Desync,
     ReplyTimeout,
 )
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.framings import Framing
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.framings import Framing
 
 
 def test_mb_003_after_a_truncated_reply_the_next_request_is_clean() -> None:

@@ -13,14 +13,14 @@ from collections.abc import Callable
 
 import pytest
 
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_S
-from gateway.protocols.modbus.server_line import LOST_AFTER, LineRequest, RtuRequests
-from gateway.protocols.modbus.server_mbap import MbapRequests
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.protocols.modbus.server_line import LOST_AFTER, LineRequest, RtuRequests
+from fieldtwin.gateway.protocols.modbus.server_mbap import MbapRequests
 
 CHUNK = 1 << 20
 CHUNKS = 100

@@ -7,14 +7,14 @@ from collections.abc import Iterable
 
 import pytest
 
-from gateway.core.errors import CrcError, Desync, FieldtwinError, ReplyTimeout, UsageError, WrongSize
-from gateway.protocols.modbus.crc import crc16, with_crc
-from gateway.protocols.modbus.diagnostics import Diagnostics
-from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
-from gateway.protocols.modbus.mbap import MbapFramer
-from gateway.protocols.modbus.replies import RegistersReply, Reply
-from gateway.protocols.modbus.request import Request
-from gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.core.errors import CrcError, Desync, FieldtwinError, ReplyTimeout, UsageError, WrongSize
+from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
+from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReportServerId
+from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer
+from fieldtwin.gateway.protocols.modbus.replies import RegistersReply, Reply
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import (
     MaskWriteRegister,
     ReadBits,
     ReadRegisters,
@@ -23,8 +23,8 @@ from gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from gateway.protocols.modbus.rtu import RtuFramer
-from gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 MS = 1_000_000
 UNIT = 0x11

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from emulators.modbus.bank import CellHooks, IllegalAddress, MapBank, Span
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.wire import MemoryWire
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ReplyTimeout
-from gateway.protocols.modbus.client import ModbusClient, UnitPace
+from fieldtwin.emulators.modbus.bank import CellHooks, IllegalAddress, MapBank, Span
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.wire import MemoryWire
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ReplyTimeout
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient, UnitPace
 
 
 def test_a_timeout_that_is_stated_anew_counts_from_the_next_request_on() -> None:

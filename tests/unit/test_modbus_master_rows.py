@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 from modbus_virtual import VirtualLoop, VirtualWire, run_virtually
 
-from gateway.core import errors
-from gateway.core.endpoint import Endpoint
-from gateway.protocols.modbus import diagnostics, files, identity, refusals, requests, user
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.replies import Reply
-from gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.core import errors
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.protocols.modbus import diagnostics, files, identity, refusals, requests, user
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.replies import Reply
+from fieldtwin.gateway.protocols.modbus.request import Request
 
 ROWS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "modbus_master_rows.toml").read_text())["row"]
 MS = 1_000_000

@@ -8,18 +8,18 @@ from hypothesis import strategies as st
 from pymodbus.pdu.bit_message import ReadCoilsResponse
 from pymodbus.pdu.register_message import ReadHoldingRegistersResponse
 
-from gateway.core.errors import FieldtwinError, ReplyTimeout, WireError
-from gateway.protocols.modbus import pdus
-from gateway.protocols.modbus.ascii import AsciiFramer, lrc
-from gateway.protocols.modbus.crc import with_crc
-from gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog, Loopback
-from gateway.protocols.modbus.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
-from gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
-from gateway.protocols.modbus.replies import RegistersReply, Reply
-from gateway.protocols.modbus.request import Request, parse_reply
-from gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout, WireError
+from fieldtwin.gateway.protocols.modbus import pdus
+from fieldtwin.gateway.protocols.modbus.ascii import AsciiFramer, lrc
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics, GetCommEventCounter, GetCommEventLog, Loopback
+from fieldtwin.gateway.protocols.modbus.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification, ReadExceptionStatus, ReportServerId
+from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
+from fieldtwin.gateway.protocols.modbus.replies import RegistersReply, Reply
+from fieldtwin.gateway.protocols.modbus.request import Request, parse_reply
+from fieldtwin.gateway.protocols.modbus.requests import (
     MaskWriteRegister,
     ReadBits,
     ReadRegisters,
@@ -29,9 +29,9 @@ from gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from gateway.protocols.modbus.rtu import MOST_HUNTED, RtuFramer
-from gateway.protocols.modbus.transaction import Transaction
-from gateway.protocols.modbus.user import CountedShape, FixedShape, UserFunction
+from fieldtwin.gateway.protocols.modbus.rtu import MOST_HUNTED, RtuFramer
+from fieldtwin.gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.gateway.protocols.modbus.user import CountedShape, FixedShape, UserFunction
 
 UNIT = 1
 TIMEOUT_NS = 1_000_000_000

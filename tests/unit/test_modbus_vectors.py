@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from gateway.core import errors
-from gateway.protocols.modbus import diagnostics, files, identity, requests, user
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.mbap import MbapFramer
-from gateway.protocols.modbus.replies import Reply
-from gateway.protocols.modbus.rtu import RtuFramer
-from gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.gateway.core import errors
+from fieldtwin.gateway.protocols.modbus import diagnostics, files, identity, requests, user
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer
+from fieldtwin.gateway.protocols.modbus.replies import Reply
+from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 VECTORS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "modbus_master.toml").read_text())["vector"]
 TIMEOUT_NS = 1_000_000_000

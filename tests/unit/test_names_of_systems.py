@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.recording import RecordingReader
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.recording import RecordingReader
-from twin.data_files import data_root, find
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.twin.data_files import data_root, find
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 
 @pytest.mark.parametrize(

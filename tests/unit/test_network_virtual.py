@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from emulators.faults.schema import parse_fault
 from fieldtwin.cli.main import cli
+from fieldtwin.emulators.faults.schema import parse_fault
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.report.model import Verdict
 from fieldtwin.running.fault_schedule import CALM_S, random_network_schedule
 from fieldtwin.running.shore import Scripted
@@ -18,9 +19,8 @@ from fieldtwin.running.virtual_network_run import VirtualNetworkOptions, Virtual
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.scenarios.trace import read_trace
-from gateway.core.errors import FileInvalid, UsageError
-from twin.network import WATER, load_network
-from twin.network_faults import check_network_fault, placed_all
+from fieldtwin.twin.network import WATER, load_network
+from fieldtwin.twin.network_faults import check_network_fault, placed_all
 
 SHIPPED = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "ocean_network.yaml"
 

@@ -9,11 +9,11 @@ from canopen_master_bus import LoopClock, running
 from canopen_peer_node import PeerBus, PeerNode, closing
 from modbus_virtual import run_virtually
 
-from gateway.core.endpoint import Endpoint
-from gateway.protocols.canopen.configure import Identity
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtState
-from gateway.protocols.canopen.scan import FoundNode, scan_nodes
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.protocols.canopen.configure import Identity
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.protocols.canopen.scan import FoundNode, scan_nodes
 
 U32 = (1).to_bytes(4, "little")
 WHOLE = {(0x1000, 0): U32, (0x1018, 0): b"\x01", (0x1018, 1): (2).to_bytes(4, "little")}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gateway.core.errors import os_reason
+from fieldtwin.gateway.core.errors import os_reason
 
 
 @pytest.mark.parametrize(

@@ -17,9 +17,9 @@ from test_canopen_outputs import DRIVEN
 from test_canopen_outputs import rig as canopen_rig
 from test_gateway_outputs import rig
 
-from emulators.modbus.bank import DeviceFailure, MapBank
-from gateway.core.errors import FieldtwinError
-from gateway.devices.canopen_config import CanopenNodeConfig
+from fieldtwin.emulators.modbus.bank import DeviceFailure, MapBank
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.devices.canopen_config import CanopenNodeConfig
 
 APART = {"drive": ("period", "valve")}
 """Registers 0 and 4, with others between them. `period` is at most 60."""

@@ -19,7 +19,7 @@ from fieldtwin.formats.can_files import read_can_file
 from fieldtwin.formats.candump import LeftOut
 from fieldtwin.formats.cnv import import_cnv
 from fieldtwin.formats.packet_file import PacketFile
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.errors import FileInvalid
 
 PIECE = 16 << 20
 PIECES = 64

@@ -20,21 +20,19 @@ from modbus_virtual import run_virtually
 from support import eventually, run
 from test_gateway_modbus_bus import TWO_GROUPS, bank, config
 
-from emulators.endpoints import bus_server
-from emulators.endpoints.bus_hello import Hello
-from emulators.endpoints.bus_server import SoftBusServer
-from fieldtwin.service import metrics_server
-from fieldtwin.service.metrics_server import MetricsServer
-from gateway.connections.tcp import TcpConnection
-from gateway.core import control
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import ByteConnection, TCPConnection
-from gateway.core.control import ControlClient, ControlServer
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.sdo import (
+from fieldtwin.emulators.endpoints import bus_server
+from fieldtwin.emulators.endpoints.bus_hello import Hello
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core import control
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import ByteConnection, TCPConnection
+from fieldtwin.gateway.core.control import ControlClient, ControlServer
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, FieldtwinError, ReplyTimeout
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.sdo import (
     WHOLE_NS_PER_BYTE,
     WHOLE_TIMEOUTS,
     Failed,
@@ -44,11 +42,13 @@ from gateway.protocols.canopen.sdo import (
     Send,
     Wait,
 )
-from gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.runtime import bridge_tcp
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.runtime import bridge_tcp
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.service import metrics_server
+from fieldtwin.service.metrics_server import MetricsServer
 
 NS = 1_000_000_000
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plc.blocks import BLOCKS, CTD, CTU, CTUD, F_TRIG, MS, R_TRIG, RS, SR, TOF, TON, TP
+from fieldtwin.plc.blocks import BLOCKS, CTD, CTU, CTUD, F_TRIG, MS, R_TRIG, RS, SR, TOF, TON, TP
 
 BITS = st.lists(st.booleans(), max_size=40)
 STEPS = st.lists(st.tuples(st.integers(1, 30), st.booleans()), max_size=40)

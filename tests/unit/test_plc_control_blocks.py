@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plc.blocks import ALARM, HYSTERESIS, MS, PID, RAMP, SECOND
+from fieldtwin.plc.blocks import ALARM, HYSTERESIS, MS, PID, RAMP, SECOND
 
 REALS = st.floats(-1e6, 1e6)
 

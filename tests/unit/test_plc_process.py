@@ -17,14 +17,14 @@ from typing import Any
 import pytest
 from support import eventually, run
 
-from gateway.core.control import ControlClient, RemoteError
-from gateway.core.errors import FileInvalid, Unreachable
-from gateway.core.image import INPUTS, OUTPUTS, RegionReader, TagKind, TagSpec, message_tag, taken_name
-from gateway.core.statemachine import encode_period
-from gateway.core.values import Quality, TagValue
-from plc.binding import InputBinding, image_for
-from plc.config import PlcConfig, ProgramConfig
-from plc.process import plc_main
+from fieldtwin.gateway.core.control import ControlClient, RemoteError
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable
+from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, RegionReader, TagKind, TagSpec, message_tag, taken_name
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.plc.binding import InputBinding, image_for
+from fieldtwin.plc.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.process import plc_main
 
 PLANT = {
     "modem.inbox": message_tag("modem.inbox", 64, 8),
@@ -34,13 +34,13 @@ PLANT = {
 }
 RELAY = ProgramConfig(
     "relay",
-    "python: plc.relay:Relay",
+    "python: fieldtwin.plc.relay:Relay",
     {"command": InputBinding("modem.inbox"), "sample": InputBinding("ctd.sample")},
     {"period_s": "ctd.sample_period_s", "response": "modem.outbox"},
 )
 FAULTY = """
-from gateway.core.image import TagKind
-from plc.program import Program, var_input, var_output
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, var_input, var_output
 
 
 class Faulty(Program):
@@ -115,7 +115,7 @@ async def plc_running(config: PlcConfig) -> AsyncIterator[tuple[asyncio.subproce
     gateway = Gateway(Path(config.image_path), config)
     gateway.publish()
     (folder / "plc.json").write_bytes(config.to_json())
-    child = await asyncio.create_subprocess_exec(sys.executable, "-m", "plc", str(folder / "plc.json"))
+    child = await asyncio.create_subprocess_exec(sys.executable, "-m", "fieldtwin.plc", str(folder / "plc.json"))
     client = None
     try:
         client = await _connect(Path(config.control_path), child)
@@ -216,7 +216,9 @@ def test_a_killed_plc_leaves_a_whole_image_and_its_successor_goes_on(tmp_path: P
             await child.wait()
             last = gateway.reader.snapshot()
             assert not last.stopped  # nobody could say so: the heartbeat stands still
-            again = await asyncio.create_subprocess_exec(sys.executable, "-m", "plc", str(tmp_path / "plc.json"))
+            again = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "fieldtwin.plc", str(tmp_path / "plc.json")
+            )
             try:
                 await eventually(lambda: gateway.reader.snapshot().counter > last.counter)
                 out = gateway.reader.snapshot()
@@ -250,8 +252,8 @@ def test_logic_that_raises_stops_with_outputs_safe_and_can_be_asked_why(tmp_path
 
 
 STUCK = """
-from gateway.core.image import TagKind
-from plc.program import Program, var_local, var_retain
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, var_local, var_retain
 
 
 class Endless(Program):

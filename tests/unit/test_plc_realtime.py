@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from gateway.core.errors import Bug
-from plc.realtime import GUARD_NS, LEAD_NS, lead, monotonic_ns, run_task, sleep_until_ns
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.plc.realtime import GUARD_NS, LEAD_NS, lead, monotonic_ns, run_task, sleep_until_ns
 
 MS = 1_000_000
 

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import Bug
-from gateway.core.events import Consumer
-from gateway.core.image import Message
-from gateway.core.statemachine import STATE_CODES, encode_period
-from gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS
-from plc.program import ScanInfo
-from plc.relay import LOG_CAPACITY, QUEUE_CAPACITY, ControlLogic, DataLog, LogEntry, Relay
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.image import Message
+from fieldtwin.gateway.core.statemachine import STATE_CODES, encode_period
+from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE, STATUS
+from fieldtwin.plc.program import ScanInfo
+from fieldtwin.plc.relay import LOG_CAPACITY, QUEUE_CAPACITY, ControlLogic, DataLog, LogEntry, Relay
 
 PERIODS = st.integers(-32768, 32767)
 

@@ -12,10 +12,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.image import TagKind
-from plc.binding import BoundProgram
-from plc.program import Program, ScanInfo, var_local, var_retain
-from plc.retain import Retained, RetainFile, RetainFull
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.binding import BoundProgram
+from fieldtwin.plc.program import Program, ScanInfo, var_local, var_retain
+from fieldtwin.plc.retain import Retained, RetainFile, RetainFull
 
 KILLS = 60
 

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import pytest
 
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.image import INPUTS, OUTPUTS, TagKind, TagSpec
-from gateway.core.values import Quality, TagValue
-from plc.binding import InputBinding, image_for
-from plc.config import PlcConfig, ProgramConfig, TaskSpec
-from plc.runner import Runner
-from plc.task import StopReason
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, TagKind, TagSpec
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.plc.binding import InputBinding, image_for
+from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.task import StopReason
 
 MS = 1_000_000
 PLANT = {"d.go": TagSpec("d.go", TagKind.BOOL), "d.n": TagSpec("d.n", TagKind.INT)}
 MODULE = """
-from gateway.core.image import TagKind
-from plc.program import Program, var_input, var_output, var_retain
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, var_input, var_output, var_retain
 
 RAN = []
 HOOKS = {}
@@ -230,8 +230,8 @@ def test_tasks_that_make_no_sense_are_refused(tmp_path: Path, tasks: tuple[TaskS
 
 
 CHAIN = """
-from gateway.core.image import TagKind
-from plc.program import Program, var_input, var_local
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, var_input, var_local
 
 class First(Program):
     n = var_local(TagKind.INT, initial=0)

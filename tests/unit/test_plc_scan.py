@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import pytest
 
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.image import (
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.image import (
     INPUTS,
     OUTPUTS,
     Image,
@@ -20,9 +20,9 @@ from gateway.core.image import (
     message_tag,
     taken_name,
 )
-from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
-from plc.binding import BoundProgram, InputBinding, image_for, load_program
-from plc.program import (
+from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
+from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for, load_program
+from fieldtwin.plc.program import (
     Message,
     Outbox,
     Program,
@@ -34,7 +34,7 @@ from plc.program import (
     var_local,
     var_output,
 )
-from plc.scan import Scan
+from fieldtwin.plc.scan import Scan
 
 MS = 1_000_000
 PLANT = {
@@ -343,7 +343,13 @@ def test_an_integer_tag_widens_into_a_real_input() -> None:
 
 @pytest.mark.parametrize(
     "source",
-    ["relay.st", "python: plc.relay", "python: no.such.module:X", "python: plc.relay:Nothing", "python: json:loads"],
+    [
+        "relay.st",
+        "python: fieldtwin.plc.relay",
+        "python: no.such.module:X",
+        "python: fieldtwin.plc.relay:Nothing",
+        "python: json:loads",
+    ],
 )
 def test_sources_that_are_no_program_are_refused(source: str) -> None:
     with pytest.raises(FileInvalid):
@@ -351,7 +357,7 @@ def test_sources_that_are_no_program_are_refused(source: str) -> None:
 
 
 def test_a_program_is_loaded_from_a_source() -> None:
-    assert type(load_program("python: plc.relay:Relay")).__name__ == "Relay"
+    assert type(load_program("python: fieldtwin.plc.relay:Relay")).__name__ == "Relay"
 
 
 # -- forces, trips, changes ------------------------------------------------------------------------------------------

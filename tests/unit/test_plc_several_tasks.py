@@ -10,10 +10,10 @@ from click.testing import CliRunner
 from test_plc_runner import MS, Rig
 
 from fieldtwin.cli.options import NegativeNumbers
-from gateway.core.values import Quality, Reason
-from plc.config import TaskSpec
-from plc.sources import changed, sources
-from plc.task import StopReason
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.plc.config import TaskSpec
+from fieldtwin.plc.sources import changed, sources
+from fieldtwin.plc.task import StopReason
 
 FAST_AND_SLOW = (TaskSpec("fast", 10, 1), TaskSpec("slow", 100, 5))
 

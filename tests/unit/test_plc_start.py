@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
-from gateway.core.image import INPUTS, OUTPUTS, TagKind, TagSpec, message_tag
-from gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
-from plc.binding import InputBinding, image_for
-from plc.config import PlcConfig, ProgramConfig, TaskSpec
-from plc.runner import Runner
-from plc.start import InputsMissing, StartPolicy
-from plc.task import StopReason
+from fieldtwin.gateway.core.image import INPUTS, OUTPUTS, TagKind, TagSpec, message_tag
+from fieldtwin.gateway.core.values import NEVER, Quality, Reason, Scalar, TagValue
+from fieldtwin.plc.binding import InputBinding, image_for
+from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.start import InputsMissing, StartPolicy
+from fieldtwin.plc.task import StopReason
 
 MS = 1_000_000
 PLANT = {
@@ -35,8 +35,8 @@ VAR since : TON; scans : DINT; first : DINT; done : BOOL; END_VAR
 END_PROGRAM
 """
 PYTHON = """
-from gateway.core.image import TagKind
-from plc.program import Program, message_input, var_input, var_local, var_output
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, message_input, var_input, var_local, var_output
 
 class Fan(Program):
     temperature = var_input(TagKind.REAL)

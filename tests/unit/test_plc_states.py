@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from gateway.core.errors import Bug
-from gateway.core.image import TagKind
-from gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, STATES, delta
-from gateway.core.values import Quality, Reason, TagValue
-from plc.diagram import svg
-from plc.program import ScanInfo, var_input, var_local, var_output
-from plc.prove import Proof, machine_key, prove
-from plc.relay import Relay
-from plc.relay_proof import PROOF, Watched
-from plc.states import ANY, StateMachine, StateTable, Transition
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, STATES, delta
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.plc.diagram import svg
+from fieldtwin.plc.program import ScanInfo, var_input, var_local, var_output
+from fieldtwin.plc.prove import Proof, machine_key, prove
+from fieldtwin.plc.relay import Relay
+from fieldtwin.plc.relay_proof import PROOF, Watched
+from fieldtwin.plc.states import ANY, StateMachine, StateTable, Transition
 
 MS = 1_000_000
 

@@ -8,15 +8,15 @@ from typing import Any
 
 import pytest
 
-from gateway.core.errors import Unreachable, UsageError
-from gateway.core.image import INPUTS, TagKind, TagSpec
-from gateway.core.values import Quality, Reason, TagValue
-from plc.acts import Acts
-from plc.binding import BoundProgram, InputBinding, image_for
-from plc.config import PlcConfig, ProgramConfig
-from plc.runner import Runner
-from plc.states import ANY, StateMachine, StateTable, Transition
-from plc.tag_view import TagView, matches
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.core.image import INPUTS, TagKind, TagSpec
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.plc.acts import Acts
+from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.config import PlcConfig, ProgramConfig
+from fieldtwin.plc.runner import Runner
+from fieldtwin.plc.states import ANY, StateMachine, StateTable, Transition
+from fieldtwin.plc.tag_view import TagView, matches
 
 MS = 1_000_000
 UTC_NS = 1_700_000_000_000_000_000
@@ -25,8 +25,8 @@ PLANT = {
     "pump.speed": TagSpec("pump.speed", TagKind.INT, "rpm", limits=(0, 1500)),
 }
 MODULE = """
-from gateway.core.image import TagKind
-from plc.program import Program, var_input, var_local, var_output
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.plc.program import Program, var_input, var_local, var_output
 
 class Pump(Program):
     level = var_input(TagKind.REAL)

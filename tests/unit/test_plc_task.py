@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from gateway.core.errors import Bug
-from plc.histogram import Histogram
-from plc.program import ProgramFailed
-from plc.task import CyclicTask, StopReason, TaskConfig, TaskState, run_on_clock
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.plc.histogram import Histogram
+from fieldtwin.plc.program import ProgramFailed
+from fieldtwin.plc.task import CyclicTask, StopReason, TaskConfig, TaskState, run_on_clock
 
 MS = 1_000_000
 

@@ -8,8 +8,8 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.core.clock import NS_PER_MS
-from gateway.runtime.poll_schedule import SOONER, PollSchedule, Rate, spread
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.runtime.poll_schedule import SOONER, PollSchedule, Rate, spread
 
 PERIODS = st.integers(50, 5000)
 

@@ -7,9 +7,9 @@ from gateway_rig import PROFILES
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import DeviceProfile, RegisterRange, load_profile, resolve, resolve_address
-from gateway.core.yaml_file import parse
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile, RegisterRange, load_profile, resolve, resolve_address
+from fieldtwin.gateway.core.yaml_file import parse
 
 HEAD = 'device: test/device\nsource: "a test"\n'
 

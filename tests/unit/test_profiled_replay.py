@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.recorded_device import RecordedDevice, load_replay
-from emulators.replay.profiled import ProfiledReplay
-from emulators.replay.replay import ExchangeReplay
-from gateway.core.connection import RS232Connection
-from gateway.core.profile import load_profile
-from gateway.core.recording import Exchange
+from fieldtwin.emulators.recorded_device import RecordedDevice, load_replay
+from fieldtwin.emulators.replay.profiled import ProfiledReplay
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.gateway.core.connection import RS232Connection
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.recording import Exchange
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, UsageError
-from twin.prototype_file import Prototype, load_prototype
-from twin.system import System, load_system
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.twin.prototype_file import Prototype, load_prototype
+from fieldtwin.twin.system import System, load_system
 
 BUS = "can:fieldtwin/127.0.0.1:29536"
 SYSTEM = """fieldtwin: 1
@@ -28,7 +28,7 @@ plc:
   cycle_ms: 10
   programs:
     relay:
-      source: "python: plc.relay:Relay"
+      source: "python: fieldtwin.plc.relay:Relay"
       inputs: {command: {tag: modem.inbox}, sample: {tag: ctd.sample}}
       outputs: {period_s: ctd.sample_period_s, response: modem.outbox}
 """

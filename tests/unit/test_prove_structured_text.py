@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from st_bench import program
 
-from gateway.core.errors import UsageError
-from gateway.core.image import TagKind
-from gateway.core.values import Quality, Reason, TagValue
-from plc.blocks import MS, TON
-from plc.program import Program, ScanInfo, var_input, var_output
-from plc.prove import Given, Proof, prove
-from plc.st.program import StProgram
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.plc.blocks import MS, TON
+from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
+from fieldtwin.plc.prove import Given, Proof, prove
+from fieldtwin.plc.st.program import StProgram
 
 MOTOR = """
 PROGRAM Motor

@@ -99,7 +99,7 @@ HIDDEN = """
 import sys
 
 HIDDEN = (
-    "pymodbus", "canopen", "can", "serial", "msgspec", "pydantic", "yaml", "click", "rich", "gateway", "twin", "emulators", "plc"
+    "pymodbus", "canopen", "can", "serial", "msgspec", "pydantic", "yaml", "click", "rich"
 )
 
 class Hide:

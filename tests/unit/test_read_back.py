@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 from fan_hall import VirtualHall, hall
 
+from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.testhost.stepped_program import SteppedProgram
-from gateway.core.values import Quality, Reason
-from twin.system import load_system
-from twin.virtual import VirtualPrototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.virtual import VirtualPrototype
 
 NODE = """
 fieldtwin: 1

@@ -17,14 +17,14 @@ from canopen_slave_rig import NODE, RICH
 from click.testing import CliRunner, Result
 from dump_device_rig import device
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
 from fieldtwin.cli.main import cli
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.wallclock import WallClock
 
 
 def read(url: str, *arguments: str) -> Result:

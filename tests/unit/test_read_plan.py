@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import DeviceProfile, RegisterRange, Table, gap_text, resolve, resolve_gap
-from gateway.core.yaml_file import parse
-from gateway.devices.read_plan import GroupPlan, Learnt, Read, plan_reads, split
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile, RegisterRange, Table, gap_text, resolve, resolve_gap
+from fieldtwin.gateway.core.yaml_file import parse
+from fieldtwin.gateway.devices.read_plan import GroupPlan, Learnt, Read, plan_reads, split
 
 TYPES = {"uint16": 1, "float32": 2, "float64": 4}
 

@@ -11,22 +11,22 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
-from emulators.replay.replay import ExchangeReplay
-from emulators.replay.unit import ReplayUnit
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import RecordingReader
-from gateway.core.values import Quality
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import RecordingReader
+from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "scripts"))

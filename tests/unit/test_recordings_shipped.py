@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.models.seawater import C_35_15_0, T68_PER_T90, conductivity, salinity
-from emulators.signals import SignalTrack
-from gateway.core.recording import RecordingReader
+from fieldtwin.emulators.models.seawater import C_35_15_0, T68_PER_T90, conductivity, salinity
+from fieldtwin.emulators.signals import SignalTrack
+from fieldtwin.gateway.core.recording import RecordingReader
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = ("cast.jsonl", "incl.jsonl")

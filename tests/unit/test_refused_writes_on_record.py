@@ -13,10 +13,10 @@ from typing import Any
 from support import eventually, run
 from test_serve_writes import rig
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.refusals import KEPT, Cause, Refusals
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.refusals import KEPT, Cause, Refusals
+from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()
 

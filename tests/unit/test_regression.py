@@ -13,14 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldtwin.cli.main import cli
+from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.regression.as_scenario import Wanted, as_scenario
 from fieldtwin.regression.comparing import Allowed, Verdict, compare
 from fieldtwin.regression.story import Story, story_of
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.errors import UsageError
-from twin.system import load_system
+from fieldtwin.twin.system import load_system
 
 SYSTEM = load_system("observatory")
 S = 1_000_000_000

@@ -12,17 +12,17 @@ from typing import Any
 
 import pytest
 
-from emulators.virtual.loop import VirtualLoop
-from gateway.connections.tap import CaptureTap
-from gateway.core.connection import Direction
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.values import Quality
-from gateway.runtime.reconfigure import reconfigure
-from twin.physical import gateway_config
-from twin.prototype_file import load_prototype
-from twin.reloading import compare, limits_changed
-from twin.system import load_system
-from twin.virtual import VirtualPrototype
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.connections.tap import CaptureTap
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.values import Quality
+from fieldtwin.gateway.runtime.reconfigure import reconfigure
+from fieldtwin.twin.physical import gateway_config
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.reloading import compare, limits_changed
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.virtual import VirtualPrototype
 
 SYSTEM = """\
 fieldtwin: 1

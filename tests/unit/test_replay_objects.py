@@ -11,16 +11,16 @@ from canopen_slave_rig import RICH, Rig
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import NodeContext
-from emulators.context import UsedUp, WhenUsedUp
-from emulators.replay.can_log import CanLog, read_can_log
-from emulators.replay.objects import RecordedObjects, recorded_objects
-from emulators.virtual.loop import VirtualLoop
-from gateway.core.errors import FileInvalid, UsageError
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.virtual import VirtualPrototype
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import NodeContext
+from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.emulators.replay.can_log import CanLog, read_can_log
+from fieldtwin.emulators.replay.objects import RecordedObjects, recorded_objects
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.virtual import VirtualPrototype
 
 LOG = """\
 (100.000000) can0 605#4018100400000000

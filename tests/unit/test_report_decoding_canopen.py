@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from report_rig import MS, can, note, observatory
 
-from emulators.canopen.sdo_server import SdoServer
 from fieldtwin.decoding.decoder import Decoder, exchanges
 from fieldtwin.decoding.exchange import Exchange, Span
 from fieldtwin.decoding.sdo_watch import SdoWatch, Transfer
+from fieldtwin.emulators.canopen.sdo_server import SdoServer
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.protocols.canopen.sdo import Done, SdoDownload, SdoTransfer, SdoUpload, Send
+from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 from fieldtwin.scenarios.trace import Event, Kind
-from gateway.core.canframe import CanFrame
-from gateway.protocols.canopen.sdo import Done, SdoDownload, SdoTransfer, SdoUpload, Send
-from gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
 
 
 def only(events: list[Event]) -> Exchange:

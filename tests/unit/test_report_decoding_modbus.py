@@ -16,10 +16,10 @@ from fieldtwin.decoding.modbus_frames import splitter
 from fieldtwin.decoding.modbus_pdu import parse_request
 from fieldtwin.decoding.modbus_wire import ModbusWire, Unit
 from fieldtwin.decoding.tags import TagMap
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.protocols.modbus.ascii import lrc
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
 from fieldtwin.scenarios.trace import Event
-from gateway.core.profile import load_profile
-from gateway.protocols.modbus.ascii import lrc
-from gateway.protocols.modbus.crc import with_crc
 
 METER = Path(__file__).parents[2] / "profiles" / "devices" / "eastron-sdm630.yaml"
 

@@ -12,11 +12,11 @@ from report_rig import MS, observatory, run_trace
 
 from fieldtwin.cli.trace_command import command
 from fieldtwin.decoding.trace_file import read_events
+from fieldtwin.gateway.connections.tap import TapFile
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.scenarios.trace import Trace
-from gateway.connections.tap import TapFile
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.errors import FieldtwinError, FileInvalid
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.recording.rotating import RotatingFile
-from gateway.core.errors import Unreachable
 
 
 @pytest.mark.parametrize("lines", [0, 1])

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.rtu_receiver import FRAME_GAP_NS
-from emulators.modbus.unit import ModbusUnit
-from gateway.protocols.modbus.crc import with_crc
-from gateway.protocols.modbus.server_line import RtuRequests
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu_receiver import FRAME_GAP_NS
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.protocols.modbus.crc import with_crc
+from fieldtwin.gateway.protocols.modbus.server_line import RtuRequests
 
 WRONG = {
     "registers, byte count below the length": "10 0001 0001 02 0A0B 0C0D",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+from fieldtwin.gateway.core.image import message_tag
+from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.relay import Relay
+from fieldtwin.plc.states import StateMachine, StateTable, Transition
 from fieldtwin.running.states import StateWatch, state_words
-from gateway.core.image import message_tag
-from plc.binding import BoundProgram, InputBinding, image_for
-from plc.relay import Relay
-from plc.states import StateMachine, StateTable, Transition
-from twin.system import load_system
+from fieldtwin.twin.system import load_system
 
 
 class Gate(StateMachine):

@@ -14,12 +14,12 @@ from test_canopen_slave_lss import unnamed
 
 from fieldtwin.commissioning.can_ear import BusEar
 from fieldtwin.commissioning.scan_canopen import CanScan, CanScanner, CanScanOptions
-from gateway.connections.can_facts import CanFacts
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection, Connector
-from gateway.core.endpoint import Endpoint
-from gateway.protocols.canopen.configure import Identity
-from gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.connections.can_facts import CanFacts
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection, Connector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.protocols.canopen.configure import Identity
+from fieldtwin.gateway.protocols.canopen.nmt import NmtState
 
 URL = "can:fieldtwin/h:1"
 U32 = (0x00020192).to_bytes(4, "little")

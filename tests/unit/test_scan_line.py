@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from uart_line import UartLine, levels, sampled
 
-from emulators.modbus.bank import Span
-from emulators.modbus.rtu_receiver import with_crc
-from emulators.modbus.unit import ModbusUnit
 from fieldtwin.commissioning.progress import Progress
 from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.settings import LIKELY, name_of
 from fieldtwin.commissioning.traffic import LineEar
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 PORT = "rtu:/dev/ttyX"
 

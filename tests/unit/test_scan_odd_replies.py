@@ -15,8 +15,8 @@ from modbus_virtual import VirtualWire
 from fieldtwin.cli.scan_view import modbus_json, show_modbus, unit_ranges
 from fieldtwin.commissioning.odd_replies import OddReply
 from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 
 
 class Server:

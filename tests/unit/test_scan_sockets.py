@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from modbus_virtual import VirtualWire
 
-from emulators.modbus.bank import Span
-from emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.commissioning.alike import SPREAD, likeness, spread_over
 from fieldtwin.commissioning.scan_modbus import ModbusScan, ModbusScanner, ScanOptions
 from fieldtwin.commissioning.settings import TCP_UNITS
 from fieldtwin.commissioning.sweep import Send, UnitAnswer, UnitSweep
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
+from fieldtwin.emulators.modbus.bank import Span
+from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
 
 Reply = Callable[[int], bytes | None]
 """Unit -> the PDU that it answers with; None: silence; b"": it hangs up."""

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sdo_block_peer import BlockServer
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
-from gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, Send, Stray, Wait
-from gateway.protocols.canopen.sdo_block import MAX_REPEATS, SdoBlockDownload, SdoBlockUpload, crc16
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
+from fieldtwin.gateway.protocols.canopen.sdo import Done, Failed, SdoTransfer, Send, Stray, Wait
+from fieldtwin.gateway.protocols.canopen.sdo_block import MAX_REPEATS, SdoBlockDownload, SdoBlockUpload, crc16
 
 MS = 1_000_000
 TIMEOUT = 500 * MS

@@ -7,10 +7,10 @@ from canopen_master_bus import frame
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
-from gateway.protocols.canopen import abort_codes
-from gateway.protocols.canopen.sdo import (
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted, UsageError
+from fieldtwin.gateway.protocols.canopen import abort_codes
+from fieldtwin.gateway.protocols.canopen.sdo import (
     MAX_STRAYS,
     Done,
     Failed,

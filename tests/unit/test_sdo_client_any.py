@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from modbus_virtual import run_virtually
 from sdo_block_peer import BlockServer
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import FieldtwinError
-from gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
 LENGTHS = {0: 4, 1: 12, 2: 84}
 """Subindex: bytes of the object. 4 are read expedited, 12 segmented or in one block, 84 in two."""

@@ -11,10 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import eventually
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import FieldtwinError, ReplyTimeout
-from gateway.protocols.canopen.late_replies import MAX_OUTSTANDING, PROBES, LateReplies
-from gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import FieldtwinError, ReplyTimeout
+from fieldtwin.gateway.protocols.canopen.late_replies import MAX_OUTSTANDING, PROBES, LateReplies
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
 M, N = (0x2000, 0), (0x2000, 1)
 

@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from fieldtwin.cli.main import COMMANDS, cli
 from fieldtwin.cli.options import Secret
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.url_secrets import has_password, without_password
+from fieldtwin.gateway.store.knowledge import open_knowledge
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.options import RunOptions
-from gateway.core.errors import FieldtwinError, UsageError
-from gateway.core.url_secrets import has_password, without_password
-from gateway.store.knowledge import open_knowledge
-from gateway.wallclock import WallClock
-from twin.system import load_system
-from twin.thread_place import plant_carrier, twin_carrier
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.thread_place import plant_carrier, twin_carrier
 
 CHECKOUT = Path(__file__).parents[2]
 WORD = "s3cret"

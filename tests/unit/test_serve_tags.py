@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import eventually, run
 
-from gateway.connections.tcp import TcpConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import (
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import (
     EndpointBusy,
     FieldtwinError,
     FileInvalid,
@@ -23,15 +23,15 @@ from gateway.core.errors import (
     NotAllowed,
     Unreachable,
 )
-from gateway.core.nursery import Nursery
-from gateway.core.values import Quality, Reason, Scalar, TagValue
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.runtime.bridge_tcp import Caller
-from gateway.runtime.serve import ServeConfig, ServedTag, TagServer
-from gateway.runtime.serve_codec import FORMATS, pack, unpack
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
-from twin.system import load_system
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.runtime.bridge_tcp import Caller
+from fieldtwin.gateway.runtime.serve import ServeConfig, ServedTag, TagServer
+from fieldtwin.gateway.runtime.serve_codec import FORMATS, pack, unpack
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.system import load_system
 
 CLOCK = WallClock()
 TAGS = (

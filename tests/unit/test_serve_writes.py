@@ -12,20 +12,20 @@ import pytest
 from gateway_rig import FieldBus, RunningBus, profile, running_bus, unit
 from support import eventually, run
 
-from emulators.modbus.bank import MapBank, Span
-from gateway.connections.tcp import TcpConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ModbusExceptionReply
-from gateway.core.nursery import Nursery
-from gateway.devices.config import DeviceConfig
-from gateway.devices.register_device import RegisterDriver, SensorDriver
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.output import Output
-from gateway.runtime.outputs import OutputWriter
-from gateway.runtime.serve import ServeConfig, ServedTag, TagServer
-from gateway.runtime.tags import TagTable
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver, SensorDriver
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.output import Output
+from fieldtwin.gateway.runtime.outputs import OutputWriter
+from fieldtwin.gateway.runtime.serve import ServeConfig, ServedTag, TagServer
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()
 PROFILE = """

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 from support import run
 
+from fieldtwin.gateway.core.errors import EndpointBusy, UsageError
+from fieldtwin.gateway.core.latency import BOUNDS_MS, Latencies
 from fieldtwin.service.exposition import CONTENT_TYPE, Family, render
 from fieldtwin.service.metrics import MOST_DEVICES, Snapshot, families
 from fieldtwin.service.metrics_server import MOST_CLIENTS, MetricsServer, parse_place
-from gateway.core.errors import EndpointBusy, UsageError
-from gateway.core.latency import BOUNDS_MS, Latencies
 
 
 def device(bus: str, online: bool = True, **more: Any) -> dict[str, Any]:

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from support import run
 
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.running.shadowing import Shadowing
-from gateway.store.event import Event, Kind
-from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from twin.instance import Instance
-from twin.status import encode_status
-from twin.system import load_system
+from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.status import encode_status
+from fieldtwin.twin.system import load_system
 
 NOW_MS = 1_790_000_000_000
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.codec import NUMBERS, ORDERS, decode, encode, register_count
-from emulators.context import UsedUp, WhenUsedUp
-from emulators.signals import SignalPlayer, SignalTrack
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import Bug, FileInvalid, UsageError
-from gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo, SignalRow
+from fieldtwin.emulators.codec import NUMBERS, ORDERS, decode, encode, register_count
+from fieldtwin.emulators.context import UsedUp, WhenUsedUp
+from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import Bug, FileInvalid, UsageError
+from fieldtwin.gateway.core.recording import RecordingHeader, RecordingWriter, SignalInfo, SignalRow
 
 START_NS = 5 * NS_PER_S
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.journal import HeldJournal
-from emulators.simulation.python_model import PythonModel
-from emulators.simulation.signals import SimulatedSignals
-from emulators.simulation.simulation import MAX_STEPS, Simulation, by_formulas, by_model
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.simulation.python_model import PythonModel
+from fieldtwin.emulators.simulation.signals import SimulatedSignals
+from fieldtwin.emulators.simulation.simulation import MAX_STEPS, Simulation, by_formulas, by_model
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 
 START = 5 * NS_PER_S
 STEP = NS_PER_S // 10

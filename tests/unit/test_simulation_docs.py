@@ -8,15 +8,15 @@ from random import Random
 
 import pytest
 
-from emulators.simulation.formula import FUNCTIONS, Formula
-from emulators.simulation.python_model import PythonModel
-from emulators.simulation.simulation import Simulation, by_formulas, by_model
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid
-from gateway.core.yaml_file import load
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.system_schema import SimulationForm
+from fieldtwin.emulators.simulation.formula import FUNCTIONS, Formula
+from fieldtwin.emulators.simulation.python_model import PythonModel
+from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, by_model
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.yaml_file import load
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.system_schema import SimulationForm
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "simulation.md").read_text(encoding="utf-8")

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.simulation.formula import FUNCTIONS, Formula
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.simulation.formula import FUNCTIONS, Formula
+from fieldtwin.gateway.core.errors import UsageError
 
 
 def value(text: str, t: float = 0.0, **names: float) -> float:

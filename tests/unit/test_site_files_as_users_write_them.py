@@ -10,9 +10,9 @@ from click.testing import CliRunner
 from template_rig import fieldtwin
 
 from fieldtwin.cli.options import Duration
-from gateway.core.errors import FileInvalid
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 PROFILE = """
 device: test/fan

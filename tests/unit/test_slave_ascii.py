@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.modbus.ascii import MAX_CHARACTERS, AsciiReceiver, AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.emulators.modbus.ascii import MAX_CHARACTERS, AsciiReceiver, AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 
 def framed(text: str) -> bytes:

@@ -14,14 +14,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.line import LineSlave
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_S
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.line import LineSlave
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 MEGABYTES = int(os.environ.get("FIELDTWIN_FLOOD_MB", "1"))
 CHUNK = 65536

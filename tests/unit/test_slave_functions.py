@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.modbus.bank import Acknowledge, CellHooks, IllegalValue, MapBank, NegativeAcknowledge, Span
-from emulators.modbus.fifo import FifoQueues
-from emulators.modbus.file_records import FileRecords
-from emulators.modbus.identification import MAX_OBJECT, Identification
-from emulators.modbus.unit import ALL_FUNCTIONS, ModbusUnit, UnitLimits
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import Acknowledge, CellHooks, IllegalValue, MapBank, NegativeAcknowledge, Span
+from fieldtwin.emulators.modbus.fifo import FifoQueues
+from fieldtwin.emulators.modbus.file_records import FileRecords
+from fieldtwin.emulators.modbus.identification import MAX_OBJECT, Identification
+from fieldtwin.emulators.modbus.unit import ALL_FUNCTIONS, ModbusUnit, UnitLimits
+from fieldtwin.gateway.core.errors import UsageError
 
 BASIC = {0: b"fieldtwin", 1: b"FT-1", 2: b"V2.11"}
 

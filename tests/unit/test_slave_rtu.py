@@ -6,12 +6,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.rtu_receiver import RtuReceiver
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu_receiver import RtuReceiver
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import UsageError
 
 PAUSE_NS = 100 * NS_PER_MS
 BYTE_NS = 572_917  # 11 bits at 19200 baud

@@ -6,9 +6,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.modbus.bank import Acknowledge, Busy, IllegalAddress, IllegalValue, MapBank, Refusal, Span, Table
-from emulators.modbus.unit import ALL_FUNCTIONS, ModbusUnit, UnitLimits
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.modbus.bank import (
+    Acknowledge,
+    Busy,
+    IllegalAddress,
+    IllegalValue,
+    MapBank,
+    Refusal,
+    Span,
+    Table,
+)
+from fieldtwin.emulators.modbus.unit import ALL_FUNCTIONS, ModbusUnit, UnitLimits
+from fieldtwin.gateway.core.errors import UsageError
 
 
 def make_bank() -> MapBank:

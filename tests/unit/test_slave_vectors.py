@@ -8,16 +8,16 @@ from typing import Any
 
 import pytest
 
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.fifo import FifoQueues
-from emulators.modbus.identification import Identification
-from emulators.modbus.line import LineSlave
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit, UnitLimits
-from gateway.core.clock import NS_PER_MS
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.fifo import FifoQueues
+from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.line import LineSlave
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 VECTORS = tomllib.loads((Path(__file__).parents[1] / "vectors" / "modbus_slave.toml").read_text())["vector"]
 LINE = SerialSettings(19200, "8E1")

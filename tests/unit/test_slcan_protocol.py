@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.endpoints.slcan_protocol import MAX_LINE, SlcanSession
-from gateway.core.can_error import CanErrorState, overrun_frame, state_frame, violation_frame
-from gateway.core.canframe import CanFrame
+from fieldtwin.emulators.endpoints.slcan_protocol import MAX_LINE, SlcanSession
+from fieldtwin.gateway.core.can_error import CanErrorState, overrun_frame, state_frame, violation_frame
+from fieldtwin.gateway.core.canframe import CanFrame
 
 BEL = b"\a"
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.core.errors import Desync, UsageError
-from gateway.core.values import Quality, Reason
-from gateway.store.event import Event, Kind, Value
-from twin.sparkplug import DataType, Metric, Payload, decode_payload, encode_payload, topic, type_of
-from twin.thread_frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
-from twin.thread_sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication, Message
+from fieldtwin.gateway.core.errors import Desync, UsageError
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.gateway.store.event import Event, Kind, Value
+from fieldtwin.twin.sparkplug import DataType, Metric, Payload, decode_payload, encode_payload, topic, type_of
+from fieldtwin.twin.thread_frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
+from fieldtwin.twin.thread_sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication, Message
 
 SCHEMA = Schema(("ctd.pressure", "ctd.serial", "relay"))
 VALUES: st.SearchStrategy[Value] = (

@@ -17,9 +17,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from st_bench import program, run, scan, value
 
-from gateway.core.errors import FileInvalid
-from plc.st.program import StProgram
-from plc.st.values import LogicError
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.program import StProgram
+from fieldtwin.plc.st.values import LogicError
 
 WIDTH = {"SINT": 8, "INT": 16, "DINT": 32, "LINT": 64, "USINT": 8, "UINT": 16, "UDINT": 32, "ULINT": 64}
 BITS = {"BYTE": 8, "WORD": 16, "DWORD": 32, "LWORD": 64}

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from st_bench import run, value
 
-from gateway.core.errors import FileInvalid
-from plc.st.values import LogicError
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.values import LogicError
 
 INTEGERS = {"SINT": 8, "INT": 16, "DINT": 32, "LINT": 64}
 

@@ -15,11 +15,11 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from st_bench import scan
 
-from gateway.core.errors import FileInvalid
-from gateway.core.values import Quality, TagValue
-from plc.st.compile import compile_text
-from plc.st.program import program_class
-from plc.st.values import LogicError
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.values import Quality, TagValue
+from fieldtwin.plc.st.compile import compile_text
+from fieldtwin.plc.st.program import program_class
+from fieldtwin.plc.st.values import LogicError
 
 ROOT = Path(__file__).resolve().parents[2]
 RELAY = (ROOT / "profiles" / "systems" / "relay.st").read_text()

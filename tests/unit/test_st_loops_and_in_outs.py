@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from st_bench import program, run, scan
 
-from gateway.core.errors import FileInvalid
-from plc.st.values import LogicError
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.values import LogicError
 
 
 def c_loop(first: int, last: int, by: int) -> tuple[list[int], int]:

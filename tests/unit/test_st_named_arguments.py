@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 from st_bench import program, run, value
 
-from gateway.core.errors import FileInvalid
-from plc.st.standard import FUNCTIONS
-from plc.st.types import ELEMENTARY
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.standard import FUNCTIONS
+from fieldtwin.plc.st.types import ELEMENTARY
 
 S = 1_000_000_000
 

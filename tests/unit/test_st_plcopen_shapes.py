@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from gateway.core.errors import FileInvalid
-from plc.program import Role, ScanInfo
-from plc.st.program import StProgram, load_file
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.program import Role, ScanInfo
+from fieldtwin.plc.st.program import StProgram, load_file
 
 SHAPES = Path(__file__).parents[1] / "vectors" / "plcopen"
 MS = 1_000_000

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.image import Message
+from fieldtwin.plc.binding import load_program
+from fieldtwin.plc.program import Outbox, ScanInfo
+from fieldtwin.plc.relay import Relay
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from gateway.core.image import Message
-from plc.binding import load_program
-from plc.program import Outbox, ScanInfo
-from plc.relay import Relay
 
 SYSTEMS = Path(__file__).parents[2] / "profiles/systems"
 MAILBOXES = ("response", "log")
@@ -53,7 +53,7 @@ def hash_of(source: str, folder: Path, seed: int) -> tuple[str, int, list[str]]:
     folder.mkdir()
     for file in SYSTEMS.glob("observatory*.yaml"):
         text = file.read_text(encoding="utf-8")
-        (folder / file.name).write_text(text.replace('"python: plc.relay:Relay"', source), encoding="utf-8")
+        (folder / file.name).write_text(text.replace('"python: fieldtwin.plc.relay:Relay"', source), encoding="utf-8")
     shutil.copy(SYSTEMS / "relay.st", folder)
     run = VirtualRun(VirtualOptions(str(folder / "observatory.yaml"), 12.0, seed=seed, commands=(1, -1)))
     run.run()
@@ -62,7 +62,7 @@ def hash_of(source: str, folder: Path, seed: int) -> tuple[str, int, list[str]]:
 
 
 def test_the_observatory_cannot_tell_them_apart(tmp_path: Path) -> None:
-    python = hash_of('"python: plc.relay:Relay"', tmp_path / "python", 7)
+    python = hash_of('"python: fieldtwin.plc.relay:Relay"', tmp_path / "python", 7)
     text = hash_of("relay.st", tmp_path / "text", 7)
     assert text == python
     assert python[1:] == (python[1], ["STANDBY", "ACTIVE", "OFF"])

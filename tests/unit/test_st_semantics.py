@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from st_bench import program, run, scan, value
 
-from gateway.core.errors import FileInvalid
-from plc.st.values import LogicError
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.plc.st.values import LogicError
 
 POINT = "TYPE Point : STRUCT x : INT; a : ARRAY[1..2] OF INT; END_STRUCT; END_TYPE\n"
 

@@ -11,10 +11,10 @@ from typing import Any
 
 from st_bench import scan
 
-from gateway.core.image import INPUTS
-from plc.binding import image_for, load_program
-from plc.config import PlcConfig, ProgramConfig, TaskSpec
-from plc.runner import Runner
+from fieldtwin.gateway.core.image import INPUTS
+from fieldtwin.plc.binding import image_for, load_program
+from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.runner import Runner
 
 MS = 1_000_000
 TEXT = """

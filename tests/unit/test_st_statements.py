@@ -8,12 +8,12 @@ import msgspec
 import pytest
 from st_bench import program, run, scan
 
-from gateway.core.errors import FileInvalid
-from gateway.core.values import Quality, Reason, TagValue
-from plc.binding import BoundProgram
-from plc.blocks import BLOCKS as STANDARD_BLOCKS
-from plc.program import ProgramFailed, Role
-from plc.scan import failed
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.plc.binding import BoundProgram
+from fieldtwin.plc.blocks import BLOCKS as STANDARD_BLOCKS
+from fieldtwin.plc.program import ProgramFailed, Role
+from fieldtwin.plc.scan import failed
 
 
 def test_if_takes_the_first_branch_that_holds() -> None:

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from emulators.emulator import EmulatedUnit
-from emulators.modbus.unit import ModbusUnit, UnitLimits
-from emulators.models.register_device import StatedRegisters, add_own_functions
-from emulators.replay.profiled import ProfiledReplay
-from emulators.replay.replay import ExchangeReplay
-from emulators.stated import parts_of
+from fieldtwin.emulators.emulator import EmulatedUnit
+from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
+from fieldtwin.emulators.models.register_device import StatedRegisters, add_own_functions
+from fieldtwin.emulators.replay.profiled import ProfiledReplay
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.stated import parts_of
+from fieldtwin.gateway.core.connection import RS232Connection
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import Exchange
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from gateway.core.connection import RS232Connection
-from gateway.core.errors import FieldtwinError, FileInvalid
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import Exchange
 
 PROFILE = """
 device: mysite/tank
@@ -227,7 +227,7 @@ devices:
     busy: {every: 20, for_ms: 150}
 """
 IDLE = """
-from plc.program import Program
+from fieldtwin.plc.program import Program
 
 
 class Idle(Program):

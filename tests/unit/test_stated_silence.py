@@ -9,11 +9,11 @@ import pytest
 from modbus_virtual import VirtualLoop, run_virtually
 from virtual_bus import VirtualLine
 
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from gateway.core.errors import Unreachable
-from twin import instance
-from twin.instance import Instance, runtime_root
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.twin import instance
+from fieldtwin.twin.instance import Instance, runtime_root
 
 STRANGER = 65534
 needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder to another user")

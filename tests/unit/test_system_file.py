@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.device import Communication
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import CommandListMismatch, EndpointBusy, FileInvalid, UsageError
-from gateway.devices.config import BusConfig
-from twin.data_files import data_root, find, find_recording
-from twin.instance import Instance, runtime_root
-from twin.mapping import MappedConnector, mapped_endpoint, mapping_from_json, mapping_to_json
-from twin.physical import gateway_config, image_layout, plc_config
-from twin.prototype_file import load_prototype
-from twin.system import load_system
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.device import Communication
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import CommandListMismatch, EndpointBusy, FileInvalid, UsageError
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.twin.data_files import data_root, find, find_recording
+from fieldtwin.twin.instance import Instance, runtime_root
+from fieldtwin.twin.mapping import MappedConnector, mapped_endpoint, mapping_from_json, mapping_to_json
+from fieldtwin.twin.physical import gateway_config, image_layout, plc_config
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
 
 
 def test_the_observatory_is_what_the_paper_says() -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from gateway.core.errors import FileInvalid
-from twin.physical import gateway_config
-from twin.system import System, load_system
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.twin.physical import gateway_config
+from fieldtwin.twin.system import System, load_system
 
 PROFILE = """
 device: mysite/meter

@@ -11,19 +11,19 @@ import pytest
 from gateway_rig import LAN, PROFILES, FieldBus, running_bus
 from support import eventually, run
 
-from emulators.modbus.unit import ModbusUnit
-from emulators.models.mailbox_modem import ModemPair
-from gateway.core.errors import Unreachable
-from gateway.core.profile import load_profile
-from gateway.core.values import COMMAND, RESPONSE
-from gateway.devices.config import DeviceConfig
-from gateway.devices.transmitter import TransmitterDriver
-from gateway.runtime.audit import AuditLog
-from gateway.runtime.mailbox_pump import MailboxPump
-from gateway.runtime.modbus_bus import Job
-from gateway.runtime.tags import TagTable
-from gateway.runtime.taken import TakenFile
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.mailbox_modem import ModemPair
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.core.values import COMMAND, RESPONSE
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.transmitter import TransmitterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.mailbox_pump import MailboxPump
+from fieldtwin.gateway.runtime.modbus_bus import Job
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.runtime.taken import TakenFile
+from fieldtwin.gateway.wallclock import WallClock
 
 PROFILE = load_profile(PROFILES / "modem-mailbox.yaml")
 POLL = {"inbox": 20}

@@ -13,14 +13,14 @@ from pathlib import Path
 import pytest
 from template_rig import CHECKOUT, SHIPPED, fieldtwin, no, own_system, packed, reworked, unpack_zip
 
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.running.template_here import system_file
-from gateway.core.errors import FileInvalid, Unreachable, UsageError
-from twin import software
-from twin.software import modules_hash, wheel_hash
-from twin.template import MANIFEST
-from twin.template_check import differences, examine, software_difference
-from twin.template_pack import Extras
-from twin.template_package import Content, FolderPackage, ZipPackage, open_package
+from fieldtwin.twin import software
+from fieldtwin.twin.software import modules_hash, wheel_hash
+from fieldtwin.twin.template import MANIFEST
+from fieldtwin.twin.template_check import differences, examine, software_difference
+from fieldtwin.twin.template_pack import Extras
+from fieldtwin.twin.template_package import Content, FolderPackage, ZipPackage, open_package
 
 
 @pytest.fixture
@@ -108,19 +108,19 @@ def test_a_program_that_is_installed_elsewhere_cannot_be_packed(dam: Path, tmp_p
 def test_a_wheel_of_other_software_is_refused(dam: Path, tmp_path: Path) -> None:
     wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
-        archive.writestr("twin/__init__.py", "")
+        archive.writestr("fieldtwin/twin/__init__.py", "")
     with pytest.raises(FileInvalid, match="other software than is running here"):
         packed(dam, tmp_path / "T.zip", Extras(wheel=wheel))
 
 
 def test_a_wheel_has_the_hash_of_what_it_installs(tmp_path: Path) -> None:
     wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
-    (tmp_path / "x" / "plc" / "__pycache__").mkdir(parents=True)
-    (tmp_path / "x" / "plc" / "a.py").write_text("a = 1\n")
-    (tmp_path / "x" / "plc" / "__pycache__" / "a.pyc").write_text("left out")
+    (tmp_path / "x" / "fieldtwin" / "plc" / "__pycache__").mkdir(parents=True)
+    (tmp_path / "x" / "fieldtwin" / "plc" / "a.py").write_text("a = 1\n")
+    (tmp_path / "x" / "fieldtwin" / "plc" / "__pycache__" / "a.pyc").write_text("left out")
     with zipfile.ZipFile(wheel, "w") as archive:
         archive.writestr("fieldtwin/_data/profiles/x.yaml", "data is no module")
-        archive.writestr("plc/a.py", "a = 1\n")
+        archive.writestr("fieldtwin/plc/a.py", "a = 1\n")
     assert wheel_hash(wheel) == ("9.9", modules_hash(tmp_path / "x"))
 
 
@@ -230,22 +230,23 @@ def test_a_damaged_template_is_not_equal_to_a_whole_one(dam: Path, tmp_path: Pat
     assert "bad.zip: devices/tilt.yaml: not what was packed" in done.stderr
 
 
-def test_the_wheel_in_a_template_is_the_software_that_its_manifest_names(dam: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "place", ["fieldtwin/plc/backdoor.py", "backdoor.py", "backdoor.pth", "fieldtwin/plc/scan.pyc"]
+)
+def test_the_wheel_in_a_template_is_the_software_that_its_manifest_names(dam: Path, tmp_path: Path, place: str) -> None:
     """Of a stranger's: the hash of the file says that it is the file that was packed, and no more."""
     wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w") as archive:
-        for name in ("emulators", "fieldtwin", "gateway", "plc", "twin"):
-            for path in (CHECKOUT / name).rglob("*.py"):
-                archive.write(path, path.relative_to(CHECKOUT).as_posix())
-            for path in (CHECKOUT / name).rglob("*.*"):
-                if path.suffix not in (".py", ".pyc"):
+        for parent, _, files in os.walk(CHECKOUT / "fieldtwin", followlinks=True):
+            for path in (Path(parent, file) for file in files):
+                if path.suffix != ".pyc":
                     archive.write(path, path.relative_to(CHECKOUT).as_posix())
     packed(dam, tmp_path / "T", Extras(wheel=wheel))
     manifest = FolderPackage(tmp_path / "T").manifest
     assert examine(tmp_path / "T", manifest).name == "dam"
     inside = tmp_path / "T" / manifest.software.wheel
     with zipfile.ZipFile(inside, "a") as archive:
-        archive.writestr("plc/backdoor.py", "open('/tmp/x', 'w')\n")
+        archive.writestr(place, "open('/tmp/x', 'w')\n")
     with pytest.raises(FileInvalid, match=r"other software than the manifest says.*expected 9\.9, modules"):
         examine(tmp_path / "T", manifest, shown=Path("T.zip"))
     inside.write_bytes(b"no wheel")
@@ -260,7 +261,7 @@ def test_a_wheel_that_is_a_bomb_is_refused_before_it_is_unpacked(
     wheel = tmp_path / "fieldtwin-9.9-py3-none-any.whl"
     with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
         for n in range(17):
-            archive.writestr(f"plc/{n}.py", bytes(1 << 20))
+            archive.writestr(f"fieldtwin/plc/{n}.py", bytes(1 << 20))
     with pytest.raises(FileInvalid, match="too large for a module"):
         wheel_hash(wheel)
     with wheel.open("ab") as file:

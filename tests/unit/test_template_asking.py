@@ -13,12 +13,12 @@ from click.testing import CliRunner, Result
 from template_rig import own_system, packed, with_python
 
 from fieldtwin.cli.main import cli
+from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.running.template_here import Stranger, agree, system_file
 from fieldtwin.running.template_scenarios import agree_to_scenario
 from fieldtwin.testhost.host import Host
-from gateway.core.errors import NotAllowed
-from twin.system import load_system
-from twin.template_package import open_package, unpack
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.template_package import open_package, unpack
 
 CODE = ("systems/helper.py", "systems/site_logic.py")
 SCENARIO = "scenario: the tilt\nsystem: SYSTEM\nsteps:\n  - pause: 1s\n"

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from template_rig import SHIPPED, fieldtwin, no, own_system, packed, reworked, with_python, yes
 
+from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.running.template_here import Stranger, system_file
-from gateway.core.errors import NotAllowed
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.template import MANIFEST
-from twin.template_check import examine
-from twin.template_package import FolderPackage
-from twin.template_reach import reach
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.template import MANIFEST
+from fieldtwin.twin.template_check import examine
+from fieldtwin.twin.template_package import FolderPackage
+from fieldtwin.twin.template_reach import reach
 
 
 @pytest.fixture

@@ -16,13 +16,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from template_rig import add, own_system, packed, reworked, unpack_zip, yes
 
+from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.running.template_here import system_file
-from gateway.core.errors import FileInvalid
-from twin.prototype_file import load_prototype
-from twin.system import System, load_system
-from twin.template import MANIFEST, check_path, parse_manifest
-from twin.template_check import examine
-from twin.template_package import FolderPackage, open_package
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.template import MANIFEST, check_path, parse_manifest
+from fieldtwin.twin.template_check import examine
+from fieldtwin.twin.template_package import FolderPackage, open_package
 
 
 @pytest.fixture

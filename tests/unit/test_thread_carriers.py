@@ -15,25 +15,25 @@ from support import eventually
 from support import run as run_really
 from thread_rig import SCHEMA, ShakyCarrier, Twin, WatchedCarrier, equal, value
 
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
-from emulators.virtual.seal import sealed
-from gateway.connections.listeners import TcpListener
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
-from gateway.core.nursery import Nursery
-from gateway.devices.config import BusConfig, DeviceConfig
-from gateway.store.event import Event, Kind
-from gateway.wallclock import WallClock
-from twin.prototype import DigitalTwinPrototype
-from twin.prototype_file import load_prototype
-from twin.system import load_system
-from twin.thread_frames import Ack, Ask, Frame, Refused, Schema
-from twin.thread_link import Carrier
-from twin.thread_modem import ModemCarrier
-from twin.thread_tcp import TcpDialler, TcpListening
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.prototype import DigitalTwinPrototype
+from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.thread_frames import Ack, Ask, Frame, Refused, Schema
+from fieldtwin.twin.thread_link import Carrier
+from fieldtwin.twin.thread_modem import ModemCarrier
+from fieldtwin.twin.thread_tcp import TcpDialler, TcpListening
 
 ADDRESS = Endpoint.parse("tcp://127.0.0.1:7000")
 

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from thread_frames_rig import EVENTS, SCHEMA
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.store.event import Event, Kind, merged, without
-from twin.thread_core import WINDOW, Effect, Incoming, Keep, NoteLost, Open, Outgoing
-from twin.thread_frames import (
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.store.event import Event, Kind, merged, without
+from fieldtwin.twin.thread_core import WINDOW, Effect, Incoming, Keep, NoteLost, Open, Outgoing
+from fieldtwin.twin.thread_frames import (
     Ack,
     Ask,
     Data,

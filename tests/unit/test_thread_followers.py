@@ -12,15 +12,15 @@ from typing import Any
 import pytest
 from thread_rig import SCHEMA, Twin, equal, value
 
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
-from emulators.virtual.seal import sealed
-from gateway.core.connection import ByteConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
-from twin.thread_link import Unwelcome
-from twin.thread_tcp import ANSWERS_WITHIN_S, LET_IN_WITHIN_S, TcpDialler, TcpListening
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.connection import ByteConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.twin.thread_link import Unwelcome
+from fieldtwin.twin.thread_tcp import ANSWERS_WITHIN_S, LET_IN_WITHIN_S, TcpDialler, TcpListening
 
 PORTS = itertools.count(7000)
 

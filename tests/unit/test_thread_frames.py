@@ -8,9 +8,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from thread_frames_rig import EVENTS, ORIGIN, SCHEMA, TAG, numbered, there
 
-from gateway.core.errors import Desync
-from gateway.store.event import Event
-from twin.thread_frames import (
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.thread_frames import (
     Ack,
     Ask,
     Data,

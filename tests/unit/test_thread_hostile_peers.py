@@ -19,23 +19,23 @@ from test_thread_carriers import modems, until_equal, virtually
 from test_thread_mqtt import edge, host
 from thread_rig import SCHEMA, Twin, WatchedCarrier, equal, value
 
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import VirtualLoop
-from emulators.virtual.ports import MemoryNet
-from gateway.connections.listeners import TcpListener
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.tcp import TcpConnection
-from gateway.core.clock import Clock
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
-from gateway.store.event import Event, Kind
-from gateway.wallclock import WallClock
-from twin import thread_tcp
-from twin.command_gate import OLD_MS, CommandGate
-from twin.mape.execute import Bounds
-from twin.thread_frames import Ack, Data, Frame, Hello, tag_of
-from twin.thread_link import Carrier, Link
-from twin.thread_tcp import TcpDialler, TcpListening
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.ports import MemoryNet
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin import thread_tcp
+from fieldtwin.twin.command_gate import OLD_MS, CommandGate
+from fieldtwin.twin.mape.execute import Bounds
+from fieldtwin.twin.thread_frames import Ack, Data, Frame, Hello, tag_of
+from fieldtwin.twin.thread_link import Carrier, Link
+from fieldtwin.twin.thread_tcp import TcpDialler, TcpListening
 
 CLOCK = WallClock()
 Settled = Callable[[Twin, Twin], Awaitable[None]]

@@ -11,13 +11,13 @@ from mosquitto_here import Mosquitto, broker
 from support import eventually, run
 from thread_rig import SCHEMA, ShakyCarrier, Twin, equal, value
 
-from gateway.core.errors import Unreachable
-from gateway.store.event import Event, Kind
-from gateway.wallclock import WallClock
-from twin.sparkplug import decode_payload
-from twin.thread_link import Carrier, Unwelcome
-from twin.thread_mqtt import Broker, MqttCarrier
-from twin.thread_sparkplug import EdgeNode, HostApplication
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.sparkplug import decode_payload
+from fieldtwin.twin.thread_link import Carrier, Unwelcome
+from fieldtwin.twin.thread_mqtt import Broker, MqttCarrier
+from fieldtwin.twin.thread_sparkplug import EdgeNode, HostApplication
 
 pytestmark = pytest.mark.interop
 CLOCK = WallClock()

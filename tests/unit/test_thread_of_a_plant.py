@@ -6,18 +6,18 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.image import INPUTS, OUTPUTS
+from fieldtwin.gateway.core.statemachine import STATE_CODES
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
-from gateway.core.errors import UsageError
-from gateway.core.image import INPUTS, OUTPUTS
-from gateway.core.statemachine import STATE_CODES
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.store.event import Event, Kind
-from gateway.wallclock import WallClock
-from twin.physical import gateway_config, gateway_lost_ms, image_layout
-from twin.plant_thread import REFRESH_MS, ImageProcess
-from twin.system import load_system
-from twin.thread_place import lent_transmitter, twin_carrier
+from fieldtwin.twin.physical import gateway_config, gateway_lost_ms, image_layout
+from fieldtwin.twin.plant_thread import REFRESH_MS, ImageProcess
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.thread_place import lent_transmitter, twin_carrier
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 OBSERVATORY = load_system(str(PROFILES / "observatory.yaml"))

@@ -8,9 +8,9 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.virtual.loop import VirtualLoop
-from gateway.core.alarm import alarm, ring
-from gateway.core.turn import Turn
+from fieldtwin.emulators.virtual.loop import VirtualLoop
+from fieldtwin.gateway.core.alarm import alarm, ring
+from fieldtwin.gateway.core.turn import Turn
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 4), st.booleans()), max_size=12))

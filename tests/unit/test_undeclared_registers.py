@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from emulators.modbus.unit import ModbusUnit
-from emulators.models.register_device import StatedRegisters
-from emulators.recorded_device import load_replay
-from emulators.replay.profiled import ProfiledReplay
-from gateway.core.errors import FileInvalid
-from gateway.core.profile import DeviceProfile, load_profile, resolve
-from gateway.core.yaml_file import parse
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.register_device import StatedRegisters
+from fieldtwin.emulators.recorded_device import load_replay
+from fieldtwin.emulators.replay.profiled import ProfiledReplay
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile, resolve
+from fieldtwin.gateway.core.yaml_file import parse
 
 ROOT = Path(__file__).resolve().parents[2]
 TEXT = """

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import FileInvalid, NotAllowed
-from gateway.core.profile import Tag, resolve
-from gateway.core.values import Quality, Reason, TagValue
-from gateway.core.yaml_file import parse
-from gateway.devices.codec import apply_scale, decode, encode
+from fieldtwin.gateway.core.errors import FileInvalid, NotAllowed
+from fieldtwin.gateway.core.profile import Tag, resolve
+from fieldtwin.gateway.core.values import Quality, Reason, TagValue
+from fieldtwin.gateway.core.yaml_file import parse
+from fieldtwin.gateway.devices.codec import apply_scale, decode, encode
 
 
 def tag(form: str) -> Tag:

@@ -9,7 +9,7 @@ from typing import NoReturn
 
 import pytest
 
-from emulators.virtual.loop import VirtualLoop
+from fieldtwin.emulators.virtual.loop import VirtualLoop
 
 
 class Told(KeyboardInterrupt):

@@ -20,11 +20,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from emulators.virtual.chance import seeded
-from emulators.virtual.clock import VirtualClock
-from emulators.virtual.loop import START_NS, Deadlock, Escape, VirtualLoop
-from emulators.virtual.seal import sealed
-from gateway.core.errors import Bug
+from fieldtwin.emulators.virtual.chance import seeded
+from fieldtwin.emulators.virtual.clock import VirtualClock
+from fieldtwin.emulators.virtual.loop import START_NS, Deadlock, Escape, VirtualLoop
+from fieldtwin.emulators.virtual.seal import sealed
+from fieldtwin.gateway.core.errors import Bug
 
 
 def run(main: Callable[[VirtualLoop], Coroutine[Any, Any, Any]]) -> Any:
@@ -154,7 +154,7 @@ def test_a_deadlock_names_the_task_that_is_waited_for() -> None:
 
 
 def test_time_that_stands_still_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("emulators.virtual.loop.STUCK_AFTER", 1_000)
+    monkeypatch.setattr("fieldtwin.emulators.virtual.loop.STUCK_AFTER", 1_000)
 
     async def main(loop: VirtualLoop) -> None:
         def again() -> None:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.core.errors import FileInvalid
-from gateway.core.visible import visible
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.visible import visible
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from gateway import wallclock
+from fieldtwin.gateway import wallclock
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="timerfd is Linux's")
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.running.twin_rules import PythonPlanner, load_planner, questions_of
+from fieldtwin.twin.mape.messages import verdict
+from fieldtwin.twin.mape.plan import RulePlanner
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.system import load_system
 from fieldtwin.whatif.plan import load_plans
-from gateway.core.statemachine import decode_period
-from twin.mape.messages import verdict
-from twin.mape.plan import RulePlanner
-from twin.model import DigitalModel
-from twin.system import load_system
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = DOCS / "what-if.md"

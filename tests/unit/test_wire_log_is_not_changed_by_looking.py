@@ -17,12 +17,12 @@ from device_rig import emulated, started_runner
 
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange as Decoded
+from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.scenarios.expectation import wire_matches
 from fieldtwin.scenarios.form import Expect
 from fieldtwin.testing.handles import Device
 from fieldtwin.testing.runner import Runner
 from fieldtwin.testing.wire import Exchange
-from gateway.core.canframe import CanFrame
 
 READ = struct.pack(">BHH", 4, 0, 2)
 PATIENCE_S = 30.0

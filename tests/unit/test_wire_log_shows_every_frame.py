@@ -13,13 +13,13 @@ from collections.abc import Iterator
 
 import pytest
 
-from emulators.modbus.rtu_receiver import with_crc
 from fieldtwin.decoding.canopen_wire import CanopenWire
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.decoding.modbus_wire import ModbusWire
+from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.testing.handles import Device
 from fieldtwin.testing.runner import Runner
-from gateway.core.canframe import CanFrame
 
 READ = struct.pack(">BHH", 4, 0, 2)
 PATIENCE_S = 30.0

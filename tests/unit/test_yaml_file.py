@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ConfigDict
 
-from gateway.core.errors import FileInvalid
-from gateway.core.yaml_file import MAX_BYTES, load, parse, validate
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.yaml_file import MAX_BYTES, load, parse, validate
 
 
 class Inner(BaseModel):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from hypothesis import strategies as st
 
-from gateway.store.event import Event
-from twin.thread_frames import (
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.thread_frames import (
     Frame,
     FrameCodec,
     Schema,

@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from gateway.core.clock import Clock
-from gateway.core.errors import ConnectionLost, Unreachable
-from gateway.store.event import Event, Kind
-from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from twin.thread_end import ThreadEnd
-from twin.thread_frames import Frame, Schema
-from twin.thread_link import Carrier, Link
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
+from fieldtwin.twin.thread_end import ThreadEnd
+from fieldtwin.twin.thread_frames import Frame, Schema
+from fieldtwin.twin.thread_link import Carrier, Link
 
 SCHEMA = Schema(("ctd.pressure", "ctd.temperature", "relay"))
 

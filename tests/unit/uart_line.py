@@ -13,14 +13,14 @@ from dataclasses import dataclass, field, replace
 from commissioning_rig import loop
 from modbus_virtual import VirtualWire
 
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.line import LineSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.connections.line_counters import LineCounters
-from gateway.core.connection import ByteConnection, CanConnection
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import EndpointBusy
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.line import LineSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.connections.line_counters import LineCounters
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import EndpointBusy
 
 OVERSAMPLING = 16
 

@@ -8,16 +8,16 @@ from typing import NamedTuple
 
 from modbus_virtual import VirtualLoop, VirtualWire
 
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Unreachable
-from gateway.devices.config import BusConfig
-from gateway.devices.register_device import RegisterDriver
-from gateway.runtime.modbus_bus import ModbusBus
-from gateway.runtime.tags import TagTable
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection, RS232Connection, TCPConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Unreachable
+from fieldtwin.gateway.devices.config import BusConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
+from fieldtwin.gateway.runtime.tags import TagTable
 
 LINE = Endpoint.parse("rtu:/dev/ttyVIRT?baudrate=19200&frame=8E1")
 CHAR_S = LINE.serial.char_time_s

@@ -8,22 +8,22 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.twin_rules import load_planner, questions_of
+from fieldtwin.twin.mape.execute import Bounds, Execute
+from fieldtwin.twin.mape.messages import verdict
+from fieldtwin.twin.mape.what_if import PlannedCommand, Question
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.status import encode_status
+from fieldtwin.twin.system import load_system
 from fieldtwin.whatif.asked import objection
 from fieldtwin.whatif.asking import Asked, Asking, Subject
 from fieldtwin.whatif.last_known import LastKnown
-from gateway.core.errors import FileInvalid, Unreachable, UsageError
-from gateway.core.nursery import Nursery
-from gateway.core.statemachine import encode_period
-from gateway.core.values import Quality, Reason
-from gateway.store.event import Event, Kind
-from gateway.wallclock import WallClock
-from twin.mape.execute import Bounds, Execute
-from twin.mape.messages import verdict
-from twin.mape.what_if import PlannedCommand, Question
-from twin.model import DigitalModel
-from twin.status import encode_status
-from twin.system import load_system
 
 OBSERVATORY = load_system("observatory")
 DEEP = (
@@ -179,7 +179,7 @@ def test_what_is_wrong_with_a_question_is_said_with_its_line(tmp_path: Path, tex
 def test_what_control_logic_prints_is_no_answer_and_what_it_dies_of_is_told(tmp_path: Path) -> None:
     """A system of one's own, whose program prints when it is imported, or ends the process."""
     (tmp_path / "loud.py").write_text(
-        "import os, sys\nfrom plc.program import Program\n\nprint('loud' * 100_000)\n"
+        "import os, sys\nfrom fieldtwin.plc.program import Program\n\nprint('loud' * 100_000)\n"
         "if os.path.exists(os.path.dirname(__file__) + '/dies'):\n    print('no more', file=sys.stderr); os._exit(9)\n\n"
         "class Loud(Program):\n    def execute(self, scan):\n        pass\n"
     )

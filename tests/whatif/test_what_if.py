@@ -11,7 +11,14 @@ from click.testing import CliRunner
 from support import run
 
 from fieldtwin.cli.what_if_command import command
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.values import Quality, Reason
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.running.shore import Scripted
+from fieldtwin.twin.status import encode_status
+from fieldtwin.twin.system import load_system
 from fieldtwin.whatif.fork import Fork, answer
 from fieldtwin.whatif.known import known_state
 from fieldtwin.whatif.last_known import of_period
@@ -20,13 +27,6 @@ from fieldtwin.whatif.outcome import VariableOutcome
 from fieldtwin.whatif.plan import Plan, load_plans
 from fieldtwin.whatif.plan import command as parsed
 from fieldtwin.whatif.state import KnownState, read_state
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.values import Quality, Reason
-from gateway.store.event import Event, Kind
-from gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from twin.status import encode_status
-from twin.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 OBSERVATORY = load_system("observatory")

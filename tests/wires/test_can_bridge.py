@@ -16,16 +16,16 @@ import can
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.bus_bridge import CanBridge
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.wires.can_faults import Disturbance, spoil
-from gateway.connections.can_end import SocketCanConnection
-from gateway.connections.soft_bus import SoftBus
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
+from fieldtwin.emulators.endpoints.bus_bridge import CanBridge
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
+from fieldtwin.gateway.connections.can_end import SocketCanConnection
+from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
 
 ANY_PORT = Endpoint.parse("can:fieldtwin/127.0.0.1:0")
 VCAN0 = Endpoint.parse("can:socketcan/vcan0")

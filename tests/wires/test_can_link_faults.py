@@ -10,17 +10,17 @@ from typing import Any
 import pytest
 from support import eventually, run
 
-from emulators.can_link import CanLink, node_of
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.faults.frames import Framing, Way
-from emulators.faults.on_link import check_can_link, wire_faults
-from emulators.faults.schema import parse_fault
-from emulators.faults.wrong_aim import WrongAim
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost
+from fieldtwin.emulators.can_link import CanLink, node_of
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.on_link import check_can_link, wire_faults
+from fieldtwin.emulators.faults.schema import parse_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost
 
 ANY_PORT = Endpoint.parse("can:fieldtwin/127.0.0.1:0")
 ASK, ANSWER = CanFrame(0x605, bytes.fromhex("4000200000000000")), CanFrame(0x585, bytes.fromhex("4300200057040000"))

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from support import run
 
-from emulators.endpoints.can_end import open_can_end
-from emulators.wires.can_timing import bits_on_wire
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.wires.can_timing import bits_on_wire
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 COUNT = 300
 

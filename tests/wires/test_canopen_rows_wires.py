@@ -16,14 +16,14 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "unit"))
 
 from canopen_rows import Row, happen, load, parse_frame
 
-from emulators.canopen.node import CanopenNode
-from emulators.canopen.serve import Poke, serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.node import CanopenNode
+from fieldtwin.emulators.canopen.serve import Poke, serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.wallclock import WallClock
 
 ROWS = [row for row in load() if row.answers_only]
 VCAN0 = Endpoint.parse("can:socketcan/vcan0")

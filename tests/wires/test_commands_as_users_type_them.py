@@ -17,21 +17,21 @@ from pymodbus.client import AsyncModbusTcpClient
 from support import run
 from test_commissioning_verbs import SHEET
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.endpoints.link_ends import TtyEnd
-from emulators.endpoints.pty import PtyEnd
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.unit import ModbusUnit
 from fieldtwin.cli.main import cli
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.link_ends import TtyEnd
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.bridging import BridgeOptions, run_bridge
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.wallclock import WallClock
 
 
 async def fieldtwin(*words: str) -> tuple[int, str]:

@@ -9,18 +9,18 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
-from emulators.modbus.unit import ModbusUnit
 from fieldtwin.commissioning.live import canopen_at, frame_of, modbus_at
 from fieldtwin.commissioning.wire_log import WireLog
-from gateway.core.connection import ByteConnection, Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, Unreachable, UsageError
-from gateway.protocols.modbus.requests import ReadRegisters
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.connection import ByteConnection, Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.protocols.modbus.requests import ReadRegisters
+from fieldtwin.gateway.wallclock import WallClock
 
 
 def test_what_is_sent_is_in_the_log_when_the_reply_is_here(tmp_path: Path) -> None:

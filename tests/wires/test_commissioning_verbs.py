@@ -17,18 +17,6 @@ from pymodbus.server import ModbusTcpServer
 from support import eventually, run
 from test_modbus_servers import COUNT, INPUTS, libmodbus, null_modem, sim_device
 
-from emulators.canopen.dictionary import parse_eds
-from emulators.canopen.node import CanopenNode, NodeContext
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu
-from emulators.modbus.unit import ModbusUnit, UnitLimits
 from fieldtwin.commissioning.address import RawForm, tags_of
 from fieldtwin.commissioning.dump import Job
 from fieldtwin.commissioning.dump_file import load_dump
@@ -36,8 +24,20 @@ from fieldtwin.commissioning.dumping import dump, log_path, object_ranges, regis
 from fieldtwin.commissioning.reading import Target, point_at
 from fieldtwin.commissioning.watching import samples
 from fieldtwin.commissioning.writing import before, carry_out, plan_write, restore
-from gateway.core.endpoint import Endpoint
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.dictionary import parse_eds
+from fieldtwin.emulators.canopen.node import CanopenNode, NodeContext
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
+from fieldtwin.emulators.modbus.unit import ModbusUnit, UnitLimits
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.wallclock import WallClock
 
 ROOT = Path(__file__).parents[2]
 Opened = Callable[[Path], AbstractAsyncContextManager[str]]

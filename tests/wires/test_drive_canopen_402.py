@@ -11,14 +11,14 @@ import canopen
 from canopen.profiles.p402 import BaseNode402
 from support import run
 
-from emulators.canopen.serve import serve_node
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.models.emulated_node import emulated_node
-from gateway.connections.soft_bus import SoftBus
-from gateway.core.endpoint import Endpoint
-from gateway.core.nursery import Nursery
-from gateway.core.profile import load_profile
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.canopen.serve import serve_node
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.models.emulated_node import emulated_node
+from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.core.profile import load_profile
+from fieldtwin.gateway.wallclock import WallClock
 
 PROFILE = load_profile(Path(__file__).parents[2] / "profiles" / "devices" / "drive-cia402.yaml")
 NODE, EVENT_MS = 7, 20

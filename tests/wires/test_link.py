@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.link_ends import MAX_PENDING, TcpEnd, TtyEnd
-from emulators.link import EmulatedConnection, Link, LinkOptions, run_link
-from gateway.core.connection import PROTOCOL, TCPConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, UsageError
+from fieldtwin.emulators.endpoints.link_ends import MAX_PENDING, TcpEnd, TtyEnd
+from fieldtwin.emulators.link import EmulatedConnection, Link, LinkOptions, run_link
+from fieldtwin.gateway.core.connection import PROTOCOL, TCPConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import Bug, ConnectionLost, EndpointBusy, Unreachable, UsageError
 
 QUICK = LinkOptions(backoff_s=0.01, backoff_max_s=0.05, half_close_s=0.2, stall_s=0.1)
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.link import LinkOptions, run_link
-from gateway.connections.serial_line import SerialConnection
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.link import LinkOptions, run_link
+from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 pytestmark = [
     pytest.mark.interop,

@@ -11,34 +11,34 @@ import pytest
 from modbus_pki import make_pki
 from support import run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketListener
-from emulators.endpoints.udp_end import UdpEnd
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.fifo import FifoQueues
-from emulators.modbus.file_records import FileRecords
-from emulators.modbus.identification import Identification
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
-from emulators.modbus.unit import ModbusUnit
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ModbusExceptionReply, ReplyTimeout, UsageError
-from gateway.core.nursery import Nursery
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.diagnostics import (
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.endpoints.udp_end import UdpEnd
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.fifo import FifoQueues
+from fieldtwin.emulators.modbus.file_records import FileRecords
+from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu, serve_udp
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ModbusExceptionReply, ReplyTimeout, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.diagnostics import (
     Diagnostics,
     ForceListenOnly,
     GetCommEventCounter,
     GetCommEventLog,
     Loopback,
 )
-from gateway.protocols.modbus.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
-from gateway.protocols.modbus.identity import ReadExceptionStatus, ReportServerId
-from gateway.protocols.modbus.user import CountedShape, UserFunction
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.protocols.modbus.files import FileSpan, ReadFifoQueue, ReadFileRecords, WriteFileRecords
+from fieldtwin.gateway.protocols.modbus.identity import ReadExceptionStatus, ReportServerId
+from fieldtwin.gateway.protocols.modbus.user import CountedShape, UserFunction
+from fieldtwin.gateway.wallclock import WallClock
 
 CLOCK = WallClock()
 NAMES = {0: b"Maker", 1: b"P1", 2: b"1.0", 3: b"http://m", 4: b"x" * 100, 5: b"y" * 100, 6: b"z" * 100, 0x80: b"own"}

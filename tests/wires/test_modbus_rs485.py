@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 from support import run
 
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.rs485 import (
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.rs485 import (
     ENABLED,
     RTS_AFTER_SEND,
     RTS_ON_SEND,
@@ -23,8 +23,8 @@ from gateway.connections.rs485 import (
     let_driver_switch,
     settings_sent,
 )
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import UsageError
 
 
 def test_the_setting_keeps_what_the_board_needs() -> None:

@@ -24,13 +24,13 @@ from pymodbus.server import ModbusSerialServer, ModbusTcpServer, ModbusTlsServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 from support import eventually, run
 
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ModbusExceptionReply
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.diagnostics import Diagnostics
-from gateway.protocols.modbus.identity import ReportServerId
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.diagnostics import Diagnostics
+from fieldtwin.gateway.protocols.modbus.identity import ReportServerId
+from fieldtwin.gateway.wallclock import WallClock
 
 COUNT = 200
 INPUTS = [(i * 257) & 0xFFFF for i in range(COUNT)]

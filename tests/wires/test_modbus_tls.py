@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from modbus_pki import Pki, make_pki
 from support import run
 
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.tls import TlsConnection
-from gateway.connections.tls_role import ROLE_OID, role_in
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, ModbusExceptionReply, Unreachable, UsageError
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.tls import TlsConnection
+from fieldtwin.gateway.connections.tls_role import ROLE_OID, role_in
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, ModbusExceptionReply, Unreachable, UsageError
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.wallclock import WallClock
 
 pytestmark = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificates")
 

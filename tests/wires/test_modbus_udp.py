@@ -10,12 +10,12 @@ from collections.abc import AsyncIterator
 import pytest
 from support import eventually, run
 
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.udp import UdpConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, ReplyTimeout, Unreachable
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.wallclock import WallClock
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.udp import UdpConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, ReplyTimeout, Unreachable
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.wallclock import WallClock
 
 READ = bytes.fromhex("0000 0006 01 03 0000 0001")
 

@@ -12,16 +12,16 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.bus_server import SoftBusServer
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.serial_line import SerialConnection
-from gateway.connections.tap import CaptureTap, TapFile, TappedConnector
-from gateway.connections.tcp import TcpConnection
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import ByteConnection, CANConnection, CanConnection, Connector, Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, FileInvalid, Unreachable, UsageError
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.connections.tap import CaptureTap, TapFile, TappedConnector
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import ByteConnection, CANConnection, CanConnection, Connector, Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, FileInvalid, Unreachable, UsageError
+from fieldtwin.gateway.wallclock import WallClock
 
 
 def test_the_scheme_decides_which_end_opens() -> None:

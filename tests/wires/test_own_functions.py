@@ -11,19 +11,19 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.modbus.rtu import RtuSlave
-from emulators.recorded_device import load_replay
-from emulators.replay.profiled import ProfiledReplay
-from emulators.replay.replay import ExchangeReplay
-from emulators.replay.unit import ReplayUnit
-from gateway.connections.serial_line import SerialConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid, ModbusExceptionReply
-from gateway.core.profile import DeviceProfile, load_profile
-from gateway.core.recording import Exchange
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.protocols.modbus.user import FixedShape, UserFunction
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.recorded_device import load_replay
+from fieldtwin.emulators.replay.profiled import ProfiledReplay
+from fieldtwin.emulators.replay.replay import ExchangeReplay
+from fieldtwin.emulators.replay.unit import ReplayUnit
+from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, ModbusExceptionReply
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import Exchange
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.protocols.modbus.user import FixedShape, UserFunction
+from fieldtwin.gateway.wallclock import WallClock
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 PROFILE = CHECKOUT / "profiles" / "devices" / "renogy-rover.yaml"

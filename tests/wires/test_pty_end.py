@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.wires.serial_line import SerialPacer
-from gateway.core.connection import PROTOCOL
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.wires.serial_line import SerialPacer
+from fieldtwin.gateway.core.connection import PROTOCOL
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
 LINE = Endpoint.parse("pty:line1")
 

@@ -13,17 +13,17 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketListener
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.rtu_receiver import with_crc
-from emulators.modbus.serve import serve_mbap, serve_rtu
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketListener
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.rtu_receiver import with_crc
+from fieldtwin.emulators.modbus.serve import serve_mbap, serve_rtu
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.wallclock import WallClock
 
 needs_mbpoll = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="mbpoll is not installed")
 READ = with_crc(bytes.fromhex("01 03 0000 0002"))

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from emulators.wires.serial_line import SerialPacer
-from gateway.core.endpoint import SerialSettings
+from fieldtwin.emulators.wires.serial_line import SerialPacer
+from fieldtwin.gateway.core.endpoint import SerialSettings
 
 
 @pytest.mark.parametrize(

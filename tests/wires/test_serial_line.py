@@ -16,11 +16,11 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from gateway.connections import serial_port
-from gateway.connections.serial_line import SerialConnection
-from gateway.core.connection import RS232Connection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from fieldtwin.gateway.connections import serial_port
+from fieldtwin.gateway.connections.serial_line import SerialConnection
+from fieldtwin.gateway.core.connection import RS232Connection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
 
 @dataclass

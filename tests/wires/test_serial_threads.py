@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.pty import PtyEnd
-from gateway.connections.serial_threads import ThreadedSerialConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.gateway.connections.serial_threads import ThreadedSerialConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
 
 WITHOUT_POSIX = """
 import sys
@@ -22,9 +22,9 @@ import asyncio, can, click, rich.console, serial, serial.tools.list_ports, yaml,
 for name in ("termios", "grp", "fcntl", "tty", "pty", "pwd", "resource"):
     sys.modules[name] = None
 sys.platform = "win32"
-from gateway.connections.os_connector import OsConnector
-from gateway.connections.serial_threads import ThreadedSerialConnection
-from gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.connections.serial_threads import ThreadedSerialConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
 for verb in ("line", "scan", "identify"):
     __import__(f"fieldtwin.cli.{verb}_command")
 async def main():

@@ -20,21 +20,21 @@ import pytest
 from modbus_pki import make_pki
 from support import eventually, run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.udp_end import UdpEnd
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.fifo import FifoQueues
-from emulators.modbus.file_records import FileRecords
-from emulators.modbus.identification import Identification
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_rtu, serve_udp
-from emulators.modbus.unit import ModbusUnit
-from gateway.connections.os_connector import OsConnector
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ModbusExceptionReply
-from gateway.protocols.modbus.client import ModbusClient
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.udp_end import UdpEnd
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.fifo import FifoQueues
+from fieldtwin.emulators.modbus.file_records import FileRecords
+from fieldtwin.emulators.modbus.identification import Identification
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_rtu, serve_udp
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.protocols.modbus.client import ModbusClient
+from fieldtwin.gateway.wallclock import WallClock
 
 CHECKOUT = Path(__file__).parents[2]
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificates")

@@ -15,20 +15,20 @@ import pytest
 from modbus_pki import Pki, make_pki
 from support import eventually, run
 
-from emulators.endpoints.pty import PtyEnd
-from emulators.endpoints.socket_end import SocketEnd, SocketListener
-from emulators.endpoints.tls_server import client_role
-from emulators.endpoints.udp_end import UdpEnd
-from emulators.modbus.ascii import AsciiSlave
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.line import Exchange
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.rtu import RtuSlave
-from emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.pty import PtyEnd
+from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
+from fieldtwin.emulators.endpoints.tls_server import client_role
+from fieldtwin.emulators.endpoints.udp_end import UdpEnd
+from fieldtwin.emulators.modbus.ascii import AsciiSlave
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.line import Exchange
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.rtu import RtuSlave
+from fieldtwin.emulators.modbus.serve import as_recorded, serve_mbap, serve_rtu, serve_udp
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
+from fieldtwin.gateway.wallclock import WallClock
 
 READ, REPLY = bytes.fromhex("0001 0000 0006 01 03 0000 0001"), bytes.fromhex("0001 0000 0005 01 03 02 0007")
 RTU_READ, RTU_REPLY = bytes.fromhex("01 03 0000 0001 840A"), bytes.fromhex("01 03 02 0007 F986")

@@ -11,12 +11,12 @@ import can
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.slcan_port import SlcanPort
-from emulators.wires.can_faults import Disturbance, spoil
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import EndpointBusy, Unreachable
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.slcan_port import SlcanPort
+from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import EndpointBusy, Unreachable
 
 ANY_BUS, ANY_TCP = Endpoint.parse("can:fieldtwin/127.0.0.1:0"), Endpoint.parse("tcp://127.0.0.1:0")
 

@@ -9,15 +9,15 @@ import struct
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.socket_end import SocketEnd, SocketListener
-from emulators.modbus.bank import MapBank, Span
-from emulators.modbus.mbap import MbapSlave
-from emulators.modbus.serve import serve_mbap
-from emulators.modbus.unit import ModbusUnit
-from gateway.core.connection import ByteConnection, Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
-from gateway.wallclock import WallClock
+from fieldtwin.emulators.endpoints.socket_end import SocketEnd, SocketListener
+from fieldtwin.emulators.modbus.bank import MapBank, Span
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.gateway.core.connection import ByteConnection, Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable
+from fieldtwin.gateway.wallclock import WallClock
 
 ANY_PORT = Endpoint.parse("tcp://127.0.0.1:0")
 READ = bytes.fromhex("0001 0000 0006 01 03 0000 0001")

@@ -23,11 +23,11 @@ import can
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.can_end import open_can_end
-from gateway.connections.can_end import SocketCanConnection
-from gateway.core.canframe import CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable, UsageError, WireError
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.gateway.connections.can_end import SocketCanConnection
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable, UsageError, WireError
 
 VCAN0, VCAN1 = Endpoint.parse("can:socketcan/vcan0"), Endpoint.parse("can:socketcan/vcan1")
 N_SLCAN = 17

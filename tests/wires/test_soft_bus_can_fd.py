@@ -8,13 +8,13 @@ import can
 import pytest
 from support import run
 
-from emulators.endpoints.bus_hello import Hello, unpack_hello
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from gateway.connections.soft_bus import SoftBus, SoftBusConnection
-from gateway.core.canframe import RECORD_SIZE, CanFrame
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
+from fieldtwin.emulators.endpoints.bus_hello import Hello, unpack_hello
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.gateway.connections.soft_bus import SoftBus, SoftBusConnection
+from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
 
 WITH_SWITCH = can.Message(arbitration_id=0x98765, data=bytes(range(48)), is_fd=True, bitrate_switch=True)
 WITHOUT = can.Message(

@@ -9,14 +9,14 @@ from contextlib import asynccontextmanager
 import can
 from support import eventually, run
 
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from emulators.wires.can_faults import Disturbance, spoil
-from gateway.connections.soft_bus import SoftBus, SoftBusConnection
-from gateway.core.can_error import CanErrorState, tells_overrun, told_state
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.emulators.wires.can_faults import Disturbance, spoil
+from fieldtwin.gateway.connections.soft_bus import SoftBus, SoftBusConnection
+from fieldtwin.gateway.core.can_error import CanErrorState, tells_overrun, told_state
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 ANY_PORT = Endpoint.parse("can:fieldtwin/127.0.0.1:0")
 WARNING, PASSIVE, BUS_OFF = CanErrorState.WARNING, CanErrorState.PASSIVE, CanErrorState.BUS_OFF

@@ -17,11 +17,11 @@ import canopen
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.bus_hello import Hello, unpack_hello
-from emulators.endpoints.bus_server import SoftBusServer
-from gateway.connections.soft_bus import SoftBus
-from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.endpoints.bus_hello import Hello, unpack_hello
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 ROOT = Path(__file__).parents[2]
 

@@ -11,14 +11,14 @@ from contextlib import asynccontextmanager
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.bus_hello import FD_VERSION, VERSION, Hello, Status, unpack_hello
-from emulators.endpoints.bus_server import SoftBusServer
-from emulators.endpoints.can_end import open_can_end
-from gateway.connections.soft_bus import SoftBusConnection
-from gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
-from gateway.core.connection import CanConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
+from fieldtwin.emulators.endpoints.bus_hello import FD_VERSION, VERSION, Hello, Status, unpack_hello
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.emulators.endpoints.can_end import open_can_end
+from fieldtwin.gateway.connections.soft_bus import SoftBusConnection
+from fieldtwin.gateway.core.canframe import RECORD_SIZE, CanFrame, pack_record, unpack_record
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, EndpointBusy, Unreachable, UsageError
 
 ANY_PORT = Endpoint.parse("can:fieldtwin/127.0.0.1:0")
 

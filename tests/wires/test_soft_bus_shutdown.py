@@ -13,9 +13,9 @@ import can
 import pytest
 from support import eventually, run
 
-from emulators.endpoints.bus_server import SoftBusServer
-from gateway.connections.soft_bus import SoftBus
-from gateway.core.endpoint import Endpoint
+from fieldtwin.emulators.endpoints.bus_server import SoftBusServer
+from fieldtwin.gateway.connections.soft_bus import SoftBus
+from fieldtwin.gateway.core.endpoint import Endpoint
 
 
 def on_a_bus(use: Callable[[SoftBus, SoftBus], None]) -> None:

@@ -11,11 +11,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 import pytest
 from support import eventually, run
 
-from gateway.connections import tcp
-from gateway.connections.tcp import TcpConnection
-from gateway.core.connection import TCPConnection
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import ConnectionLost, Unreachable
+from fieldtwin.gateway.connections import tcp
+from fieldtwin.gateway.connections.tcp import TcpConnection
+from fieldtwin.gateway.core.connection import TCPConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
 
 Peer = Callable[[socket.socket], Awaitable[None]]
 

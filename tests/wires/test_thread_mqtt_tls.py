@@ -13,14 +13,14 @@ import pytest
 from modbus_pki import Pki, make_pki
 from support import eventually, run
 
-import twin.thread_mqtt
-from gateway.core.errors import Unreachable, UsageError
-from gateway.wallclock import WallClock
-from twin.system import load_system
-from twin.thread import schema_of
-from twin.thread_end import ThreadEnd
-from twin.thread_link import Carrier, Unwelcome
-from twin.thread_place import plant_carrier, twin_carrier
+from fieldtwin.gateway.core.errors import Unreachable, UsageError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin import thread_mqtt
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.thread import schema_of
+from fieldtwin.twin.thread_end import ThreadEnd
+from fieldtwin.twin.thread_link import Carrier, Unwelcome
+from fieldtwin.twin.thread_place import plant_carrier, twin_carrier
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
 from mosquitto_here import Mosquitto, broker, program
@@ -114,7 +114,7 @@ def test_whom_the_broker_does_not_want_hears_why(tmp_path: Path, pki: Pki, monke
             assert "the broker refuses: Not authorized" in await refused(url(here, pki, "plant"), "wrong-word")
             trusting_others = url(here, pki, "plant").replace(pki.ca, stranger.ca)
             assert "the broker's certificate is refused: " in await refused(trusting_others, "plant-word")
-            monkeypatch.setattr(twin.thread_mqtt, "TIMEOUT_S", 0.5)  # TLS 1.3: we may say CONNECT before it refuses
+            monkeypatch.setattr(thread_mqtt, "TIMEOUT_S", 0.5)  # TLS 1.3: we may say CONNECT before it refuses
             with pytest.raises(Unreachable, match="the broker ends the connection: tlsv13 alert certificate required"):
                 await (await plant(url(here, pki, "plant", certificate=False))).open()
             with pytest.raises(Unreachable, match="does it want mqtts://"):
@@ -173,7 +173,7 @@ def test_a_topic_that_we_may_not_hear_is_said(monkeypatch: pytest.MonkeyPatch) -
         server = await asyncio.start_server(denies, "127.0.0.1", 0)
         port = server.sockets[0].getsockname()[1]
         carrier = await plant(f"mqtt://127.0.0.1:{port}/sea/obs")
-        monkeypatch.setattr(twin.thread_mqtt, "GOODBYE_S", 0.1)
+        monkeypatch.setattr(thread_mqtt, "GOODBYE_S", 0.1)
         with pytest.raises(Unwelcome, match=r"does not let us hear spBv1\.0/sea/NCMD/obs"):
             await carrier.open()
         server.close()

@@ -10,11 +10,11 @@ import pytest
 from modbus_pki import Pki, make_pki
 from support import eventually, run
 
-from gateway.core.errors import UsageError
-from gateway.wallclock import WallClock
-from twin.system import load_system
-from twin.thread import schema_of
-from twin.thread_place import plant_carrier, twin_carrier
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.wallclock import WallClock
+from fieldtwin.twin.system import load_system
+from fieldtwin.twin.thread import schema_of
+from fieldtwin.twin.thread_place import plant_carrier, twin_carrier
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
 from thread_rig import Twin, equal, value

@@ -20,11 +20,11 @@ from fieldtwin.formats.pcap import (
     read_capture,
     write_pcap,
 )
-from gateway.connections.tap import Captured, TapFile
-from gateway.core.canframe import CanFrame
-from gateway.core.connection import Direction
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import FileInvalid
+from fieldtwin.gateway.connections.tap import Captured, TapFile
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.connection import Direction
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid
 
 RTU, TCP, CAN = (Endpoint.parse(u) for u in ("rtu:/dev/ttyS0", "tcp://modem:502", "can:socketcan/can0"))
 S, R = Direction.SENT, Direction.RECEIVED

@@ -10,15 +10,15 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-from gateway.core.clock import Clock
-from gateway.core.errors import Desync
-from gateway.core.events import Consumer, Producer
-from gateway.core.values import DATA, Quality
-from gateway.store.event import Kind
-from twin.mape.messages import SeenMeasurement, SeenStatus, Verdict, verdict
-from twin.model import DigitalModel
-from twin.status import decode_status
-from twin.thread_process import DTDigitalThreadProcess
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.values import DATA, Quality
+from fieldtwin.gateway.store.event import Kind
+from fieldtwin.twin.mape.messages import SeenMeasurement, SeenStatus, Verdict, verdict
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.status import decode_status
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 10_000
 LAGS = 10_000

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import Desync
-from gateway.core.events import Consumer, Producer
-from gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, decode_period
-from gateway.core.values import COMMAND
-from gateway.store.event import Kind
-from twin.mape.what_if import PlannedCommand, Question, WhatIf
-from twin.model import DigitalModel
-from twin.thread_process import DTDigitalThreadProcess
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.statemachine import PERIOD_MAX, PERIOD_MIN, decode_period
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.store.event import Kind
+from fieldtwin.twin.mape.what_if import PlannedCommand, Question, WhatIf
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 1000
 MINUTE_NS = 60 * NS_PER_S

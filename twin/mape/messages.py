@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.values import DATA, MEASUREMENT, STATUS, Quality, Reason
-from gateway.store.event import Event
+from fieldtwin.gateway.core.values import DATA, MEASUREMENT, STATUS, Quality, Reason
+from fieldtwin.gateway.store.event import Event
 
 _REASONS = frozenset(int(reason) for reason in Reason)
 

@@ -5,16 +5,16 @@ It must never know a connection, nor anything that could send a command.
 
 from __future__ import annotations
 
-from gateway.core.clock import Clock
-from gateway.core.errors import Desync
-from gateway.core.events import Consumer, Producer
-from gateway.core.statemachine import encode_period
-from gateway.core.values import DATA
-from gateway.store.event import Event, Kind
-from twin.mape.messages import SeenMeasurement, SeenStatus
-from twin.model import DigitalModel
-from twin.status import decode_status
-from twin.thread_process import DTDigitalThreadProcess
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import DATA
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.twin.mape.messages import SeenMeasurement, SeenStatus
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.status import decode_status
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 10_000
 

@@ -10,16 +10,16 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from gateway.core.clock import NS_PER_MS, Clock
-from gateway.core.errors import FieldtwinError
-from gateway.core.events import Consumer, Producer
-from gateway.core.statemachine import encode_period
-from gateway.core.values import COMMAND, DATA
-from gateway.store.event import Kind
-from twin.mape.messages import Verdict
-from twin.mape.what_if import PlannedCommand, Question
-from twin.model import DigitalModel
-from twin.thread_process import DTDigitalThreadProcess
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import FieldtwinError
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import COMMAND, DATA
+from fieldtwin.gateway.store.event import Kind
+from fieldtwin.twin.mape.messages import Verdict
+from fieldtwin.twin.mape.what_if import PlannedCommand, Question
+from fieldtwin.twin.model import DigitalModel
+from fieldtwin.twin.thread_process import DTDigitalThreadProcess
 
 CAPACITY = 1000
 OLD_MS = 10_000

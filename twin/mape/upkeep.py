@@ -7,10 +7,10 @@ nor anything that could send a command.
 
 from __future__ import annotations
 
-from gateway.core.events import Consumer
-from gateway.core.values import DATA
-from twin.mape.messages import SeenMeasurement, Verdict
-from twin.model import DigitalModel
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.core.values import DATA
+from fieldtwin.twin.mape.messages import SeenMeasurement, Verdict
+from fieldtwin.twin.model import DigitalModel
 
 CAPACITY = 10_000
 

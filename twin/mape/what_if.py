@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from gateway.core.values import COMMAND
+from fieldtwin.gateway.core.values import COMMAND
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gateway.core.errors import SdoAborted
-from gateway.protocols.canopen.concise_dcf import CONFIGURATION_DATE, Setting
-from gateway.protocols.canopen.configure import DEVICE_TYPE, IDENTITY, read_number, verify_number, write_number
-from gateway.protocols.canopen.datatypes import DataType
-from gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.core.errors import SdoAborted
+from fieldtwin.gateway.protocols.canopen.concise_dcf import CONFIGURATION_DATE, Setting
+from fieldtwin.gateway.protocols.canopen.configure import (
+    DEVICE_TYPE,
+    IDENTITY,
+    read_number,
+    verify_number,
+    write_number,
+)
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
 
 STORE_PARAMETERS = 0x1010
 SAVE = b"save"

@@ -5,7 +5,7 @@ Pure arithmetic: knows no frame and no bus.
 
 from __future__ import annotations
 
-from gateway.core.errors import UsageError
+from fieldtwin.gateway.core.errors import UsageError
 
 NMT = 0x000
 SYNC = 0x080

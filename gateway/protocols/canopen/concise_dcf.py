@@ -10,9 +10,9 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from gateway.core.errors import Desync, FileInvalid, UsageError
-from gateway.protocols.canopen.datatypes import DataType, encode
-from gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
+from fieldtwin.gateway.core.errors import Desync, FileInvalid, UsageError
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType, encode
+from fieldtwin.gateway.protocols.canopen.dictionary import DictionaryEntry, ObjectDictionary
 
 _COUNT = struct.Struct("<I")
 _HEAD = struct.Struct("<HBI")

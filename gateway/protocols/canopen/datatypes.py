@@ -8,8 +8,8 @@ from __future__ import annotations
 import struct
 from enum import IntEnum
 
-from gateway.core.errors import UsageError, WireError
-from gateway.core.values import Scalar
+from fieldtwin.gateway.core.errors import UsageError, WireError
+from fieldtwin.gateway.core.values import Scalar
 
 
 class DataType(IntEnum):

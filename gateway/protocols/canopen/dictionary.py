@@ -17,14 +17,14 @@ from types import MappingProxyType
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable
 from canopen.objectdictionary.eds import import_eds
 
-from gateway.core.errors import FileInvalid, UsageError
-from gateway.core.input_file import read_input
-from gateway.core.nearest import did_you_mean
-from gateway.core.values import Scalar
-from gateway.protocols.canopen.cob_id import check_node
-from gateway.protocols.canopen.datatypes import DataType
-from gateway.protocols.canopen.eds_text import EdsText, Section, decode_eds, read_eds_text
-from gateway.protocols.canopen.eds_values import read_limit, read_value
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import read_input
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.gateway.protocols.canopen.cob_id import check_node
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.protocols.canopen.eds_text import EdsText, Section, decode_eds, read_eds_text
+from fieldtwin.gateway.protocols.canopen.eds_values import read_limit, read_value
 
 MAX_EDS_BYTES = 8 * 1024 * 1024
 """An EDS or DCF file that is larger is a mistake; the largest one known has 2 MB."""

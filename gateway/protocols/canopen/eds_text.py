@@ -10,8 +10,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field
 
-from gateway.core.errors import FileInvalid
-from gateway.protocols.canopen.datatypes import DataType
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType
 
 MAX_BYTES = 16 * 1024 * 1024
 """No EDS comes near; whatever does is another kind of file."""

@@ -10,9 +10,9 @@ import math
 import re
 import struct
 
-from gateway.core.values import Scalar
-from gateway.protocols.canopen.cob_id import NODE_MAX
-from gateway.protocols.canopen.datatypes import DataType, is_signed, size_of
+from fieldtwin.gateway.core.values import Scalar
+from fieldtwin.gateway.protocols.canopen.cob_id import NODE_MAX
+from fieldtwin.gateway.protocols.canopen.datatypes import DataType, is_signed, size_of
 
 _TEXTS = (DataType.VISIBLE_STRING, DataType.UNICODE_STRING)
 _TIMES = (DataType.TIME_OF_DAY, DataType.TIME_DIFFERENCE)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.errors import Desync
+from fieldtwin.gateway.core.errors import Desync
 
 _CLASSES = {
     0x00: "error reset or no error",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from gateway.core.clock import NS_PER_MS
-from gateway.protocols.canopen.emcy import Emcy
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.canopen.emcy import Emcy
 
 MAX_ENTRIES = 32
 MAX_ACTIVE = 32

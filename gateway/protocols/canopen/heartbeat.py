@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.clock import NS_PER_MS
-from gateway.protocols.canopen import cob_id
-from gateway.protocols.canopen.nmt import NmtState, NodeEvent, NodeEventKind, heartbeat_state
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.protocols.canopen.nmt import NmtState, NodeEvent, NodeEventKind, heartbeat_state
 
 TWIN_BOOT_NS = 100 * NS_PER_MS
 """No node boots twice within this time; two nodes with one id do (CO-042)."""

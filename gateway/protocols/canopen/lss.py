@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import DeviceRefused, UsageError
-from gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import DeviceRefused, UsageError
+from fieldtwin.gateway.protocols.canopen import cob_id
 
 SWITCH_GLOBAL = 0x04
 CONFIGURE_NODE_ID = 0x11

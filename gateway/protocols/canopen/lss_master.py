@@ -12,11 +12,11 @@ import asyncio
 from collections import deque
 from collections.abc import Awaitable, Callable
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import Desync, ReplyTimeout, UsageError
-from gateway.protocols.canopen import lss
-from gateway.protocols.canopen.lss import LssAddress
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, UsageError
+from fieldtwin.gateway.protocols.canopen import lss
+from fieldtwin.gateway.protocols.canopen.lss import LssAddress
 
 MAX_INBOX = 64
 REPLY_S = 0.1

@@ -9,17 +9,25 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
-from gateway.core.connection import CanConnection
-from gateway.core.errors import Bug, ConnectionLost, Desync, FieldtwinError, ReplyTimeout, SdoAborted, UsageError
-from gateway.core.latency import Latencies
-from gateway.protocols.canopen import abort_codes, cob_id, nmt
-from gateway.protocols.canopen.heartbeat import HeartbeatConsumer
-from gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
-from gateway.protocols.canopen.sdo import SdoDownload, SdoTransfer, SdoUpload
-from gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
-from gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import CanConnection
+from fieldtwin.gateway.core.errors import (
+    Bug,
+    ConnectionLost,
+    Desync,
+    FieldtwinError,
+    ReplyTimeout,
+    SdoAborted,
+    UsageError,
+)
+from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.protocols.canopen import abort_codes, cob_id, nmt
+from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
+from fieldtwin.gateway.protocols.canopen.nmt import NmtCommand, NmtState, NodeEvent, conflict_text
+from fieldtwin.gateway.protocols.canopen.sdo import SdoDownload, SdoTransfer, SdoUpload
+from fieldtwin.gateway.protocols.canopen.sdo_block import SdoBlockDownload, SdoBlockUpload
+from fieldtwin.gateway.protocols.canopen.sdo_channel import Counters, SdoChannel
 
 PdoCallback = Callable[[bytes, int], None]
 """Called with the frame's data and when it came (monotonic, ns)."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Literal
 
-from gateway.core.canframe import CanFrame
-from gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.protocols.canopen import cob_id
 
 
 class NmtCommand(IntEnum):

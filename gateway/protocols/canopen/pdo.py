@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 
-from gateway.core.errors import Desync, UsageError, WireError
+from fieldtwin.gateway.core.errors import Desync, UsageError, WireError
 
 PDO_BITS = 64
 MAX_ENTRIES = 64

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import Desync, ReplyTimeout, SdoAborted
-from gateway.protocols.canopen.cob_id import NODE_MAX
-from gateway.protocols.canopen.configure import DEVICE_TYPE, Identity, read_identity
-from gateway.protocols.canopen.datatypes import LengthMismatch
-from gateway.protocols.canopen.master import CanopenMaster
-from gateway.protocols.canopen.nmt import NmtState
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import Desync, ReplyTimeout, SdoAborted
+from fieldtwin.gateway.protocols.canopen.cob_id import NODE_MAX
+from fieldtwin.gateway.protocols.canopen.configure import DEVICE_TYPE, Identity, read_identity
+from fieldtwin.gateway.protocols.canopen.datatypes import LengthMismatch
+from fieldtwin.gateway.protocols.canopen.master import CanopenMaster
+from fieldtwin.gateway.protocols.canopen.nmt import NmtState
 
 
 @dataclass(frozen=True, slots=True)

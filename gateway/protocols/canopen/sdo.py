@@ -16,9 +16,9 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
-from gateway.core.canframe import CanFrame
-from gateway.core.errors import Bug, Desync, FieldtwinError, ReplyTimeout, SdoAborted, UsageError
-from gateway.protocols.canopen import abort_codes, cob_id
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.errors import Bug, Desync, FieldtwinError, ReplyTimeout, SdoAborted, UsageError
+from fieldtwin.gateway.protocols.canopen import abort_codes, cob_id
 
 MAX_BYTES = 1 << 20
 """No object that a gateway reads is larger; a node that sends segments for ever is stopped here."""

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 
-from gateway.core.errors import UsageError
-from gateway.protocols.canopen import abort_codes
-from gateway.protocols.canopen.sdo import MAX_BYTES, Done, SdoDownload, SdoUpload, Send, Step, Wait
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.protocols.canopen import abort_codes
+from fieldtwin.gateway.protocols.canopen.sdo import MAX_BYTES, Done, SdoDownload, SdoUpload, Send, Step, Wait
 
 UPLOAD_BLOCK = 63
 BLOCK_MAX = 127

@@ -12,13 +12,13 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted
-from gateway.core.latency import Latencies
-from gateway.protocols.canopen import abort_codes
-from gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
-from gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import ConnectionLost, ReplyTimeout, SdoAborted
+from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.protocols.canopen import abort_codes
+from fieldtwin.gateway.protocols.canopen.late_replies import LateReplies, Multiplexor
+from fieldtwin.gateway.protocols.canopen.sdo import ABORT, Done, Failed, SdoTransfer, SdoUpload, Send, Step, Stray, Wait
 
 MAX_ANSWERS = 16
 """Answered requests of one node that a second reply is compared with."""

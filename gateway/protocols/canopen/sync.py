@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from gateway.core.canframe import CanFrame
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import UsageError
-from gateway.protocols.canopen import cob_id
+from fieldtwin.gateway.core.canframe import CanFrame
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.protocols.canopen import cob_id
 
 NS_PER_US = 1_000
 _DAY_NS = 24 * 3600 * NS_PER_S

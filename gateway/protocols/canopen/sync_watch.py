@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.clock import NS_PER_MS
 
 _INTERVALS = 16
 """Intervals that are compared: enough that a few late frames do not matter."""

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
-from gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.request import MAX_PDU, Request, short_hex
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.request import MAX_PDU, Request, short_hex
 
 CHARACTER_GAP_NS = NS_PER_S
 """The longest pause between two characters of a frame (SL 2.5.2.1)."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple, Self, TypeVar
 
-from gateway.core.clock import NS_PER_S, Clock
-from gateway.core.connection import ByteConnection, closed_here
-from gateway.core.endpoint import Endpoint, SerialSettings
-from gateway.core.errors import (
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, closed_here
+from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
+from fieldtwin.gateway.core.errors import (
     ConnectionLost,
     CrcError,
     Desync,
@@ -24,15 +24,15 @@ from gateway.core.errors import (
     UsageError,
     VerifyFailed,
 )
-from gateway.core.latency import Latencies
-from gateway.core.turn import Turn
-from gateway.protocols.modbus.framings import Framing, framing_of, make_framer
-from gateway.protocols.modbus.identity import ReadDeviceIdentification
-from gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
-from gateway.protocols.modbus.refusals import GatewayRefusal
-from gateway.protocols.modbus.replies import BitsReply, RegistersReply, Reply, WriteReply
-from gateway.protocols.modbus.request import Request
-from gateway.protocols.modbus.requests import (
+from fieldtwin.gateway.core.latency import Latencies
+from fieldtwin.gateway.core.turn import Turn
+from fieldtwin.gateway.protocols.modbus.framings import Framing, framing_of, make_framer
+from fieldtwin.gateway.protocols.modbus.identity import ReadDeviceIdentification
+from fieldtwin.gateway.protocols.modbus.line import TURNAROUND_S, LineSilence
+from fieldtwin.gateway.protocols.modbus.refusals import GatewayRefusal
+from fieldtwin.gateway.protocols.modbus.replies import BitsReply, RegistersReply, Reply, WriteReply
+from fieldtwin.gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.protocols.modbus.requests import (
     BitTable,
     MaskWriteRegister,
     ReadBits,
@@ -44,7 +44,7 @@ from gateway.protocols.modbus.requests import (
     WriteRegister,
     WriteRegisters,
 )
-from gateway.protocols.modbus.transaction import Transaction
+from fieldtwin.gateway.protocols.modbus.transaction import Transaction
 
 R = TypeVar("R", bound=Reply)
 

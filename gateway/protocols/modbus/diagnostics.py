@@ -9,15 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from gateway.core.errors import Desync, UsageError
-from gateway.protocols.modbus.replies import (
+from fieldtwin.gateway.core.errors import Desync, UsageError
+from fieldtwin.gateway.protocols.modbus.replies import (
     CommEventCounterReply,
     CommEventLogReply,
     DiagnosticsReply,
     WriteReply,
 )
-from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
-from gateway.protocols.modbus.requests import check_range
+from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
+from fieldtwin.gateway.protocols.modbus.requests import check_range
 
 _FUNCTION = 0x08
 _LOOPBACK = 0x00

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.errors import Desync, UsageError, VerifyFailed
-from gateway.protocols.modbus.pdus import words_of, words_to_bytes
-from gateway.protocols.modbus.replies import FileRecordsReply, RegistersReply, WriteReply
-from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
-from gateway.protocols.modbus.requests import check_range
+from fieldtwin.gateway.core.errors import Desync, UsageError, VerifyFailed
+from fieldtwin.gateway.protocols.modbus.pdus import words_of, words_to_bytes
+from fieldtwin.gateway.protocols.modbus.replies import FileRecordsReply, RegistersReply, WriteReply
+from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
+from fieldtwin.gateway.protocols.modbus.requests import check_range
 
 _REFERENCE_TYPE = 6
 _LAST_RECORD = 9999

@@ -10,8 +10,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import Any
 
-from gateway.core.errors import WireError
-from gateway.protocols.modbus.request import Request
+from fieldtwin.gateway.core.errors import WireError
+from fieldtwin.gateway.protocols.modbus.request import Request
 
 
 class Framer(ABC):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Literal
 
-from gateway.core.endpoint import Endpoint
-from gateway.core.errors import UsageError
-from gateway.protocols.modbus.ascii import AsciiFramer
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
-from gateway.protocols.modbus.rtu import RtuFramer
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.protocols.modbus.ascii import AsciiFramer
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.mbap import MbapFramer, UdpFramer
+from fieldtwin.gateway.protocols.modbus.rtu import RtuFramer
 
 Framing = Literal["rtu", "ascii", "mbap", "udp"]
 

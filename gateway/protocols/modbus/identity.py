@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.errors import Desync
-from gateway.protocols.modbus import pdus
-from gateway.protocols.modbus.replies import (
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.protocols.modbus import pdus
+from fieldtwin.gateway.protocols.modbus.replies import (
     DeviceIdentificationReply,
     ExceptionStatusReply,
     ServerIdReply,
 )
-from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
-from gateway.protocols.modbus.requests import check_range
+from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request, short_hex
+from fieldtwin.gateway.protocols.modbus.requests import check_range
 
 _MEI_DEVICE_IDENTIFICATION = 0x0E
 _IDENTIFICATION_HEAD = 7  # function, MEI type, read code, conformity, more follows, next object id, number of objects

@@ -7,7 +7,7 @@ request go. Pure: told what arrived and when, it says until when to wait. Times 
 
 from __future__ import annotations
 
-from gateway.core.clock import NS_PER_MS, NS_PER_S
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 TURNAROUND_S = 0.1
 """What units get to execute a broadcast (SL 2.4.1: 100 to 200 ms)."""

@@ -10,9 +10,9 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from gateway.core.errors import ReplyTimeout, WireError
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.request import MAX_PDU, Request
+from fieldtwin.gateway.core.errors import ReplyTimeout, WireError
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.request import MAX_PDU, Request
 
 _HEADER = struct.Struct(">HHHB")  # transaction id, protocol id, length, unit id; the length counts from the unit id
 _BEFORE_LENGTH_COUNTS = 6

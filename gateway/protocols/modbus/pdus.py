@@ -31,7 +31,7 @@ from pymodbus.pdu.register_message import (
     WriteSingleRegisterRequest,
 )
 
-from gateway.core.errors import Bug
+from fieldtwin.gateway.core.errors import Bug
 
 _FOREIGN = (ModbusException, ValueError, IndexError, TypeError, struct.error)
 

@@ -6,7 +6,7 @@ codes included, is a plain `ModbusExceptionReply`.
 
 from __future__ import annotations
 
-from gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
 
 
 class Acknowledged(ModbusExceptionReply):

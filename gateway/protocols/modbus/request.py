@@ -11,9 +11,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar, Generic, TypeVar
 
-from gateway.core.errors import Desync, UsageError, WrongSize
-from gateway.protocols.modbus.refusals import refusal
-from gateway.protocols.modbus.replies import Reply
+from fieldtwin.gateway.core.errors import Desync, UsageError, WrongSize
+from fieldtwin.gateway.protocols.modbus.refusals import refusal
+from fieldtwin.gateway.protocols.modbus.replies import Reply
 
 R = TypeVar("R", bound=Reply)
 R_co = TypeVar("R_co", bound=Reply, covariant=True)

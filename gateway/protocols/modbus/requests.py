@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from gateway.core.errors import UsageError, VerifyFailed
-from gateway.protocols.modbus import pdus
-from gateway.protocols.modbus.replies import BitsReply, RegistersReply, WriteReply
-from gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request
+from fieldtwin.gateway.core.errors import UsageError, VerifyFailed
+from fieldtwin.gateway.protocols.modbus import pdus
+from fieldtwin.gateway.protocols.modbus.replies import BitsReply, RegistersReply, WriteReply
+from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request
 
 RegisterTable = Literal["holding", "input"]
 BitTable = Literal["coil", "discrete"]

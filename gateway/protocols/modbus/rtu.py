@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from gateway.core.clock import NS_PER_MS
-from gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError, WrongSize
-from gateway.protocols.modbus.crc import crc16, is_whole, with_crc
-from gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request, counted_bytes, short_hex
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import CrcError, Desync, ReplyTimeout, WireError, WrongSize
+from fieldtwin.gateway.protocols.modbus.crc import crc16, is_whole, with_crc
+from fieldtwin.gateway.protocols.modbus.frame_shapes import MAX_FRAME, MIN_FRAME, frame_lengths
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, NEED_MORE, Request, counted_bytes, short_hex
 
 USB_LATENCY_NS = 20 * NS_PER_MS
 """USB adapters hold bytes back for up to 16 ms (case MB-006): a shorter pause says nothing about the line."""

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from gateway.core.errors import ModbusExceptionReply
-from gateway.protocols.modbus.refusals import refusal
+from fieldtwin.gateway.core.errors import ModbusExceptionReply
+from fieldtwin.gateway.protocols.modbus.refusals import refusal
 
 ServedTable = Literal["coil", "discrete", "input", "holding"]
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.core.errors import VerifyFailed
-from gateway.protocols.modbus.crc import crc16
-from gateway.protocols.modbus.replies import Reply
-from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request
-from gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked
+from fieldtwin.gateway.core.errors import VerifyFailed
+from fieldtwin.gateway.protocols.modbus.crc import crc16
+from fieldtwin.gateway.protocols.modbus.replies import Reply
+from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request
+from fieldtwin.gateway.protocols.modbus.server import BROADCAST_FUNCTIONS, Asked
 
 _COUNTED = frozenset({0x0C, 0x11, 0x14})
 """Functions whose reply tells its length in its second byte."""

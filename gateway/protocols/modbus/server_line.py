@@ -11,9 +11,9 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from gateway.core.clock import NS_PER_MS
-from gateway.protocols.modbus.crc import crc16, with_crc
-from gateway.protocols.modbus.frame_shapes import KNOWN_FUNCTIONS, MAX_FRAME, MIN_FRAME, frame_lengths
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.protocols.modbus.crc import crc16, with_crc
+from fieldtwin.gateway.protocols.modbus.frame_shapes import KNOWN_FUNCTIONS, MAX_FRAME, MIN_FRAME, frame_lengths
 
 _LAST_UNIT = 247
 LOST_AFTER = 4 * MAX_FRAME

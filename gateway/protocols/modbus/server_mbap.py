@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from gateway.protocols.modbus.request import MAX_PDU
+from fieldtwin.gateway.protocols.modbus.request import MAX_PDU
 
 _HEADER = struct.Struct(">HHHB")
 _BEFORE_LENGTH_COUNTS = 6

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Generic, TypeVar
 
-from gateway.core.clock import NS_PER_S
-from gateway.core.errors import Bug, FieldtwinError
-from gateway.protocols.modbus.framing import Framer
-from gateway.protocols.modbus.replies import Reply
-from gateway.protocols.modbus.request import Request, parse_reply
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import Bug, FieldtwinError
+from fieldtwin.gateway.protocols.modbus.framing import Framer
+from fieldtwin.gateway.protocols.modbus.replies import Reply
+from fieldtwin.gateway.protocols.modbus.request import Request, parse_reply
 
 R = TypeVar("R", bound=Reply)
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gateway.protocols.modbus.replies import UserReply
-from gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request
-from gateway.protocols.modbus.requests import check_range
+from fieldtwin.gateway.protocols.modbus.replies import UserReply
+from fieldtwin.gateway.protocols.modbus.request import IMPOSSIBLE, MAX_PDU, NEED_MORE, Request
+from fieldtwin.gateway.protocols.modbus.requests import check_range
 
 
 @dataclass(frozen=True, slots=True)

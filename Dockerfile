@@ -15,7 +15,7 @@ RUN python -c "import tomllib; p = tomllib.load(open('pyproject.toml', 'rb'))['p
 COPY . .
 # share: where the shipped profiles and recordings are, whatever the version of Python in their path.
 RUN pip --python /opt/fieldtwin/bin/python install --no-deps . \
- && cd / && ln -s "$(/opt/fieldtwin/bin/python -c 'from fieldtwin.twin.data_files import data_root; print(data_root())')" \
+ && cd / && ln -s "$(/opt/fieldtwin/bin/python -c 'from fieldtwin.twin.site.data_files import data_root; print(data_root())')" \
       /opt/fieldtwin/share
 
 FROM python:3.11-slim-bookworm

@@ -36,10 +36,10 @@ from fieldtwin.emulators.wires.serial_line import SerialPacer
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
 from fieldtwin.running.children import Child
-from fieldtwin.twin.controller import ControllerConfig
-from fieldtwin.twin.mapping import mapping_to_json
-from fieldtwin.twin.physical import image_layout, make_image
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.plant.controller import ControllerConfig
+from fieldtwin.twin.plant.mapping import mapping_to_json
+from fieldtwin.twin.plant.physical import image_layout, make_image
+from fieldtwin.twin.site.system import load_system
 
 UNITS, LIVE, PERIOD_S, WINDOW_S, GOAL = 31, 7, 0.5, 60.0, 0.95
 LINE, LATENCY_S = SerialSettings(19200, "8N1"), 0.005
@@ -130,7 +130,7 @@ async def our_polls(port: str, seconds: float) -> None:
         mapping = mapping_to_json({Endpoint.parse(PLANT): Endpoint.parse(PLANT.replace("/dev/ttyBENCH", port))})
         config = folder / "gateway.json"
         config.write_bytes(msgspec.json.encode(ControllerConfig(str(path), str(folder), False, mapping)))
-        gateway = Child("gateway", "fieldtwin.twin.controller", config, folder)
+        gateway = Child("gateway", "fieldtwin.twin.plant.controller", config, folder)
         try:
             control = await gateway.connect()
             await asyncio.sleep(seconds)

@@ -26,7 +26,7 @@ from peers import Goals, ratio
 from fieldtwin.gateway.store.event import Event
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.knowledge import BATCH, KnowledgeWriter, known_at
+from fieldtwin.twin.model.knowledge import BATCH, KnowledgeWriter, known_at
 
 WRITES_PER_S = 50_000
 REPLAY_S = 2.0

@@ -30,11 +30,11 @@ from peers import HERE, Goals, cpu_s, peak_mb, python, ratio, rss_mb, start, sto
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.running.children import Child
-from fieldtwin.twin.controller import ControllerConfig
-from fieldtwin.twin.field_process import FieldConfig
-from fieldtwin.twin.mapping import mapped_endpoint, mapping_to_json
-from fieldtwin.twin.physical import image_layout, make_image
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.plant.controller import ControllerConfig
+from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
+from fieldtwin.twin.plant.physical import image_layout, make_image
+from fieldtwin.twin.prototype.field_process import FieldConfig
+from fieldtwin.twin.site.system import System, load_system
 
 PROFILE, RECORDING, UNIT, REGISTERS, RECORDED = "meter.yaml", "meter.jsonl", 1, 20, 100
 METER = f"""
@@ -106,7 +106,7 @@ async def emulators_up(folder: Path, system: Path) -> tuple[Child, ControlClient
     config = folder / "field.json"
     config.write_bytes(msgspec.json.encode(FieldConfig(str(system), str(folder))))
     began = time.perf_counter()
-    child = Child("field", "fieldtwin.twin.field_process", config, folder)
+    child = Child("field", "fieldtwin.twin.prototype.field_process", config, folder)
     client = await child.connect()
     return child, client, Up(time.perf_counter() - began, rss_mb(child.pid))
 
@@ -162,7 +162,7 @@ async def poll(devices: int, seconds: float, goals: Goals) -> None:
             }
             config = ControllerConfig(str(path), str(folder), False, mapping_to_json(mapping))
             (folder / "gateway.json").write_bytes(msgspec.json.encode(config))
-            gateway = Child("gateway", "fieldtwin.twin.controller", folder / "gateway.json", folder)
+            gateway = Child("gateway", "fieldtwin.twin.plant.controller", folder / "gateway.json", folder)
             try:
                 await watch(field, field_client, gateway, system, seconds, goals)
             finally:

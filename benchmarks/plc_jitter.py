@@ -33,7 +33,7 @@ from peers import Goals, python
 from fieldtwin.gateway.core.image import TagKind, TagSpec
 from fieldtwin.plc.binding import InputBinding, image_for
 from fieldtwin.plc.config import PlcConfig, ProgramConfig
-from fieldtwin.twin.physical import make_image
+from fieldtwin.twin.plant.physical import make_image
 
 ROOT = Path(__file__).resolve().parents[1]
 PRIORITY = 10

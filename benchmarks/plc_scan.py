@@ -26,8 +26,8 @@ from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
 from fieldtwin.plc.blocks import CTU, MS, TON
 from fieldtwin.plc.program import Program, ScanInfo, var_input, var_output
 from fieldtwin.plc.scan import Scan
-from fieldtwin.twin.physical import image_layout, programs_of
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.plant.physical import image_layout, programs_of
+from fieldtwin.twin.site.system import load_system
 
 GOAL_OBSERVATORY_US = 25.0
 GOAL_BLOCKS_US = 1000.0

@@ -28,11 +28,11 @@ from fieldtwin.emulators.wires.serial_line import SerialPacer
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.endpoint import Endpoint, SerialSettings
 from fieldtwin.running.children import Child
-from fieldtwin.twin.controller import ControllerConfig
-from fieldtwin.twin.field_process import FieldConfig
-from fieldtwin.twin.mapping import mapped_endpoint, mapping_to_json
-from fieldtwin.twin.physical import image_layout, make_image
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.plant.controller import ControllerConfig
+from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
+from fieldtwin.twin.plant.physical import image_layout, make_image
+from fieldtwin.twin.prototype.field_process import FieldConfig
+from fieldtwin.twin.site.system import load_system
 
 LINE, LATENCY_MS, REGISTERS = SerialSettings(19200, "8E1"), 5, 10
 REQUEST_CHARS, REPLY_CHARS = 8, 5 + 2 * REGISTERS
@@ -122,7 +122,7 @@ async def one_run(folder: Path, seconds: float) -> tuple[float, float]:
     path = make_files(folder)
     config = folder / "field.json"
     config.write_bytes(msgspec.json.encode(FieldConfig(str(path), str(folder))))
-    field = Child("field", "fieldtwin.twin.field_process", config, folder)
+    field = Child("field", "fieldtwin.twin.prototype.field_process", config, folder)
     client = await field.connect()
     try:
         return await gateway_rate(folder, path, client, seconds), await peer_rate(folder, client, seconds)
@@ -139,7 +139,7 @@ async def gateway_rate(folder: Path, path: Path, client: ControlClient, seconds:
     mapping = mapping_to_json({plant: mapped_endpoint(plant, listening)})
     config = folder / "gateway.json"
     config.write_bytes(msgspec.json.encode(ControllerConfig(str(path), str(folder), False, mapping)))
-    gateway = Child("gateway", "fieldtwin.twin.controller", config, folder)
+    gateway = Child("gateway", "fieldtwin.twin.plant.controller", config, folder)
     try:
         control = await gateway.connect()
         rate = await counted_per_s(client, seconds)

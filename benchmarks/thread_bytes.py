@@ -21,7 +21,7 @@ import sys
 from peers import Goals
 
 from fieldtwin.gateway.store.event import Event
-from fieldtwin.twin.thread_frames import Data, FrameCodec, Hello, Schema
+from fieldtwin.twin.thread.frames import Data, FrameCodec, Hello, Schema
 
 MTU = 64
 LINK_BYTES_PER_S, OVERHEAD = 80, 8

@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from fieldtwin.running.options import RunOptions as RunOptions
     from fieldtwin.running.session import RunSession as RunSession
     from fieldtwin.running.summary import summarise as summarise
-    from fieldtwin.twin.prototype_file import load_prototype as load_prototype
-    from fieldtwin.twin.system import load_system as load_system
+    from fieldtwin.twin.prototype.file import load_prototype as load_prototype
+    from fieldtwin.twin.site.system import load_system as load_system
 
 _PUBLIC = {
     "FieldtwinError": "fieldtwin.gateway.core.errors",
     "RunOptions": "fieldtwin.running.options",
     "RunSession": "fieldtwin.running.session",
     "load_profile": "fieldtwin.gateway.core.profile",
-    "load_prototype": "fieldtwin.twin.prototype_file",
-    "load_system": "fieldtwin.twin.system",
+    "load_prototype": "fieldtwin.twin.prototype.file",
+    "load_system": "fieldtwin.twin.site.system",
     "scan_can_bus": "fieldtwin.running.node_scan",
     "summarise": "fieldtwin.running.summary",
 }

@@ -31,7 +31,7 @@ from fieldtwin.recording.comparing_can import Frames, compare_logs
 from fieldtwin.recording.live_comparing import compare_device, compare_node, uploads_of
 from fieldtwin.recording.rotating import exchanges_of, header_of, parts_of
 from fieldtwin.sitereport.about import headed
-from fieldtwin.twin.data_files import find
+from fieldtwin.twin.site.data_files import find
 
 SHOWN = 20
 INCONCLUSIVE = 4

@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.protocols.canopen.dictionary import ObjectDictionary, load_dictionary
 from fieldtwin.sitereport.about import headed
-from fieldtwin.twin.data_files import find, search_path
+from fieldtwin.twin.site.data_files import find, search_path
 
 DIFFERENT = 1
 

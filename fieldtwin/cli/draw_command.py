@@ -37,9 +37,9 @@ def command(system: str, prototype: bool, output: Path | None, profiles: tuple[s
     from fieldtwin.drawing.tree import tree
     from fieldtwin.drawing.wiring import wiring
     from fieldtwin.running.template_here import system_file
-    from fieldtwin.twin.data_files import network_file
-    from fieldtwin.twin.prototype_file import load_prototype
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.prototype.file import load_prototype
+    from fieldtwin.twin.site.data_files import network_file
+    from fieldtwin.twin.site.system import load_system
 
     if as_json and output is not None:
         raise UsageError("--json and -o at once", expected="one of them")
@@ -53,7 +53,7 @@ def command(system: str, prototype: bool, output: Path | None, profiles: tuple[s
 
 def _network(path: Path, profiles: list[Path]) -> tuple[Any, str, Callable[[], str]]:
     from fieldtwin.drawing.water import network_map, svg, text
-    from fieldtwin.twin.network import load_network
+    from fieldtwin.twin.network.network import load_network
 
     drawn = network_map(load_network(path, profiles))
     return drawn.as_data(), text(drawn), lambda: svg(drawn)

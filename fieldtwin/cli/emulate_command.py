@@ -11,7 +11,7 @@ from fieldtwin.cli.options import Secret, pairs, profiles_option
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.running.field_contact import DEFAULT_CONTROL_PORT
-from fieldtwin.twin.data_files import data_root, find
+from fieldtwin.twin.site.data_files import data_root, find
 
 if TYPE_CHECKING:
     from fieldtwin.running.device_here import Extras
@@ -290,7 +290,7 @@ def _number_or_text(text: str) -> float | str:
 
 def _kind(what: str, profiles: tuple[Path, ...]) -> tuple[str, Path]:
     """What `what` names: ("system" | "device" | "recording" | "log" | "data sheet", file)."""
-    from fieldtwin.twin.template_package import is_template
+    from fieldtwin.twin.template.package import is_template
 
     direct = Path(what)
     if is_template(direct):

@@ -11,7 +11,7 @@ import click
 from fieldtwin.cli.options import json_option, profiles_option
 from fieldtwin.cli.talk import data
 from fieldtwin.gateway.core.profile import load_profile
-from fieldtwin.twin.data_files import find
+from fieldtwin.twin.site.data_files import find
 
 
 @click.command("export")

@@ -23,7 +23,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
 from fieldtwin.gateway.wallclock import run as run_precise
-from fieldtwin.twin.data_files import search_path
+from fieldtwin.twin.site.data_files import search_path
 
 COLOUR = {
     Sureness.CERTAIN: "bold green",

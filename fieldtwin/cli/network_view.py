@@ -30,8 +30,8 @@ from fieldtwin.running.shore import Scripted, script
 from fieldtwin.running.summary import summarise
 from fieldtwin.running.template_here import agree
 from fieldtwin.running.virtual_network_run import VirtualNetworkOptions
-from fieldtwin.twin.network import SHIP, Network, load_network
-from fieldtwin.twin.network_faults import check_network_fault
+from fieldtwin.twin.network.faults import check_network_fault
+from fieldtwin.twin.network.network import SHIP, Network, load_network
 
 FIRST_S = 1.0
 BASE_S = 10

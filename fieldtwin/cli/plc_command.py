@@ -14,7 +14,7 @@ from fieldtwin.cli.options import NegativeNumbers, json_option, profiles_option
 from fieldtwin.cli.talk import talk
 from fieldtwin.cli.template_question import consent, trust_option
 from fieldtwin.gateway.core.errors import UsageError
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.site.system import System, load_system
 
 instance_option = click.option(
     "--instance", default="", metavar="NAME", help="Which one; default: the only one that runs."

@@ -154,7 +154,7 @@ def _scenario_of(run: str | None, system: str, out: Path, profiles: tuple[str, .
     """A recorded run as a scenario, with the tolerances that `fieldtwin trace --as-scenario` has by itself."""
     from fieldtwin.cli.regression_view import write_scenario
     from fieldtwin.regression.comparing import Allowed
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.site.system import load_system
 
     if run is None:
         raise UsageError("which run?", expected="the file of run --virtual --trace, or of run --capture")

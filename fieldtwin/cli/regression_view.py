@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.regression.as_scenario import Wanted, as_scenario
 from fieldtwin.regression.comparing import Allowed, Verdict, compare
 from fieldtwin.regression.story import story_of
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 SHOWN = 30
 LENGTHS_S = 1.0

@@ -27,7 +27,7 @@ from fieldtwin.running.template_here import system_file
 from fieldtwin.service.attached import Service, ServiceOptions, check
 from fieldtwin.service.journal import Format
 from fieldtwin.service.notify import Notifier
-from fieldtwin.twin.data_files import network_file
+from fieldtwin.twin.site.data_files import network_file
 
 if TYPE_CHECKING:
     from fieldtwin.running.fault_schedule import RandomFaults
@@ -294,8 +294,8 @@ def _run_network(request: NetworkRequest, plant: bool, others: list[str]) -> int
 
 def _faults(path: str, system: str, profiles: tuple[str, ...]) -> tuple[dict[str, Any], ...]:
     from fieldtwin.emulators.faults.schema import load_faults
-    from fieldtwin.twin.fault_aims import target
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.prototype.fault_aims import target
+    from fieldtwin.twin.site.system import load_system
 
     if path == "random":
         raise UsageError("random faults go with --virtual")
@@ -353,7 +353,7 @@ def _run_against(options: VirtualOptions, old: Path, as_json: bool) -> int:
     from fieldtwin.cli.regression_view import judged, show
     from fieldtwin.cli.virtual_view import run_one
     from fieldtwin.regression.comparing import Allowed
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.site.system import load_system
 
     if as_json:
         raise UsageError(

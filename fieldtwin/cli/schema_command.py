@@ -11,19 +11,19 @@ import click
 
 
 def _system() -> dict[str, Any]:
-    from fieldtwin.twin.system_schema import SystemForm
+    from fieldtwin.twin.site.schema import SystemForm
 
     return SystemForm.model_json_schema()
 
 
 def _prototype() -> dict[str, Any]:
-    from fieldtwin.twin.system_schema import PrototypeForm
+    from fieldtwin.twin.site.schema import PrototypeForm
 
     return PrototypeForm.model_json_schema()
 
 
 def _network() -> dict[str, Any]:
-    from fieldtwin.twin.network_schema import NetworkForm
+    from fieldtwin.twin.network.schema import NetworkForm
 
     return NetworkForm.model_json_schema()
 

@@ -18,9 +18,9 @@ from fieldtwin.cli.talk import talk
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.running.shadowing import Shadowing
 from fieldtwin.running.template_here import system_file
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.mape.messages import Verdict
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import System, load_system
 
 STYLE = {"mismatch": "bold red", "outside": "red", "bad": "yellow", "stale": "yellow", "unreadable": "red"}
 

@@ -17,7 +17,7 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.field_contact import connect_control, reachable
 from fieldtwin.running.shore import Shore, parse_periods, script
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.site.system import System, load_system
 
 
 @click.command("shore")

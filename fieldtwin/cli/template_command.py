@@ -19,13 +19,13 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.visible import visible
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.template_here import Stranger
-from fieldtwin.twin.prototype_file import prototype_path
-from fieldtwin.twin.software import modules_hash
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.template import DOCUMENTS, DocumentKind, Manifest
-from fieldtwin.twin.template_check import Difference, differences, examine, put_together, software_difference, unified
-from fieldtwin.twin.template_pack import Extras, collect, pack
-from fieldtwin.twin.template_package import FolderPackage, open_package, unpack
+from fieldtwin.twin.prototype.file import prototype_path
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.template.check import Difference, differences, examine, put_together, software_difference, unified
+from fieldtwin.twin.template.pack import Extras, collect, pack
+from fieldtwin.twin.template.package import FolderPackage, open_package, unpack
+from fieldtwin.twin.template.software import modules_hash
+from fieldtwin.twin.template.template import DOCUMENTS, DocumentKind, Manifest
 
 KINDS: dict[str, DocumentKind] = {kind: kind for kind in DOCUMENTS}
 

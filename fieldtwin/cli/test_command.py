@@ -26,7 +26,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 if TYPE_CHECKING:
     from fieldtwin.report.model import Machine, SystemKey
-    from fieldtwin.twin.system import System
+    from fieldtwin.twin.site.system import System
 
 SUFFIX = ".scenario.yaml"
 _CONTROLLER = "fieldtwin.controller"

@@ -18,7 +18,7 @@ def command(trust: bool) -> int:
     """
     from fieldtwin.gateway.wallclock import run
     from fieldtwin.testhost.host import Host
-    from fieldtwin.twin.child import allow_open_files
+    from fieldtwin.twin.plant.child import allow_open_files
 
     allow_open_files()
     return run(Host(trust=trust).serve())

@@ -74,7 +74,7 @@ def command(
     Another run is compared by what it means: states and their order, values, qualities, latencies; never byte by byte.
     """
     from fieldtwin.running.template_here import system_file
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.site.system import load_system
 
     folders = [Path(p) for p in profiles]
     agreed = consent(

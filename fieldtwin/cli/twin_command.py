@@ -23,10 +23,10 @@ from fieldtwin.running.shadowing import limits_of
 from fieldtwin.running.template_here import system_file
 from fieldtwin.running.twin_rules import Plans, PythonPlanner, load_planner, questions_of
 from fieldtwin.running.twinning import Twinning
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.mape.plan import RulePlanner
-from fieldtwin.twin.mape.what_if import Question
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.model.mape.plan import RulePlanner
+from fieldtwin.twin.model.mape.what_if import Question
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import System, load_system
 from fieldtwin.whatif.asking import Asking, Subject
 
 

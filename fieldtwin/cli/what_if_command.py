@@ -65,7 +65,7 @@ def command(
 
     The plant is not touched. Exit status: 0 when a plan meets all that is required, 1 when none does.
     """
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.site.system import load_system
     from fieldtwin.whatif.fork import Fork
     from fieldtwin.whatif.many import answers
     from fieldtwin.whatif.plan import Plan, in_words, load_plans
@@ -130,7 +130,7 @@ def _ahead(seconds: float) -> str:
 
 
 def _state(source: str, origin: str, system: str, folders: tuple[Path, ...]) -> KnownState:
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.site.system import load_system
     from fieldtwin.whatif.known import known_state
     from fieldtwin.whatif.state import of_instance, read_state
 
@@ -158,6 +158,6 @@ def _faults(path: Path | None, system: Any) -> tuple[dict[str, Any], ...]:
     if path is None:
         return ()
     from fieldtwin.emulators.faults.schema import load_faults
-    from fieldtwin.twin.fault_aims import target
+    from fieldtwin.twin.prototype.fault_aims import target
 
     return load_faults(path, lambda spec: target(system, spec))

@@ -59,8 +59,8 @@ def command(
     from fieldtwin.running.struck import struck_of
     from fieldtwin.running.template_here import system_file
     from fieldtwin.running.with_field import run_with
-    from fieldtwin.twin.field_process import FieldConfig
-    from fieldtwin.twin.system import load_system
+    from fieldtwin.twin.prototype.field_process import FieldConfig
+    from fieldtwin.twin.site.system import load_system
 
     words = argv[1:] if argv[:1] == ("--",) else argv
     if not words:
@@ -80,7 +80,7 @@ def command(
     put_in: tuple[dict[str, Any], ...] = ()
     if faults:
         from fieldtwin.emulators.faults.schema import load_faults
-        from fieldtwin.twin.fault_aims import target
+        from fieldtwin.twin.prototype.fault_aims import target
 
         put_in = load_faults(Path(faults), lambda spec: target(loaded, spec))
 

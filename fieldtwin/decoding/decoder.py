@@ -24,7 +24,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.protocols.modbus.framings import framing_of
 from fieldtwin.scenarios.trace import Event, Kind, refusal_text
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 
 class Decoder:

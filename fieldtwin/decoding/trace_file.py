@@ -13,7 +13,7 @@ from fieldtwin.formats.pcap import MAX_LINE_BYTES, read_capture
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.input_file import open_input
 from fieldtwin.scenarios.trace import Event, Kind, refusal_data
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 _EXPECTED = "[ns, kind, where, data], as `fieldtwin run --virtual --trace` writes it"
 

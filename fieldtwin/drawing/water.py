@@ -12,7 +12,7 @@ from typing import Any
 
 from fieldtwin.drawing.svg import CHAR, EDGE, LINE, document
 from fieldtwin.report.markup import Markup, el
-from fieldtwin.twin.network import SHIP, Network
+from fieldtwin.twin.network.network import SHIP, Network
 
 WIDE, HIGH, LOW = 760.0, 420.0, 120.0
 """Room for the places, in px: its width, its greatest and its smallest height."""

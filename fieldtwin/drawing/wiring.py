@@ -11,8 +11,8 @@ from typing import Any
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
-from fieldtwin.twin.prototype_file import Prototype
-from fieldtwin.twin.system import System
+from fieldtwin.twin.prototype.file import Prototype
+from fieldtwin.twin.site.system import System
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
 from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.regression.story import Change, Story
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 BRIEF_NS = 200_000_000
 """A state that lasted less is not waited for: a check might come too late for it."""

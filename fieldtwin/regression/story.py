@@ -15,7 +15,7 @@ from fieldtwin.decoding.decoder import Decoder
 from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.scenarios.trace import FAR_END, Event, Kind
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 MOST = 200_000
 """Changes of a field."""

@@ -19,7 +19,7 @@ from fieldtwin.gateway.devices.config import DeviceConfig
 from fieldtwin.gateway.protocols.canopen.abort_codes import MEANINGS
 from fieldtwin.report.model import Counts, Machine
 from fieldtwin.scenarios.trace import Event, Kind
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 MOST = 2000
 """Different things of a kind that are counted."""

@@ -16,7 +16,7 @@ from fieldtwin.report.axis import CHAR, LEFT, RIGHT, WIDTH, Axis, fitted, label,
 from fieldtwin.report.markup import Markup, el
 from fieldtwin.report.value_lanes import value_lane
 from fieldtwin.report.window import FaultBar, Step, Window
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 MOST_TAGS = 10
 MOST_STATES = 6

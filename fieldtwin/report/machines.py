@@ -5,7 +5,7 @@ from __future__ import annotations
 from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.states import StateTable
 from fieldtwin.report.model import Machine
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 
 def machines_of(system: System) -> tuple[Machine, ...]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from fieldtwin.scenarios.trace import Event
 
 if TYPE_CHECKING:  # verdicts and results are also made where no system can be read
-    from fieldtwin.twin.system import System
+    from fieldtwin.twin.site.system import System
 
 
 class Verdict(Enum):

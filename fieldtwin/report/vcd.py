@@ -21,7 +21,7 @@ from fieldtwin.gateway.core.values import Quality
 from fieldtwin.report.markup import clean
 from fieldtwin.report.model import Machine
 from fieldtwin.scenarios.trace import Event, Kind
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 MOST_CHARACTERS = 48
 """Characters of a word; longer ones end with a dot."""

@@ -27,7 +27,7 @@ from fieldtwin.gateway.runtime.bridge_policy import LOOPBACK, AllowRule, Network
 from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.instance import Instance
+from fieldtwin.twin.plant.instance import Instance
 
 TARGET = "target"
 WATCH_NS = NS_PER_S // 5

@@ -9,7 +9,7 @@ from fieldtwin.decoding.decoder import frame_events
 from fieldtwin.formats.pcap import captured_of
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid
 from fieldtwin.scenarios.trace import Event
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 AT_ONCE = 4 << 20
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import Bug, FieldtwinError, ReplyTimeout, Unreachable
-from fieldtwin.twin.child import command
+from fieldtwin.twin.plant.child import command
 
 START_TIMEOUT_S = 30.0
 POLL_S = 0.02

@@ -42,8 +42,8 @@ from fieldtwin.running.with_field import environment_from
 from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
 from fieldtwin.scenarios.probe_form import Probe
 from fieldtwin.scenarios.trace import FAR_END, Event, Kind, Trace, refusal_data
-from fieldtwin.twin.physical import attached, gateway_lost_ms, image_layout
-from fieldtwin.twin.system import System
+from fieldtwin.twin.plant.physical import attached, gateway_lost_ms, image_layout
+from fieldtwin.twin.site.system import System
 
 PLC_EVERY_S = 0.25
 STARTING_S = 5.0

@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.gateway.core.values import COMMAND, Quality, TagValue
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.prove import Given, Proof, Result, shown
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 ARRIVES = "5s"
 """How long the last stimulus may take to get to the program."""

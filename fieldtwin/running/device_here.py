@@ -56,8 +56,8 @@ from fieldtwin.recording.rotating import exchanges_of, header_of, oldest_part
 from fieldtwin.running.can_here import only_bus, stand_on_bus
 from fieldtwin.running.data_sheet_here import print_remarks
 from fieldtwin.running.until_stopped import until_stopped
-from fieldtwin.twin.data_files import find_recording
-from fieldtwin.twin.field import unit_limits
+from fieldtwin.twin.prototype.field import unit_limits
+from fieldtwin.twin.site.data_files import find_recording
 
 DEFAULT_RECORDINGS = {"fieldtwin/ctd-reference": "cast.jsonl", "fieldtwin/inclinometer-cia410": "incl.jsonl"}
 """Shipped reference devices whose recording has another name than their profile."""

@@ -14,9 +14,9 @@ from fieldtwin.emulators.faults.value_ranges import numbers
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.nearest import did_you_mean
-from fieldtwin.twin.fault_aims import target
-from fieldtwin.twin.network import WATER, Network
-from fieldtwin.twin.system import System
+from fieldtwin.twin.network.network import WATER, Network
+from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.site.system import System
 
 MEAN_S = 120.0
 """One fault in so many seconds, on average."""

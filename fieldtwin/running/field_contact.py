@@ -14,8 +14,8 @@ from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.running.link_child import LinkChild
-from fieldtwin.twin.mapping import mapped_endpoint
-from fieldtwin.twin.system import System
+from fieldtwin.twin.plant.mapping import mapped_endpoint
+from fieldtwin.twin.site.system import System
 
 DEFAULT_CONTROL_PORT = 7420
 LOCAL_HOSTS = ("localhost", "127.0.0.1", "::1")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 DEFAULT_HOST = "field"
 MOST_LOOKED_AT = 200

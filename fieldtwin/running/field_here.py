@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from fieldtwin.cli.talk import talk
-from fieldtwin.twin.child import allow_open_files
-from fieldtwin.twin.field import FieldSide
-from fieldtwin.twin.field_process import FieldConfig, FieldProcess
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.plant.child import allow_open_files
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field_process import FieldConfig, FieldProcess
+from fieldtwin.twin.site.system import load_system
 
 
 @dataclass(frozen=True)

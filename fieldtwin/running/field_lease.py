@@ -1,5 +1,5 @@
-"""A judge's lease on the simulated field devices, held on behalf of one scenario (`fieldtwin.twin.field_leases` is the other
-side).
+"""A judge's lease on the simulated field devices, held on behalf of one scenario (`fieldtwin.twin.prototype.field_leases` is the
+other side).
 
 What the scenario puts in is taken out when the lease ends: at once at the end of the scenario, and `LEASE_S` seconds after the
 last renewal where the judge died.
@@ -17,7 +17,7 @@ from typing import Any
 from fieldtwin.gateway.core.control import ControlClient, RemoteError
 from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
 from fieldtwin.scenarios.bench import NothingKnown
-from fieldtwin.twin.field_leases import LEASE_S
+from fieldtwin.twin.prototype.field_leases import LEASE_S
 
 RENEW_EVERY_S = 2.0
 OPEN_WITHIN_S = 2 * LEASE_S

@@ -14,7 +14,7 @@ from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, ReplyTimeout, Unreachable
 from fieldtwin.gateway.runtime.backoff import Backoff
 from fieldtwin.running.field_contact import FieldContact, check_same, connect_control
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 FIRST_S, LIMIT_S = 0.25, 4.0
 CONNECT_S = 4.0

@@ -14,9 +14,9 @@ from fieldtwin.__about__ import __version__
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.running import health_os as here
 from fieldtwin.running.health_judging import Check, Verdict, judged_can, judged_clock, judged_processor, judged_watches
-from fieldtwin.twin.data_files import data_root
-from fieldtwin.twin.instance import runtime_root
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.plant.instance import runtime_root
+from fieldtwin.twin.site.data_files import data_root
+from fieldtwin.twin.site.system import load_system
 
 MIN_FREE_BYTES = 200 * 1024 * 1024
 MIN_OPEN_FILES = 1024

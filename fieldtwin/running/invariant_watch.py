@@ -12,7 +12,7 @@ from fieldtwin.scenarios.knowledge import Knowledge
 from fieldtwin.scenarios.runner import LATE_SHARE, RECENT_S
 from fieldtwin.scenarios.standing import AlwaysRule, always_rule
 from fieldtwin.scenarios.whole_run import WithinRule, within_rule
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 Rule = AlwaysRule | WithinRule
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import ReplyTimeout, Unreachable
 from fieldtwin.running.children import START_TIMEOUT_S, spawn
-from fieldtwin.twin.child import command
+from fieldtwin.twin.plant.child import command
 
 LINGER_S = 2.0
 """The line outlives us for so long when we are killed: the gateway writes its safe values over it."""

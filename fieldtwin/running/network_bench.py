@@ -18,9 +18,9 @@ from fieldtwin.running.shore import Shore
 from fieldtwin.running.struck import struck_of
 from fieldtwin.scenarios.bench import Bench, Can, Reading, Stopped
 from fieldtwin.scenarios.trace import Kind, Trace
-from fieldtwin.twin.network import WATER, Network
-from fieldtwin.twin.network_faults import placed
-from fieldtwin.twin.water_faults import WaterFaults
+from fieldtwin.twin.network.faults import placed
+from fieldtwin.twin.network.network import WATER, Network
+from fieldtwin.twin.network.water_faults import WaterFaults
 
 
 class MemberTrace(Trace):

@@ -19,11 +19,11 @@ from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
 from fieldtwin.running.shore import Scripted, Shore
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.network import WATER, Network
-from fieldtwin.twin.network_faults import placed_all
-from fieldtwin.twin.ship import Ship
-from fieldtwin.twin.water_faults import WaterFaults
+from fieldtwin.twin.network.faults import placed_all
+from fieldtwin.twin.network.network import WATER, Network
+from fieldtwin.twin.network.ship import Ship
+from fieldtwin.twin.network.water_faults import WaterFaults
+from fieldtwin.twin.plant.instance import Instance
 
 
 @dataclass(frozen=True)

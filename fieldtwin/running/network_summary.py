@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fieldtwin.__about__ import __version__
-from fieldtwin.twin.network import Network
+from fieldtwin.twin.network.network import Network
 
 
 def summarise_network(

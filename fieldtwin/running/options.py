@@ -32,7 +32,7 @@ class RunOptions:
     capture: Path | None = None
     cold: bool = False
     thread: str = ""
-    """Where the plant's side of a digital thread goes (`fieldtwin.twin.thread_place`), empty for none."""
+    """Where the plant's side of a digital thread goes (`fieldtwin.twin.thread.place`), empty for none."""
     thread_store: str = ""
     """What keeps its log; a file of the instance where nothing is said."""
     thread_every_s: float | None = None
@@ -42,7 +42,7 @@ class RunOptions:
     faults: tuple[dict[str, Any], ...] = ()
     """As `fieldtwin.emulators.faults.schema.load_faults` gives them."""
     water: dict[str, tuple[str, str]] = field(default_factory=dict)
-    """Transmitters that are in a network's water (`fieldtwin.twin.field_process.FieldConfig`)."""
+    """Transmitters that are in a network's water (`fieldtwin.twin.prototype.field_process.FieldConfig`)."""
 
     def __post_init__(self) -> None:
         """Raises `UsageError` for a password in a URL, before it is handed on to a process or a file."""

@@ -15,8 +15,8 @@ from fieldtwin.plc.binding import load_program
 from fieldtwin.plc.program import Program
 from fieldtwin.plc.prove import Proof
 from fieldtwin.plc.states import StateTable
-from fieldtwin.twin.instance import runtime_root
-from fieldtwin.twin.system import System
+from fieldtwin.twin.plant.instance import runtime_root
+from fieldtwin.twin.site.system import System
 
 T = TypeVar("T")
 LOOK_S = 0.02

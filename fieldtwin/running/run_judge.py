@@ -16,8 +16,8 @@ from fieldtwin.running.driven import PIECE_S
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
 from fieldtwin.scenarios.form import Scenario
-from fieldtwin.twin.network_faults import placed_all
-from fieldtwin.twin.prototype_file import Prototype
+from fieldtwin.twin.network.faults import placed_all
+from fieldtwin.twin.prototype.file import Prototype
 
 MOST_TOLD = 5
 TITLE = "what a run in virtual time is judged by"

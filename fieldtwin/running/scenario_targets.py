@@ -33,8 +33,8 @@ from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import Runner, gone
 from fieldtwin.scenarios.target_limits import refusal
 from fieldtwin.scenarios.trace import Trace, open_sink
-from fieldtwin.twin.field_process import FieldConfig
-from fieldtwin.twin.instance import Instance, runtime_root
+from fieldtwin.twin.plant.instance import Instance, runtime_root
+from fieldtwin.twin.prototype.field_process import FieldConfig
 
 
 @dataclass(frozen=True)

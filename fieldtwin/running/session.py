@@ -33,19 +33,19 @@ from fieldtwin.running.shore import Shore, script
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.running.thread_return import ThreadReturn
 from fieldtwin.scenarios.trace import Trace
-from fieldtwin.twin.controller import ControllerConfig
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.mapping import mapping_to_json
-from fieldtwin.twin.physical import PhysicalTwin
-from fieldtwin.twin.plant_thread import PlantThreadConfig
-from fieldtwin.twin.system import System, load_system
-from fieldtwin.twin.system_schema import NONE_STATED
-from fieldtwin.twin.thread_place import MODEM, lent_transmitter
+from fieldtwin.twin.plant.controller import ControllerConfig
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.plant.mapping import mapping_to_json
+from fieldtwin.twin.plant.physical import PhysicalTwin
+from fieldtwin.twin.site.schema import NONE_STATED
+from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.thread.place import MODEM, lent_transmitter
+from fieldtwin.twin.thread.plant_thread import PlantThreadConfig
 
 if TYPE_CHECKING:
     from fieldtwin.running.bridge_cable import BridgeCable
     from fieldtwin.running.invariant_watch import InvariantWatch
-    from fieldtwin.twin.field_process import FieldConfig
+    from fieldtwin.twin.prototype.field_process import FieldConfig
 
 MODEM_EVERY_S = 1.0
 """So often, at most, a tag goes over a modem: it takes some thirty events a second."""
@@ -77,7 +77,9 @@ class RunSession(Started):
         self.twin = PhysicalTwin(self.system)
         self.lent = self._lent_to_the_thread()
         if options.prototype and not options.field_host:
-            from fieldtwin.twin.field_process import resolve  # here and below: a plant has no emulators installed
+            from fieldtwin.twin.prototype.field_process import (
+                resolve,  # here and below: a plant has no emulators installed
+            )
 
             resolve(self._field_config(Path()))  # what can be wrong in the files is wrong before anything starts
         self.instance = Instance(options.instance or self.system.name)
@@ -168,7 +170,7 @@ class RunSession(Started):
             capture=str(self.options.capture.resolve()) if self.options.capture else "",
             lent=(self.lent,) if self.lent else (),
         )
-        await self._start_child("gateway", "fieldtwin.twin.controller", self._write("gateway.json", gateway))
+        await self._start_child("gateway", "fieldtwin.twin.plant.controller", self._write("gateway.json", gateway))
         self._stack.enter_context(self.states.attached(ecs.layout, run_dir / "image"))
         if self.options.thread:
             await self._start_thread(run_dir)
@@ -196,7 +198,9 @@ class RunSession(Started):
                 1000 * (o.thread_every_s if o.thread_every_s is not None else MODEM_EVERY_S if self.lent else 0)
             ),
         )
-        client = await self._start_child("thread", "fieldtwin.twin.plant_thread", self._write("thread.json", config))
+        client = await self._start_child(
+            "thread", "fieldtwin.twin.thread.plant_thread", self._write("thread.json", config)
+        )
         self.thread_place = str((await client.call("get"))["place"])
         if not self.lent:  # where it is found again, had it been free to choose a port
             config = msgspec.structs.replace(config, place=self.thread_place)
@@ -207,7 +211,7 @@ class RunSession(Started):
     def _keep_thread(self, config: PlantThreadConfig) -> None:
         def another() -> Child:
             path = self._write("thread.json", config)
-            self.children["thread"] = Child("thread", "fieldtwin.twin.plant_thread", path, self.instance.dir)
+            self.children["thread"] = Child("thread", "fieldtwin.twin.thread.plant_thread", path, self.instance.dir)
             return self.children["thread"]
 
         def came(client: ControlClient) -> None:
@@ -220,7 +224,7 @@ class RunSession(Started):
         self._nursery.start(self.thread_return.run(), "thread's process")
 
     def _field_config(self, run_dir: Path) -> FieldConfig:
-        from fieldtwin.twin.field_process import FieldConfig
+        from fieldtwin.twin.prototype.field_process import FieldConfig
 
         o = self.options
         listen = dict(o.listen)
@@ -260,7 +264,7 @@ class RunSession(Started):
             self.field_return = FieldReturn(self._field, self.system, at, token, self._field_returned)
         else:
             config = self._write("field.json", self._field_config(run_dir))
-            client = await self._start_child("field", "fieldtwin.twin.field_process", config, FIELD_LINGER_S)
+            client = await self._start_child("field", "fieldtwin.twin.prototype.field_process", config, FIELD_LINGER_S)
             self._field = await contact_here(client, self.system, run_dir)
         self._stack.push_async_callback(self._field.aclose)
         self.mapping, self.far = self._field.mapping, self._field.far

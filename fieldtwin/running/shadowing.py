@@ -1,7 +1,7 @@
 """A digital shadow at work: the thread that brings what the plant saw, the store that keeps it, and the shadow that is given it.
 
-Here the transmitter's side is assembled, outside of `fieldtwin.twin.shadow` (SPEC ruling 16): it acknowledges and asks for what
-is missing, and has no log of its own to send.
+Here the transmitter's side is assembled, outside of `fieldtwin.twin.model.shadow` (SPEC ruling 16): it acknowledges and asks for
+what is missing, and has no log of its own to send.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.declared import declared_variables
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.knowledge import KnowledgeWriter
-from fieldtwin.twin.mape.messages import Verdict
-from fieldtwin.twin.shadow import DigitalShadow
-from fieldtwin.twin.system import System
-from fieldtwin.twin.thread import schema_of, to_receivers
-from fieldtwin.twin.thread_end import ThreadEnd
-from fieldtwin.twin.thread_link import Carrier
-from fieldtwin.twin.thread_place import twin_carrier
-from fieldtwin.twin.thread_process import ReceivingEnd
-from fieldtwin.twin.variables import Limits
+from fieldtwin.twin.model.knowledge import KnowledgeWriter
+from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.shadow import DigitalShadow
+from fieldtwin.twin.model.thread_process import ReceivingEnd
+from fieldtwin.twin.model.variables import Limits
+from fieldtwin.twin.plant.declared import declared_variables
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import System
+from fieldtwin.twin.thread.end import ThreadEnd
+from fieldtwin.twin.thread.link import Carrier
+from fieldtwin.twin.thread.place import twin_carrier
+from fieldtwin.twin.thread.thread import schema_of, to_receivers
 from fieldtwin.whatif.known import recall
 
 STEP_MS = 50

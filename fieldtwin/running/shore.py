@@ -26,7 +26,7 @@ from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.mailboxes import Inbox, Mailboxes
 from fieldtwin.gateway.runtime.modbus_bus import ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 TICK_NS = 20 * NS_PER_MS
 """How often an exchange that is under way is looked after."""

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from fieldtwin.gateway.core.image import OUTPUTS, ImageLayout, RegionReader
 from fieldtwin.gateway.core.statemachine import STATES, encode_period
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.physical import attached
-from fieldtwin.twin.system import System
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.plant.physical import attached
+from fieldtwin.twin.site.system import System
 
 NAMES = list(STATES)
 MAX_TRANSITIONS = 10_000

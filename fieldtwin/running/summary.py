@@ -11,7 +11,7 @@ from fieldtwin.plc.task import StopReason
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import StateWatch, expected_states
 from fieldtwin.scenarios.trace import refusal_text
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 MOST_REFUSED = 10
 """Refused outputs that a summary names one by one."""

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldtwin.gateway.core.errors import NotAllowed, UsageError
-from fieldtwin.twin.data_files import find, template_of
-from fieldtwin.twin.instance import runtime_root
-from fieldtwin.twin.system import System, load_system
-from fieldtwin.twin.template import MANIFEST, MAX_MANIFEST_BYTES, is_code
-from fieldtwin.twin.template_pack import OUR_PROGRAMS
-from fieldtwin.twin.template_package import FolderPackage, Package, is_template, names_below, open_package, unpack
+from fieldtwin.twin.plant.instance import runtime_root
+from fieldtwin.twin.site.data_files import find, template_of
+from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.template.pack import OUR_PROGRAMS
+from fieldtwin.twin.template.package import FolderPackage, Package, is_template, names_below, open_package, unpack
+from fieldtwin.twin.template.template import MANIFEST, MAX_MANIFEST_BYTES, is_code
 
 
 @dataclass(frozen=True, slots=True)
 class Stranger:
     """What a template brings that somebody has to agree to: `code` are files that Python would run, `reach` says what its
-    prototype uses of this computer (`fieldtwin.twin.template_reach`)."""
+    prototype uses of this computer (`fieldtwin.twin.template.reach`)."""
 
     path: Path
     code: tuple[str, ...] = ()
@@ -58,7 +58,7 @@ def system_file(
         folder = path if path.is_dir() else _unpacked(package)
     here = FolderPackage(folder)
     here.verify()
-    from fieldtwin.twin.template_check import (
+    from fieldtwin.twin.template.check import (
         examine,  # where a template is there to examine, what reads it is installed
     )
 
@@ -135,7 +135,7 @@ def _elsewhere(system: System) -> tuple[str, ...]:
 
 
 def _beside(system: System) -> Path | None:
-    from fieldtwin.twin.prototype_file import prototype_path  # a plant has no emulators installed
+    from fieldtwin.twin.prototype.file import prototype_path  # a plant has no emulators installed
 
     file = prototype_path(system)
     return file if file.is_file() else None
@@ -143,8 +143,8 @@ def _beside(system: System) -> Path | None:
 
 def _of_prototype(system: System, file: Path, folders: Iterable[Path]) -> tuple[list[str], tuple[str, ...]]:
     """Simulations in Python from outside of the templates, and what of this computer the prototype uses."""
-    from fieldtwin.twin.prototype_file import load_prototype
-    from fieldtwin.twin.template_reach import reach
+    from fieldtwin.twin.prototype.file import load_prototype
+    from fieldtwin.twin.template.reach import reach
 
     prototype = load_prototype(system, file)
     named = [form.python.rpartition(":")[0] for form in prototype.form.simulations.values() if form.python is not None]

@@ -13,8 +13,8 @@ from typing import Any
 from fieldtwin.gateway.core.errors import FieldtwinError
 from fieldtwin.gateway.core.yaml_file import load
 from fieldtwin.running.template_here import Ask, agree
-from fieldtwin.twin.data_files import network_file
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.system import System, load_system
 
 
 def agree_to_scenario(
@@ -40,7 +40,7 @@ def _systems(path: Path, said: Mapping[str, Any], profiles: tuple[Path, ...]) ->
     beside = path.parent / name
     named = str(beside) if beside.exists() else name.removesuffix(".yaml")
     if (at := network_file(named, profiles)) is not None:
-        from fieldtwin.twin.network import load_network  # takes emulators, as a plant does not
+        from fieldtwin.twin.network.network import load_network  # takes emulators, as a plant does not
 
         return [(member.system, member.prototype.path) for member in load_network(at, profiles).members.values()]
     return [(load_system(named, profiles), path.parent / prototype if isinstance(prototype, str) else None)]

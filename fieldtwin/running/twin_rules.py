@@ -26,12 +26,12 @@ from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.values import COMMAND, DATA
 from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
 from fieldtwin.running.shadowing import limits_of
-from fieldtwin.twin.mape.plan import Planner, Rule, RulePlanner
-from fieldtwin.twin.mape.what_if import Question
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.system import System
-from fieldtwin.twin.system_schema import Strict, TagName
-from fieldtwin.twin.variables import Limits
+from fieldtwin.twin.model.mape.plan import Planner, Rule, RulePlanner
+from fieldtwin.twin.model.mape.what_if import Question
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.variables import Limits
+from fieldtwin.twin.site.schema import Strict, TagName
+from fieldtwin.twin.site.system import System
 
 Finding = Literal["agree", "mismatch", "outside", "inside", "bad", "good", "stale", "fresh", "unreadable"]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -15,19 +15,19 @@ from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Event, Kind, KnowledgeStore
 from fieldtwin.running.shadowing import STALE_AFTER_MS, Shadowing
-from fieldtwin.twin.declared import declared_variables
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.knowledge import KnowledgeWriter
-from fieldtwin.twin.mape.execute import Bounds
-from fieldtwin.twin.mape.messages import Verdict
-from fieldtwin.twin.mape.plan import OLD_MS, Planner
-from fieldtwin.twin.mape.what_if import Question
-from fieldtwin.twin.system import System
-from fieldtwin.twin.thread import DTtoPTConnection, Operator, schema_of
-from fieldtwin.twin.thread_end import ThreadEnd
-from fieldtwin.twin.thread_link import Carrier
-from fieldtwin.twin.twin import DigitalTwin
-from fieldtwin.twin.variables import Limits
+from fieldtwin.twin.model.knowledge import KnowledgeWriter
+from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.mape.plan import OLD_MS, Planner
+from fieldtwin.twin.model.mape.what_if import Question
+from fieldtwin.twin.model.twin import DigitalTwin
+from fieldtwin.twin.model.variables import Limits
+from fieldtwin.twin.plant.declared import declared_variables
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import System
+from fieldtwin.twin.thread.end import ThreadEnd
+from fieldtwin.twin.thread.link import Carrier
+from fieldtwin.twin.thread.thread import DTtoPTConnection, Operator, schema_of
 from fieldtwin.whatif.asking import Asking
 
 

@@ -32,9 +32,9 @@ from fieldtwin.running.struck import struck_of
 from fieldtwin.scenarios.bench import Can, Reading, Stopped, variable
 from fieldtwin.scenarios.probe_form import Probe
 from fieldtwin.scenarios.trace import FAR_END, Kind, Trace, refusal_data
-from fieldtwin.twin.prototype_file import Prototype
-from fieldtwin.twin.system import System
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.file import Prototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+from fieldtwin.twin.site.system import System
 
 ASKED_KEPT = 64
 _QUALITIES = {quality: quality.name.lower() for quality in Quality}

@@ -19,9 +19,9 @@ from fieldtwin.running.network_bench import MemberTrace, NetworkBench, Part
 from fieldtwin.running.shore import Scripted, Shore
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.trace import FAR_END, Kind, Trace
-from fieldtwin.twin.network import Network
-from fieldtwin.twin.ship import Ship
-from fieldtwin.twin.water_faults import WaterFaults
+from fieldtwin.twin.network.network import Network
+from fieldtwin.twin.network.ship import Ship
+from fieldtwin.twin.network.water_faults import WaterFaults
 
 SEEDS_APART = 1_000_003
 """Between the systems of a run: none plays another one's chances."""

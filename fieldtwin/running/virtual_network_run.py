@@ -17,8 +17,8 @@ from fieldtwin.running.network_summary import summarise_network
 from fieldtwin.running.shore import Scripted
 from fieldtwin.running.virtual_network import VirtualNetwork
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from fieldtwin.twin.network import load_network
-from fieldtwin.twin.network_faults import placed_all
+from fieldtwin.twin.network.faults import placed_all
+from fieldtwin.twin.network.network import load_network
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from fieldtwin.running.summary import summarise
 from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.runner import TICK_S
 from fieldtwin.scenarios.trace import Event, Kind
-from fieldtwin.twin.field import FieldSide
-from fieldtwin.twin.field_process import FieldConfig, resolve
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
 
 SETTLE_S = 10.0
 """How long a command that is still under way may take after the run's time is over."""

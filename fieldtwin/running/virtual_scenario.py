@@ -24,7 +24,7 @@ from fieldtwin.scenarios.about import result_of
 from fieldtwin.scenarios.form import Scenario
 from fieldtwin.scenarios.runner import ByChance, Runner, gone
 from fieldtwin.scenarios.trace import Trace, open_sink
-from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.prototype.file import load_prototype
 
 
 def run_virtual(

@@ -24,10 +24,10 @@ from fieldtwin.gateway.core.started import Started
 from fieldtwin.running.children import Child, ChildFailed
 from fieldtwin.running.field_contact import contact_here
 from fieldtwin.running.with_field import END_WITHIN_S, FIELD_LINGER_S, environment
-from fieldtwin.twin.child import end_with_parent
-from fieldtwin.twin.field_process import FieldConfig
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.system import System
+from fieldtwin.twin.plant.child import end_with_parent
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.prototype.field_process import FieldConfig
+from fieldtwin.twin.site.system import System
 
 POLL_S = 0.02
 STANDARD_ERROR = 2
@@ -66,7 +66,7 @@ class WithController(Started):
         path = self.instance.path("field.json")
         path.write_bytes(msgspec.json.encode(msgspec.structs.replace(self._config, run_dir=str(home))))
         path.chmod(0o600)
-        child = self._child = Child("field", "fieldtwin.twin.field_process", path, home, FIELD_LINGER_S)
+        child = self._child = Child("field", "fieldtwin.twin.prototype.field_process", path, home, FIELD_LINGER_S)
         self._stack.push_async_callback(child.end)
         contact = await contact_here(await child.connect(), self._system, home)
         self._stack.push_async_callback(contact.aclose)

@@ -24,10 +24,10 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.children import Child
 from fieldtwin.running.field_contact import FieldContact, contact_here, reachable
-from fieldtwin.twin.field_process import FieldConfig, resolve
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.mapping import mapped_endpoint
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.plant.mapping import mapped_endpoint
+from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
+from fieldtwin.twin.site.system import System, load_system
 
 FIELD_LINGER_S = 0.5
 END_WITHIN_S = 5.0
@@ -142,7 +142,7 @@ async def _inside(
     path = home.path("field.json")
     path.write_bytes(msgspec.json.encode(config))
     path.chmod(0o600)
-    child = Child("field", "fieldtwin.twin.field_process", path, home.dir, FIELD_LINGER_S)
+    child = Child("field", "fieldtwin.twin.prototype.field_process", path, home.dir, FIELD_LINGER_S)
     try:
         contact = await contact_here(await child.connect(), system, home.dir)
         try:

@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.scenarios.bench import Bench, Reading
 from fieldtwin.scenarios.words import Bounds, Expect, WireForm
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 Said = tuple[str, str] | None
 LIKE_S = 0.5

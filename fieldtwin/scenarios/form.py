@@ -15,12 +15,12 @@ from fieldtwin.scenarios.expression import QUALITIES, Expression, NotUnderstood
 from fieldtwin.scenarios.invariants import Invariants, load_invariants
 from fieldtwin.scenarios.probe_form import Probe, read_probe
 from fieldtwin.scenarios.words import WORDS, Bounds, Expect, ScenarioForm, Set, Step, Time, WireForm
-from fieldtwin.twin.data_files import network_file
-from fieldtwin.twin.fault_aims import target
-from fieldtwin.twin.network import Network, load_network
-from fieldtwin.twin.network_faults import check_network_fault
-from fieldtwin.twin.system import System, load_system
-from fieldtwin.twin.system_schema import NONE_STATED
+from fieldtwin.twin.network.faults import check_network_fault
+from fieldtwin.twin.network.network import Network, load_network
+from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.schema import NONE_STATED
+from fieldtwin.twin.site.system import System, load_system
 
 _TOGETHER = {
     "tag": ("tag", "value", "tolerance", "quality", "like", "within", "during"),
@@ -91,7 +91,7 @@ class Scenario:
 def names_of(system: System, network: Network | None = None) -> dict[str, tuple[str, ...]]:
     """What can be asked for: DEVICE.TAG and PROGRAM.VARIABLE; in a network behind the name of their system. Of a program's state
     the words that it can be, of all else none."""
-    from fieldtwin.twin.physical import image_layout
+    from fieldtwin.twin.plant.physical import image_layout
 
     if network is not None:
         of_all = [(m.name, names_of(m.system)) for m in network.members.values()]

@@ -9,7 +9,7 @@ from fieldtwin.emulators.faults.schema import seconds
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.yaml_file import Key
 from fieldtwin.scenarios.expression import Expression
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from fieldtwin.scenarios.bench import Bench
 from fieldtwin.scenarios.expectation import is_secret
 from fieldtwin.scenarios.expression import Expression
 from fieldtwin.scenarios.trace import Event, Kind
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 PENDING_S = 5.0
 """How long ``command pending`` is true after the remote client's command."""

@@ -22,10 +22,10 @@ from fieldtwin.gateway.devices.codec import decode, decode_little
 from fieldtwin.testhost.one_device import endpoint_words
 from fieldtwin.testhost.running_plc import RunningPlc
 from fieldtwin.testhost.wire_log import WireLog
-from fieldtwin.twin.field import FieldSide
-from fieldtwin.twin.mapping import mapped_endpoint
-from fieldtwin.twin.prototype_file import Prototype
-from fieldtwin.twin.system import System
+from fieldtwin.twin.plant.mapping import mapped_endpoint
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.file import Prototype
+from fieldtwin.twin.site.system import System
 
 
 class Bench:

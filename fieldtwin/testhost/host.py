@@ -23,10 +23,10 @@ from fieldtwin.testhost.bench import Bench, new_folder
 from fieldtwin.testhost.one_device import Wanted, write_system
 from fieldtwin.testhost.running_plc import RunningPlc
 from fieldtwin.testhost.stepped_program import SteppedProgram
-from fieldtwin.twin.data_files import find
-from fieldtwin.twin.field_process import FieldConfig, resolve_files
-from fieldtwin.twin.prototype_file import Prototype
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.prototype.field_process import FieldConfig, resolve_files
+from fieldtwin.twin.prototype.file import Prototype
+from fieldtwin.twin.site.data_files import find
+from fieldtwin.twin.site.system import System, load_system
 
 MOST = 1_000
 """Benches and programs at once: who forgets to end them is told."""

@@ -14,7 +14,7 @@ import yaml
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
-from fieldtwin.twin.data_files import find, find_recording
+from fieldtwin.twin.site.data_files import find, find_recording
 
 DEVICE, BUS = "device", "wire"
 RECORDINGS = {"ctd-reference": "cast.jsonl", "inclinometer-cia410": "incl.jsonl"}

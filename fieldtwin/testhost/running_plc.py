@@ -19,11 +19,11 @@ from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.running.children import Child
 from fieldtwin.running.plc_client import step_and_wait
 from fieldtwin.running.shore import Shore
-from fieldtwin.twin.controller import ControllerConfig
-from fieldtwin.twin.field import FieldSide
-from fieldtwin.twin.mapping import mapped_endpoint, mapping_to_json
-from fieldtwin.twin.physical import PhysicalTwin
-from fieldtwin.twin.system import System
+from fieldtwin.twin.plant.controller import ControllerConfig
+from fieldtwin.twin.plant.mapping import mapped_endpoint, mapping_to_json
+from fieldtwin.twin.plant.physical import PhysicalTwin
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.site.system import System
 
 BY = "test"
 STEERING = ("force", "unforce", "pause", "go", "step", "restart", "why")
@@ -69,7 +69,7 @@ class RunningPlc:
         )
         config = folder / "gateway.json"
         config.write_bytes(msgspec.json.encode(told))
-        await self._start("gateway", "fieldtwin.twin.controller", config)
+        await self._start("gateway", "fieldtwin.twin.plant.controller", config)
         device = next(iter(self._field.far), None)
         if device is not None:
             self._shore = Shore(system, device, self._field.far[device], self._clock)

@@ -14,7 +14,7 @@ from fieldtwin.decoding.exchange import Exchange
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.scenarios.trace import Event, Kind
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 MOST = 20_000
 AT_ONCE = 5_000

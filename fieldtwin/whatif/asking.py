@@ -18,9 +18,9 @@ from fieldtwin.gateway.core.errors import Bug, FieldtwinError, Unreachable, Usag
 from fieldtwin.gateway.core.statemachine import decode_period
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import KnowledgeStore
-from fieldtwin.twin.child import command as child_command
-from fieldtwin.twin.mape.what_if import Question
-from fieldtwin.twin.system import System
+from fieldtwin.twin.model.mape.what_if import Question
+from fieldtwin.twin.plant.child import command as child_command
+from fieldtwin.twin.site.system import System
 from fieldtwin.whatif.last_known import LastKnown
 from fieldtwin.whatif.state import Number
 
@@ -35,7 +35,7 @@ MOST_KEPT = 1 << 16
 class Asked(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A question as it goes to the process `fieldtwin.whatif.asked`.
 
-    `require`, `finally_`, `horizon_s` and `settle_s` as in `fieldtwin.twin.mape.what_if.Question`.
+    `require`, `finally_`, `horizon_s` and `settle_s` as in `fieldtwin.twin.model.mape.what_if.Question`.
     """
 
     system: str

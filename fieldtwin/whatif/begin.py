@@ -10,7 +10,7 @@ from fieldtwin.emulators.distorted_registers import DistortedRegisters
 from fieldtwin.emulators.models.register_device import StatedRegisters
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.statemachine import encode_period
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
 from fieldtwin.whatif.state import KnownState, Number
 
 

@@ -26,8 +26,8 @@ from fieldtwin.plc.task import StopReason
 from fieldtwin.running.shore import Shore
 from fieldtwin.running.states import state_words
 from fieldtwin.scenarios.expression import Expression
-from fieldtwin.twin.field_process import FieldConfig, resolve
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.field_process import FieldConfig, resolve
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
 from fieldtwin.whatif.begin import begin, otherwise, retain_for
 from fieldtwin.whatif.outcome import Outcome, Requirement
 from fieldtwin.whatif.plan import Plan

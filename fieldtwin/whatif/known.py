@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.store.event import Event, KnowledgeStore
 from fieldtwin.gateway.store.knowledge import open_knowledge
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 from fieldtwin.whatif.last_known import LastKnown
 from fieldtwin.whatif.state import KnownState
 

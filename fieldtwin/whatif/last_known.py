@@ -11,9 +11,9 @@ from fieldtwin.gateway.core.errors import Desync
 from fieldtwin.gateway.core.statemachine import STATES, encode_period
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.store.event import Event, Kind
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.status import decode_status
-from fieldtwin.twin.system import System
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.status import decode_status
+from fieldtwin.twin.site.system import System
 from fieldtwin.whatif.state import KnownState, Number
 
 

@@ -18,7 +18,7 @@ import msgspec
 from fieldtwin.gateway.core.control import ControlClient
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.input_file import read_input
-from fieldtwin.twin.system import System
+from fieldtwin.twin.site.system import System
 
 VERSION = 1
 MAX_BYTES = 16 << 20

@@ -2,8 +2,8 @@
 The plant's switch with it, at once.
 
 Buses, devices, addresses, tags and what is bound to them have to be the same: whoever calls has compared the files
-(`fieldtwin.twin.reloading`). A device has either its old configuration or its new one, never some of each; values that it holds
-are understood anew at once. Nothing here reads a file.
+(`fieldtwin.twin.plant.reloading`). A device has either its old configuration or its new one, never some of each; values that it
+holds are understood anew at once. Nothing here reads a file.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ class Kind(IntEnum):
     REFUSAL = 2
     """`value` says why a command or plan was refused; `name` by whom."""
     STATE = 3
-    """`value` is a STATUS, state and period (bytes, `fieldtwin.twin.status`); `name` is whose state machine it is."""
+    """`value` is a STATUS, state and period (bytes, `fieldtwin.twin.model.status`); `name` is whose state machine it is."""
     VERDICT = 4
     """`value` is what an analysis found; `name` of what."""
     PAYLOAD = 5

@@ -57,9 +57,9 @@ def test_every_schema_of_the_paper_has_classes_that_there_are():
 
 
 def test_a_class_that_there_is_not_is_named():
-    with pytest.raises(paper_page.NoSuchClass, match=r"no class Twin in fieldtwin\.twin\.twin"):
+    with pytest.raises(paper_page.NoSuchClass, match=r"no class Twin in fieldtwin\.twin\.model\.twin"):
         paper_page.rows(
-            "## Schemas and classes\n| schema | class | where |\n| DigitalTwin | `Twin` | `fieldtwin.twin.twin` |\n"
+            "## Schemas and classes\n| schema | class | where |\n| DigitalTwin | `Twin` | `fieldtwin.twin.model.twin` |\n"
         )
 
 

@@ -16,8 +16,8 @@ from fieldtwin.emulators.faults.on_link import wire_faults
 from fieldtwin.emulators.faults.registry import FAULTS
 from fieldtwin.emulators.faults.schema import load_faults, parse_fault, seconds
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.twin.fault_aims import target
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.prototype.fault_aims import target
+from fieldtwin.twin.site.system import load_system
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from fieldtwin.report.model import Verdict
 from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.running.scenario_targets import Target, run_scenario
 from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.twin.fault_aims import target
+from fieldtwin.twin.prototype.fault_aims import target
 
 PROFILE = """device: fieldtwin/tank
 source: "made for this test"

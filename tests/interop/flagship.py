@@ -33,9 +33,9 @@ from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.children import Child
-from fieldtwin.twin.mapping import MappedConnector
-from fieldtwin.twin.physical import attached, gateway_config, image_layout, make_image, plc_config
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.plant.mapping import MappedConnector
+from fieldtwin.twin.plant.physical import attached, gateway_config, image_layout, make_image, plc_config
+from fieldtwin.twin.site.system import System, load_system
 
 SYSTEM = Path(__file__).parents[2] / "profiles/systems/observatory.yaml"
 SAMPLES = 2

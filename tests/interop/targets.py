@@ -29,9 +29,9 @@ from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.children import Child
 from fieldtwin.running.shore import Shore
-from fieldtwin.twin.field_process import FieldConfig
-from fieldtwin.twin.mapping import mapped_endpoint
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.plant.mapping import mapped_endpoint
+from fieldtwin.twin.prototype.field_process import FieldConfig
+from fieldtwin.twin.site.system import load_system
 
 HERE = Path(__file__).parent
 DEVICES = HERE / "devices"
@@ -56,7 +56,7 @@ async def field_side(run_dir: Path, **listen: str) -> AsyncIterator[dict[str, An
     """The observatory's emulators as a process, `listen` saying where a bus's listen elsewhere; their status."""
     config = run_dir / "field.json"
     config.write_bytes(msgspec.json.encode(FieldConfig(system=str(SYSTEM), run_dir=str(run_dir), listen=listen)))
-    field = Child("field", "fieldtwin.twin.field_process", config, run_dir)
+    field = Child("field", "fieldtwin.twin.prototype.field_process", config, run_dir)
     try:
         client = await field.connect(timeout_s=120)
         status = await client.call("get")

@@ -13,7 +13,7 @@ from fieldtwin.gateway.connections.tap import Captured
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 pytestmark = [pytest.mark.interop, needs_tshark]
 MS = 1_000_000

@@ -29,7 +29,7 @@ from fieldtwin.gateway.devices.register_device import SensorDriver
 from fieldtwin.gateway.runtime.modbus_bus import Job, ModbusBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 pytestmark = [
     pytest.mark.interop,

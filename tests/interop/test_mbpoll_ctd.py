@@ -25,7 +25,7 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.profile import load_profile
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.field import unit_limits
+from fieldtwin.twin.prototype.field import unit_limits
 
 pytestmark = [
     pytest.mark.interop,

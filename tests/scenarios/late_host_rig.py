@@ -10,7 +10,7 @@ from fieldtwin.running.virtual_bench import VirtualBench
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.scenarios.runner import Runner
 from fieldtwin.scenarios.trace import Trace
-from fieldtwin.twin.prototype_file import load_prototype
+from fieldtwin.twin.prototype.file import load_prototype
 
 HEAD = "scenario: a test\nsystem: observatory\n"
 

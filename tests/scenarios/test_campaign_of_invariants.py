@@ -22,7 +22,7 @@ from fieldtwin.running.confirming import CONFIRMED
 from fieldtwin.running.fault_schedule import RandomFaults, random_schedule
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 pytestmark = pytest.mark.long
 

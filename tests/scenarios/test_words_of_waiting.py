@@ -12,7 +12,7 @@ from fieldtwin.cli.main import cli
 from fieldtwin.report.model import Verdict
 from fieldtwin.running.scenario_targets import Target, run_scenario
 from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 MOORING = """fieldtwin: 1

@@ -5,8 +5,8 @@ from __future__ import annotations
 from fieldtwin.gateway.core.statemachine import delta
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
-from fieldtwin.twin.status import encode_status
-from fieldtwin.twin.variables import Variable
+from fieldtwin.twin.model.status import encode_status
+from fieldtwin.twin.model.variables import Variable
 
 DECLARED = (
     Variable("ctd.pressure", "real", "dbar", (0.0, 100.0)),

@@ -16,12 +16,12 @@ from fieldtwin.gateway.devices.register_device import RegisterDriver
 from fieldtwin.gateway.protocols.modbus.client import ModbusClient
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.field import FieldSide
-from fieldtwin.twin.mapping import MappedConnector, mapped_endpoint
-from fieldtwin.twin.physical import make_drivers
-from fieldtwin.twin.prototype import DigitalTwinPrototype
-from fieldtwin.twin.prototype_file import Prototype, load_prototype
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint
+from fieldtwin.twin.plant.physical import make_drivers
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.file import Prototype, load_prototype
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.system import System, load_system
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SYSTEMS = CHECKOUT / "profiles" / "systems"

@@ -23,7 +23,7 @@ from fieldtwin.emulators.signals import SignalPlayer, SignalTrack
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.recording import RecordingReader, shown
 from fieldtwin.recording.importing import import_capture
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 WITNESS = """
 import os, sys
@@ -107,7 +107,7 @@ def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(dese
         read = {
             path
             for process, path in ended.opened
-            if " fieldtwin.twin.controller " in process and path.parent == deserted.parent
+            if " fieldtwin.twin.plant.controller " in process and path.parent == deserted.parent
         }
         assert read == {deserted}
     told = [json.loads((ended.run_dir / "gateway.json").read_text()) for ended in (prototype, plant)]
@@ -123,7 +123,7 @@ def test_prose_2_the_prototype_reads_the_plants_configuration_byte_for_byte(dese
 
 def test_prose_2_the_plants_run_never_opens_a_prototype_file(deserted: Path, tmp_path: Path) -> None:
     ended = Ended(tmp_path / "run", str(deserted), "--plant", "--for", "1s")
-    assert ended.files_of("fieldtwin.twin.controller") >= {
+    assert ended.files_of("fieldtwin.twin.plant.controller") >= {
         "observatory.yaml",
         "ctd-reference.yaml",
     }  # the witness was there
@@ -131,8 +131,8 @@ def test_prose_2_the_plants_run_never_opens_a_prototype_file(deserted: Path, tmp
 
 
 def test_prose_2_what_is_emulated_is_known_to_the_field_side_alone(standby: Ended) -> None:
-    assert "observatory.prototype.yaml" in standby.files_of("fieldtwin.twin.field_process")
-    for module in ("fieldtwin.twin.controller", "fieldtwin.plc"):
+    assert "observatory.prototype.yaml" in standby.files_of("fieldtwin.twin.prototype.field_process")
+    for module in ("fieldtwin.twin.plant.controller", "fieldtwin.plc"):
         assert "observatory.prototype.yaml" not in standby.files_of(module), module
 
 

@@ -33,21 +33,21 @@ from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.running.shadowing import Shadowing
-from fieldtwin.twin.declared import declared_variables
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.mape.execute import Bounds
-from fieldtwin.twin.mape.messages import SeenMeasurement, SeenStatus
-from fieldtwin.twin.mape.plan import Rule, RulePlanner
-from fieldtwin.twin.prototype import DigitalTwinPrototype
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.shadow import DigitalShadow
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.thread import schema_of
-from fieldtwin.twin.thread_end import ThreadEnd
-from fieldtwin.twin.thread_frames import ACK, ASK, REFUSED
-from fieldtwin.twin.thread_process import ReceivingEnd
-from fieldtwin.twin.thread_tcp import WHO, TcpListening
-from fieldtwin.twin.twin import DigitalTwin
+from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus
+from fieldtwin.twin.model.mape.plan import Rule, RulePlanner
+from fieldtwin.twin.model.shadow import DigitalShadow
+from fieldtwin.twin.model.thread_process import ReceivingEnd
+from fieldtwin.twin.model.twin import DigitalTwin
+from fieldtwin.twin.plant.declared import declared_variables
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.thread.end import ThreadEnd
+from fieldtwin.twin.thread.frames import ACK, ASK, REFUSED
+from fieldtwin.twin.thread.tcp import WHO, TcpListening
+from fieldtwin.twin.thread.thread import schema_of
 from fieldtwin.whatif.asked import objection
 from fieldtwin.whatif.asking import Asked
 from fieldtwin.whatif.fork import Fork, answer
@@ -135,7 +135,7 @@ def test_prose_1_a_planted_difference_is_seen(tmp_path: Path) -> None:
 
 def test_prose_4_the_shadows_modules_load_nothing_that_could_send() -> None:
     """By construction: what is not imported is not held. The contract of the same name is checked at every commit."""
-    program = "import sys, fieldtwin.twin.shadow; print(*sys.modules)"
+    program = "import sys, fieldtwin.twin.model.shadow; print(*sys.modules)"
     loaded = subprocess.run(
         [sys.executable, "-c", program], cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=30
     ).stdout.split()
@@ -145,10 +145,10 @@ def test_prose_4_the_shadows_modules_load_nothing_that_could_send() -> None:
     assert {
         "fieldtwin.gateway.connections",
         "fieldtwin.gateway.devices",
-        "fieldtwin.twin.thread",
-        "fieldtwin.twin.thread_end",
+        "fieldtwin.twin.thread.thread",
+        "fieldtwin.twin.thread.end",
     } <= set(forbidden)
-    assert "fieldtwin.twin.shadow" in loaded
+    assert "fieldtwin.twin.model.shadow" in loaded
     assert not [m for m in loaded if any(m == f or m.startswith(f"{f}.") for f in forbidden)]
 
 

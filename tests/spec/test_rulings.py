@@ -27,14 +27,14 @@ from fieldtwin.gateway.runtime.gateway import make_driver
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.plc.runner import Runner
 from fieldtwin.running.shore import Shore
-from fieldtwin.twin.declared import declared_variables
-from fieldtwin.twin.physical import plc_lost_ms
-from fieldtwin.twin.plant_thread import ImageProcess
-from fieldtwin.twin.shadow import DigitalShadow
-from fieldtwin.twin.system import System
-from fieldtwin.twin.thread_process import ReceivingEnd
-from fieldtwin.twin.variables import Variable
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.model.shadow import DigitalShadow
+from fieldtwin.twin.model.thread_process import ReceivingEnd
+from fieldtwin.twin.model.variables import Variable
+from fieldtwin.twin.plant.declared import declared_variables
+from fieldtwin.twin.plant.physical import plc_lost_ms
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+from fieldtwin.twin.site.system import System
+from fieldtwin.twin.thread.plant_thread import ImageProcess
 
 PROFILES = sorted((CHECKOUT / "profiles" / "devices").glob("*.yaml"))
 

@@ -19,9 +19,9 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import CommandListMismatch
 from fieldtwin.gateway.core.events import Consumer
 from fieldtwin.gateway.core.values import DATA
-from fieldtwin.twin.prototype import DigitalTwinPrototype
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.system import load_system
 
 NAMES = st.frozensets(st.sampled_from([f"command_{letter}" for letter in "abcdef"]))
 

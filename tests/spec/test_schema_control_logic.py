@@ -12,7 +12,7 @@ from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import encode_period
 from fieldtwin.gateway.core.values import COMMAND, MEASUREMENT, RESPONSE
 from fieldtwin.plc.relay import LOG_CAPACITY, ControlLogic, DataLog, LogEntry, Relay
-from fieldtwin.twin.physical import EmbeddedControlSystem
+from fieldtwin.twin.plant.physical import EmbeddedControlSystem
 
 PERIODS = st.integers(-32768, 32767)
 PAYLOADS = st.lists(st.binary(max_size=20), max_size=10)

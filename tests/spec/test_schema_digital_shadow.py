@@ -15,12 +15,12 @@ from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import STATE_CODES, delta
 from fieldtwin.gateway.core.values import DATA, STATUS, Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
-from fieldtwin.twin.mape.messages import SeenMeasurement, SeenStatus, Verdict
-from fieldtwin.twin.mape.monitor import Monitor
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.shadow import DigitalShadow
-from fieldtwin.twin.status import decode_status, encode_status
-from fieldtwin.twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus, Verdict
+from fieldtwin.twin.model.mape.monitor import Monitor
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.shadow import DigitalShadow
+from fieldtwin.twin.model.status import decode_status, encode_status
+from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess, ReceivingEnd
 
 PERIODS = st.integers(-32768, 32767)
 
@@ -187,7 +187,7 @@ def test_DigitalShadow_can_reach_nothing_that_sends() -> None:
         "function",
         "method",
     }
-    source = Path(__file__).resolve().parents[2] / "twin"
+    source = Path(__file__).resolve().parents[2] / "twin" / "model"
     for module in ("shadow.py", "mape/monitor.py", "mape/analyze.py"):
         names = {n.id for n in ast.walk(ast.parse((source / module).read_text())) if isinstance(n, ast.Name)}
         assert "COMMAND" not in names

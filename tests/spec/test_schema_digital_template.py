@@ -10,12 +10,15 @@ import pytest
 from spec_rig import CLOCK, observatory
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.twin.declared import declared_variables
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.physical import EmbeddedControlSystem
-from fieldtwin.twin.prototype import DigitalTwinPrototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.template import (
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.plant.declared import declared_variables
+from fieldtwin.twin.plant.physical import EmbeddedControlSystem
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.template.check import examine, put_together
+from fieldtwin.twin.template.pack import Extras, collect, pack
+from fieldtwin.twin.template.package import FolderPackage
+from fieldtwin.twin.template.template import (
     DOCUMENTS,
     BillOfMaterials,
     BluePrint,
@@ -25,9 +28,6 @@ from fieldtwin.twin.template import (
     Generic,
     TechnicalManual,
 )
-from fieldtwin.twin.template_check import examine, put_together
-from fieldtwin.twin.template_pack import Extras, collect, pack
-from fieldtwin.twin.template_package import FolderPackage
 
 
 def template(tmp_path: Path) -> DigitalTemplate:

@@ -21,12 +21,12 @@ from fieldtwin.gateway.devices.config import BusConfig
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.store.event import Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from fieldtwin.twin.knowledge import KnowledgeWriter
-from fieldtwin.twin.status import decode_status, encode_status
-from fieldtwin.twin.thread import DigitalThread, DTtoPTConnection, Operator, PTtoDTConnection, schema_of
-from fieldtwin.twin.thread_end import ThreadEnd
-from fieldtwin.twin.thread_modem import ModemCarrier
-from fieldtwin.twin.thread_process import DigitalThreadProcess, DTDigitalThreadProcess, PTDigitalThreadProcess
+from fieldtwin.twin.model.knowledge import KnowledgeWriter
+from fieldtwin.twin.model.status import decode_status, encode_status
+from fieldtwin.twin.model.thread_process import DigitalThreadProcess, DTDigitalThreadProcess, PTDigitalThreadProcess
+from fieldtwin.twin.thread.end import ThreadEnd
+from fieldtwin.twin.thread.modem import ModemCarrier
+from fieldtwin.twin.thread.thread import DigitalThread, DTtoPTConnection, Operator, PTtoDTConnection, schema_of
 
 
 def modem() -> ModemCarrier:

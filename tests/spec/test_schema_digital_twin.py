@@ -13,15 +13,15 @@ from fieldtwin.gateway.core.events import Consumer, Producer
 from fieldtwin.gateway.core.statemachine import decode_period, delta, encode_period
 from fieldtwin.gateway.core.values import COMMAND, DATA, Quality, Reason
 from fieldtwin.gateway.store.event import Kind
-from fieldtwin.twin.mape.execute import Bounds, Execute
-from fieldtwin.twin.mape.messages import verdict
-from fieldtwin.twin.mape.plan import Plan, Planner, Rule, RulePlanner
-from fieldtwin.twin.mape.what_if import Question
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.shadow import DigitalShadow
-from fieldtwin.twin.thread import Operator
-from fieldtwin.twin.thread_process import DTDigitalThreadProcess, ReceivingEnd
-from fieldtwin.twin.twin import DigitalTwin
+from fieldtwin.twin.model.mape.execute import Bounds, Execute
+from fieldtwin.twin.model.mape.messages import verdict
+from fieldtwin.twin.model.mape.plan import Plan, Planner, Rule, RulePlanner
+from fieldtwin.twin.model.mape.what_if import Question
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.shadow import DigitalShadow
+from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.twin.model.twin import DigitalTwin
+from fieldtwin.twin.thread.thread import Operator
 
 PERIODS = st.integers(-32768, 32767)
 RULES = (Rule("outside", "ctd.pressure", 1), Rule("inside", "ctd.pressure", 10), Rule("bad", "", -1))

@@ -22,7 +22,7 @@ from fieldtwin.gateway.devices.driver import DeviceDriver
 from fieldtwin.gateway.devices.register_device import SensorDriver
 from fieldtwin.gateway.devices.transmitter import TransmitterDriver
 from fieldtwin.gateway.runtime.tags import TagTable
-from fieldtwin.twin.physical import make_drivers
+from fieldtwin.twin.plant.physical import make_drivers
 
 SYSTEM, _ = observatory()
 

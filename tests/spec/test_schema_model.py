@@ -24,11 +24,11 @@ from fieldtwin.gateway.core.statemachine import (
 )
 from fieldtwin.gateway.core.values import COMMAND, Quality, Reason, Scalar
 from fieldtwin.running.states import expected_states
-from fieldtwin.twin.declared import declared_variables
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.prototype import DigitalTwinPrototype
-from fieldtwin.twin.template import describe_model
-from fieldtwin.twin.variables import Variable, Variables
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.variables import Variable, Variables
+from fieldtwin.twin.plant.declared import declared_variables
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.template.template import describe_model
 
 PERIODS = st.integers(-32768, 32767)
 

@@ -17,12 +17,12 @@ from fieldtwin.gateway.runtime.audit import AuditLog
 from fieldtwin.gateway.runtime.gateway import Gateway
 from fieldtwin.gateway.store.exchange_log import ExchangeLog
 from fieldtwin.plc.relay import ControlLogic, Relay
-from fieldtwin.twin.mapping import MappedConnector
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.physical import EmbeddedControlSystem, PhysicalTwin, attached
-from fieldtwin.twin.prototype import DigitalTwinPrototype
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.plant.mapping import MappedConnector
+from fieldtwin.twin.plant.physical import EmbeddedControlSystem, PhysicalTwin, attached
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.system import load_system
 
 
 def gateway_of(ecs: EmbeddedControlSystem, run_dir: Path, mapping: dict[Endpoint, Endpoint] | None) -> dict[str, type]:

@@ -26,8 +26,8 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.running.field_contact import reachable
 from fieldtwin.running.shadowing import Shadowing
 from fieldtwin.running.twinning import Twinning
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.system import load_system
 
 IMAGE_SHARE = "/opt/fieldtwin/share/"
 SYSTEMS = CHECKOUT / "profiles" / "systems"

@@ -126,7 +126,9 @@ def test_the_gateway_leaves_no_hole_and_no_double_in_the_exchange_log(tmp_path: 
         wait_for(lambda: held_by(field, "ctd", "sample_period_s")[-1:] == ["0001"], 20, "the sensor samples")
         os.kill(run.pid_of("g", "gateway"), signal.SIGKILL)
         config = root / "g" / "gateway.json"
-        with victim("fieldtwin.twin.controller", str(config), root=root, imports="fieldtwin.twin.system") as it:
+        with victim(
+            "fieldtwin.twin.plant.controller", str(config), root=root, imports="fieldtwin.twin.site.system"
+        ) as it:
             while it.starts < KILLS:
                 it.start()
                 if it.starts % 3:
@@ -162,7 +164,7 @@ def test_simulated_field_devices_come_back_on_their_ports_and_pseudo_terminals(t
         f"can0=can:fieldtwin/127.0.0.1:{can}", "--listen", f"lan=tcp://127.0.0.1:{lan}",
     )  # fmt: skip
     field = Asking(("127.0.0.1", port))
-    imports = "fieldtwin.cli.emulate_command,fieldtwin.twin.field_process"
+    imports = "fieldtwin.cli.emulate_command,fieldtwin.twin.prototype.field_process"
     with victim("fieldtwin", *words, root=root, imports=imports) as it:
         while it.starts < KILLS:
             it.start()
@@ -196,12 +198,13 @@ def test_both_ends_of_a_digital_thread_have_the_same_log_in_the_end(tmp_path: Pa
         (root / "thread.json").write_text(json.dumps(config))
         follow = ("twin", "observatory", "--from", place, "--instance", "tt", "--json")
         here, there = (root / name / "knowledge.sqlite" for name in ("t", "tt"))
-        imports = (
-            "fieldtwin.twin.thread_end,fieldtwin.cli.twin_command,fieldtwin.running.twinning,fieldtwin.twin.physical"
-        )
+        imports = "fieldtwin.twin.thread.end,fieldtwin.cli.twin_command,fieldtwin.running.twinning,fieldtwin.twin.plant.physical"
         with (
             victim(
-                "fieldtwin.twin.plant_thread", str(root / "thread.json"), root=root, imports="fieldtwin.twin.system"
+                "fieldtwin.twin.thread.plant_thread",
+                str(root / "thread.json"),
+                root=root,
+                imports="fieldtwin.twin.site.system",
             ) as plant,
             victim("fieldtwin", *follow, root=root, imports=imports, seed=2) as twin,
         ):

@@ -15,7 +15,7 @@ from procs import CHECKOUT, fieldtwin, free_port, no_tracebacks, run_to_end, wai
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.running.control_bench import ControlBench, Where
 from fieldtwin.scenarios.trace import Trace
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 HERE = CHECKOUT / "examples" / "own-plc"
 MODBUS_H = Path("/usr/include/modbus/modbus.h")

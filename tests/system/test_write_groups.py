@@ -17,7 +17,7 @@ from test_canopen_outputs_system import SYSTEM as WINCH_SYSTEM
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 GROUPED = SYSTEM.replace("    safe: {run: 0}\n", "    write_groups: {drive: [speed, run]}\n")
 LINE = GROUPED.replace("tcp://drive:502", "rtu:/dev/ttyS0?baudrate=115200")

@@ -36,11 +36,11 @@ from fieldtwin.plc.st.program import load_file
 from fieldtwin.recording.importing import kind_of
 from fieldtwin.running.twin_rules import load_planner
 from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.twin.data_files import network_file
-from fieldtwin.twin.network import load_network
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.template_package import open_package
+from fieldtwin.twin.network.network import load_network
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.template.package import open_package
 from fieldtwin.whatif.plan import load_plans
 from fieldtwin.whatif.state import read_state
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from fieldtwin.gateway.protocols.modbus.crc import with_crc
 from fieldtwin.scenarios.trace import Event, Kind
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.site.system import System, load_system
 
 MS = 1_000_000
 

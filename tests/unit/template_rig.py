@@ -11,10 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fieldtwin.running.template_here import Stranger
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.template import Manifest
-from fieldtwin.twin.template_pack import Extras, collect, pack
-from fieldtwin.twin.template_package import open_package, unpack
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.template.pack import Extras, collect, pack
+from fieldtwin.twin.template.package import open_package, unpack
+from fieldtwin.twin.template.template import Manifest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 SHIPPED = CHECKOUT / "profiles"

@@ -11,7 +11,7 @@ from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.devices.canopen_config import CanopenBusConfig, RpdoConfig
 from fieldtwin.gateway.protocols.canopen.boot import ExpectedIdentity
 from fieldtwin.gateway.protocols.canopen.lss import LssAddress
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 SYSTEM = """\
 fieldtwin: 1

@@ -35,8 +35,8 @@ from fieldtwin.gateway.runtime.audit import AuditLog
 from fieldtwin.gateway.runtime.canopen_bus import CanopenBus
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 DEVICES = ROOT / "profiles" / "devices"

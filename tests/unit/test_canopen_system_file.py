@@ -22,9 +22,9 @@ from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.protocols.canopen.nmt import NmtState
 from fieldtwin.gateway.runtime.status import describe
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+from fieldtwin.twin.site.system import load_system
 
 DEVICES = Path(__file__).parents[2] / "profiles" / "devices"
 NODE = 9

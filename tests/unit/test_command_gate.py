@@ -16,13 +16,13 @@ from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.running.twin_rules import load_planner
 from fieldtwin.running.twinning import Twinning
-from fieldtwin.twin.command_gate import CommandGate
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.mape.execute import Bounds
-from fieldtwin.twin.mape.messages import verdict
-from fieldtwin.twin.mape.plan import Plan, RulePlanner
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.model.mape.messages import verdict
+from fieldtwin.twin.model.mape.plan import Plan, RulePlanner
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.plant.command_gate import CommandGate
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import load_system
 
 OBSERVATORY = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "observatory.yaml"
 NOW_MS = 1_790_000_000_000

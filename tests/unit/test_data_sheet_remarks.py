@@ -21,8 +21,8 @@ from fieldtwin.emulators.canopen.dictionary import parse_eds
 from fieldtwin.emulators.canopen.node import CanopenNode
 from fieldtwin.emulators.canopen.remarks import remarks
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.system import load_system
 
 CHECKOUT = Path(__file__).parents[2]
 DRIVE = (CHECKOUT / "profiles" / "devices" / "drive-cia402.eds").read_text("ascii")

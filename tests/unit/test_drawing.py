@@ -15,10 +15,10 @@ from fieldtwin.drawing import water
 from fieldtwin.drawing.svg import ROOM, svg
 from fieldtwin.drawing.tree import tree
 from fieldtwin.drawing.wiring import Wiring, wiring
-from fieldtwin.twin.data_files import network_file
-from fieldtwin.twin.network import load_network
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.network.network import load_network
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 SHIPPED = sorted(

@@ -18,8 +18,8 @@ from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.recording.exporting import Column, _write_parquet
 from fieldtwin.running import loops
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.thread_place import twin_carrier
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.thread.place import twin_carrier
 
 CHECKOUT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -44,7 +44,7 @@ def use_parquet(folder: Path) -> None:
 
 
 USES: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread_mqtt"),
+    "mqtt": ("aiomqtt", use_mqtt, "fieldtwin.twin.thread.mqtt"),
     "postgres": ("asyncpg", use_postgres, "fieldtwin.gateway.store.postgres_knowledge"),
     "plot": ("matplotlib", use_plot, ""),
     "parquet": ("pyarrow", use_parquet, ""),

@@ -11,7 +11,7 @@ from fieldtwin.emulators.faults.schema import parse_fault
 from fieldtwin.gateway.core.yaml_file import parse
 from fieldtwin.running.fault_schedule import CALM_S, MOST, UNSEEN_ON_TCP, random_schedule
 from fieldtwin.running.shrink import as_scenario, smallest
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 SYSTEM = load_system("observatory", [])
 

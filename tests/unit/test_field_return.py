@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.control import ControlClient, ControlServer
 from fieldtwin.running.field_contact import FieldContact, connect_control
 from fieldtwin.running.field_return import FieldReturn
 from fieldtwin.running.oracle import Oracle
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.site.system import System, load_system
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 from fan_hall import VirtualHall, hall, writes
 
 from fieldtwin.gateway.core.clock import NS_PER_S
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
 
 
 @pytest.mark.parametrize("if_bad", ["pass", "hold", "trip", 5.0])

@@ -17,7 +17,7 @@ from test_gateway_canopen_bus import NODE, SDO_TO_NODE, rig
 from fieldtwin.gateway.core.canframe import CanFrame
 from fieldtwin.gateway.devices.config import Heartbeat
 from fieldtwin.gateway.protocols.canopen.heartbeat import HeartbeatConsumer
-from fieldtwin.twin.system_schema import HeartbeatForm
+from fieldtwin.twin.site.schema import HeartbeatForm
 
 LISTEN = Heartbeat(None, 150)
 

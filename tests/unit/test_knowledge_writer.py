@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.store.event import Event, Kind, StoreFull
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.knowledge import KnowledgeWriter, known_at
+from fieldtwin.twin.model.knowledge import KnowledgeWriter, known_at
 
 
 def value(number: float) -> Event:

@@ -11,9 +11,9 @@ from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.core.values import COMMAND
 from fieldtwin.gateway.runtime.mailboxes import Patience
 from fieldtwin.running.shore import Shore
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+from fieldtwin.twin.site.system import load_system
 
 MESSAGES = 12
 

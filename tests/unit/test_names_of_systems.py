@@ -10,9 +10,9 @@ import pytest
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.recording import RecordingReader
 from fieldtwin.running.virtual_run import VirtualOptions, VirtualRun
-from fieldtwin.twin.data_files import data_root, find
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.data_files import data_root, find
+from fieldtwin.twin.site.system import load_system
 
 
 @pytest.mark.parametrize(

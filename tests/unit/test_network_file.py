@@ -11,10 +11,10 @@ from click.testing import CliRunner
 from fieldtwin.cli.main import cli
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.scenarios.form import load_scenario
-from fieldtwin.twin.data_files import network_file
-from fieldtwin.twin.network import load_network
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.water_faults import WaterFaults
+from fieldtwin.twin.network.network import load_network
+from fieldtwin.twin.network.water_faults import WaterFaults
+from fieldtwin.twin.site.data_files import network_file
+from fieldtwin.twin.site.system import load_system
 
 SYSTEMS = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 SHIPPED = SYSTEMS / "ocean_network.yaml"

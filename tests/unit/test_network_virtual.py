@@ -19,8 +19,8 @@ from fieldtwin.running.virtual_network_run import VirtualNetworkOptions, Virtual
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.scenarios.trace import read_trace
-from fieldtwin.twin.network import WATER, load_network
-from fieldtwin.twin.network_faults import check_network_fault, placed_all
+from fieldtwin.twin.network.faults import check_network_fault, placed_all
+from fieldtwin.twin.network.network import WATER, load_network
 
 SHIPPED = Path(__file__).resolve().parents[2] / "profiles" / "systems" / "ocean_network.yaml"
 

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-SHOW = "import resource\nfrom twin import child\nchild.MOST_FILES = {most}\nchild.allow_open_files()\n"
+SHOW = "import resource\nfrom fieldtwin.twin.plant import child\nchild.MOST_FILES = {most}\nchild.allow_open_files()\n"
 SHOW += "print(*resource.getrlimit(resource.RLIMIT_NOFILE))"
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.twin.prototype_file import Prototype, load_prototype
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.prototype.file import Prototype, load_prototype
+from fieldtwin.twin.site.system import System, load_system
 
 BUS = "can:fieldtwin/127.0.0.1:29536"
 SYSTEM = """fieldtwin: 1

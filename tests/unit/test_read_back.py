@@ -17,8 +17,8 @@ from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.testhost.stepped_program import SteppedProgram
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+from fieldtwin.twin.site.system import load_system
 
 NODE = """
 fieldtwin: 1

@@ -20,7 +20,7 @@ from fieldtwin.regression.story import Story, story_of
 from fieldtwin.running.virtual_scenario import run_virtual
 from fieldtwin.scenarios.form import load_scenario
 from fieldtwin.scenarios.trace import Event, Kind
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 SYSTEM = load_system("observatory")
 S = 1_000_000_000

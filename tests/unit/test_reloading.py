@@ -18,11 +18,11 @@ from fieldtwin.gateway.core.connection import Direction
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
 from fieldtwin.gateway.core.values import Quality
 from fieldtwin.gateway.runtime.reconfigure import reconfigure
-from fieldtwin.twin.physical import gateway_config
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.reloading import compare, limits_changed
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.plant.physical import gateway_config
+from fieldtwin.twin.plant.reloading import compare, limits_changed
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+from fieldtwin.twin.site.system import load_system
 
 SYSTEM = """\
 fieldtwin: 1

@@ -18,9 +18,9 @@ from fieldtwin.emulators.replay.can_log import CanLog, read_can_log
 from fieldtwin.emulators.replay.objects import RecordedObjects, recorded_objects
 from fieldtwin.emulators.virtual.loop import VirtualLoop
 from fieldtwin.gateway.core.errors import FileInvalid, UsageError
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.virtual import VirtualPrototype
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.virtual import VirtualPrototype
+from fieldtwin.twin.site.system import load_system
 
 LOG = """\
 (100.000000) can0 605#4018100400000000

@@ -313,7 +313,7 @@ def test_a_wire_of_no_system_is_decoded_as_what_is_spoken_there() -> None:
 
 def test_results_need_no_protocols() -> None:
     """Who only makes results (a plugin in somebody's own environment) needs neither pymodbus nor canopen."""
-    needless = "pymodbus", "canopen", "fieldtwin.twin.system"
+    needless = "pymodbus", "canopen", "fieldtwin.twin.site.system"
     code = f"import sys, fieldtwin.report.model; print([m for m in {needless} if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=30)
     assert ran.stdout == "[]\n"

@@ -7,7 +7,7 @@ from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
 from fieldtwin.plc.relay import Relay
 from fieldtwin.plc.states import StateMachine, StateTable, Transition
 from fieldtwin.running.states import StateWatch, state_words
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 
 class Gate(StateMachine):

@@ -18,8 +18,8 @@ from fieldtwin.gateway.core.url_secrets import has_password, without_password
 from fieldtwin.gateway.store.knowledge import open_knowledge
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.options import RunOptions
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.thread_place import plant_carrier, twin_carrier
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
 
 CHECKOUT = Path(__file__).parents[2]
 WORD = "s3cret"

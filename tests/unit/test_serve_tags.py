@@ -31,7 +31,7 @@ from fieldtwin.gateway.runtime.serve import ServeConfig, ServedTag, TagServer
 from fieldtwin.gateway.runtime.serve_codec import FORMATS, pack, unpack
 from fieldtwin.gateway.runtime.tags import TagTable
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.site.system import load_system
 
 CLOCK = WallClock()
 TAGS = (

@@ -11,9 +11,9 @@ from support import run
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.running.shadowing import Shadowing
-from fieldtwin.twin.instance import Instance
-from fieldtwin.twin.status import encode_status
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.model.status import encode_status
+from fieldtwin.twin.plant.instance import Instance
+from fieldtwin.twin.site.system import load_system
 
 NOW_MS = 1_790_000_000_000
 

@@ -14,9 +14,9 @@ from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, b
 from fieldtwin.gateway.core.clock import NS_PER_S
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.gateway.core.yaml_file import load
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.system_schema import SimulationForm
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.schema import SimulationForm
+from fieldtwin.twin.site.system import load_system
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "simulation.md").read_text(encoding="utf-8")

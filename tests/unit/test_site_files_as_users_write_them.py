@@ -11,8 +11,8 @@ from template_rig import fieldtwin
 
 from fieldtwin.cli.options import Duration
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.system import load_system
 
 PROFILE = """
 device: test/fan

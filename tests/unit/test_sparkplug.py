@@ -12,9 +12,17 @@ from hypothesis import strategies as st
 from fieldtwin.gateway.core.errors import Desync, UsageError
 from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind, Value
-from fieldtwin.twin.sparkplug import DataType, Metric, Payload, decode_payload, encode_payload, topic, type_of
-from fieldtwin.twin.thread_frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
-from fieldtwin.twin.thread_sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication, Message
+from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
+from fieldtwin.twin.thread.sparkplug import HISTORICAL_MS, REBIRTH, EdgeNode, HostApplication, Message
+from fieldtwin.twin.thread.sparkplug_payloads import (
+    DataType,
+    Metric,
+    Payload,
+    decode_payload,
+    encode_payload,
+    topic,
+    type_of,
+)
 
 SCHEMA = Schema(("ctd.pressure", "ctd.serial", "relay"))
 VALUES: st.SearchStrategy[Value] = (

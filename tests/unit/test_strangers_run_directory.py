@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.twin import instance
-from fieldtwin.twin.instance import Instance, runtime_root
+from fieldtwin.twin.plant import instance
+from fieldtwin.twin.plant.instance import Instance, runtime_root
 
 STRANGER = 65534
 needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can give a folder to another user")

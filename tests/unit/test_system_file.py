@@ -13,12 +13,12 @@ from fieldtwin.gateway.core.device import Communication
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import CommandListMismatch, EndpointBusy, FileInvalid, UsageError
 from fieldtwin.gateway.devices.config import BusConfig
-from fieldtwin.twin.data_files import data_root, find, find_recording
-from fieldtwin.twin.instance import Instance, runtime_root
-from fieldtwin.twin.mapping import MappedConnector, mapped_endpoint, mapping_from_json, mapping_to_json
-from fieldtwin.twin.physical import gateway_config, image_layout, plc_config
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.plant.instance import Instance, runtime_root
+from fieldtwin.twin.plant.mapping import MappedConnector, mapped_endpoint, mapping_from_json, mapping_to_json
+from fieldtwin.twin.plant.physical import gateway_config, image_layout, plc_config
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.data_files import data_root, find, find_recording
+from fieldtwin.twin.site.system import load_system
 
 
 def test_the_observatory_is_what_the_paper_says() -> None:

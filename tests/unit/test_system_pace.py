@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from fieldtwin.gateway.core.errors import FileInvalid
-from fieldtwin.twin.physical import gateway_config
-from fieldtwin.twin.system import System, load_system
+from fieldtwin.twin.plant.physical import gateway_config
+from fieldtwin.twin.site.system import System, load_system
 
 PROFILE = """
 device: mysite/meter

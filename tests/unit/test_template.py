@@ -15,12 +15,12 @@ from template_rig import CHECKOUT, SHIPPED, fieldtwin, no, own_system, packed, r
 
 from fieldtwin.gateway.core.errors import FileInvalid, Unreachable, UsageError
 from fieldtwin.running.template_here import system_file
-from fieldtwin.twin import software
-from fieldtwin.twin.software import modules_hash, wheel_hash
-from fieldtwin.twin.template import MANIFEST
-from fieldtwin.twin.template_check import differences, examine, software_difference
-from fieldtwin.twin.template_pack import Extras
-from fieldtwin.twin.template_package import Content, FolderPackage, ZipPackage, open_package
+from fieldtwin.twin.template import software
+from fieldtwin.twin.template.check import differences, examine, software_difference
+from fieldtwin.twin.template.pack import Extras
+from fieldtwin.twin.template.package import Content, FolderPackage, ZipPackage, open_package
+from fieldtwin.twin.template.software import modules_hash, wheel_hash
+from fieldtwin.twin.template.template import MANIFEST
 
 
 @pytest.fixture

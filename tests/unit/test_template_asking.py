@@ -17,8 +17,8 @@ from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.running.template_here import Stranger, agree, system_file
 from fieldtwin.running.template_scenarios import agree_to_scenario
 from fieldtwin.testhost.host import Host
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.template_package import open_package, unpack
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.template.package import open_package, unpack
 
 CODE = ("systems/helper.py", "systems/site_logic.py")
 SCENARIO = "scenario: the tilt\nsystem: SYSTEM\nsteps:\n  - pause: 1s\n"

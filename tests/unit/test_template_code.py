@@ -11,12 +11,12 @@ from template_rig import SHIPPED, fieldtwin, no, own_system, packed, reworked, w
 
 from fieldtwin.gateway.core.errors import NotAllowed
 from fieldtwin.running.template_here import Stranger, system_file
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.template import MANIFEST
-from fieldtwin.twin.template_check import examine
-from fieldtwin.twin.template_package import FolderPackage
-from fieldtwin.twin.template_reach import reach
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.template.check import examine
+from fieldtwin.twin.template.package import FolderPackage
+from fieldtwin.twin.template.reach import reach
+from fieldtwin.twin.template.template import MANIFEST
 
 
 @pytest.fixture

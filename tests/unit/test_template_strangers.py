@@ -18,11 +18,11 @@ from template_rig import add, own_system, packed, reworked, unpack_zip, yes
 
 from fieldtwin.gateway.core.errors import FileInvalid
 from fieldtwin.running.template_here import system_file
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import System, load_system
-from fieldtwin.twin.template import MANIFEST, check_path, parse_manifest
-from fieldtwin.twin.template_check import examine
-from fieldtwin.twin.template_package import FolderPackage, open_package
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.template.check import examine
+from fieldtwin.twin.template.package import FolderPackage, open_package
+from fieldtwin.twin.template.template import MANIFEST, check_path, parse_manifest
 
 
 @pytest.fixture

@@ -27,13 +27,13 @@ from fieldtwin.gateway.core.nursery import Nursery
 from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.prototype import DigitalTwinPrototype
-from fieldtwin.twin.prototype_file import load_prototype
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.thread_frames import Ack, Ask, Frame, Refused, Schema
-from fieldtwin.twin.thread_link import Carrier
-from fieldtwin.twin.thread_modem import ModemCarrier
-from fieldtwin.twin.thread_tcp import TcpDialler, TcpListening
+from fieldtwin.twin.prototype.file import load_prototype
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.thread.frames import Ack, Ask, Frame, Refused, Schema
+from fieldtwin.twin.thread.link import Carrier
+from fieldtwin.twin.thread.modem import ModemCarrier
+from fieldtwin.twin.thread.tcp import TcpDialler, TcpListening
 
 ADDRESS = Endpoint.parse("tcp://127.0.0.1:7000")
 

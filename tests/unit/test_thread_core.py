@@ -13,8 +13,8 @@ from thread_frames_rig import EVENTS, SCHEMA
 
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 from fieldtwin.gateway.store.event import Event, Kind, merged, without
-from fieldtwin.twin.thread_core import WINDOW, Effect, Incoming, Keep, NoteLost, Open, Outgoing
-from fieldtwin.twin.thread_frames import (
+from fieldtwin.twin.thread.core import WINDOW, Effect, Incoming, Keep, NoteLost, Open, Outgoing
+from fieldtwin.twin.thread.frames import (
     Ack,
     Ask,
     Data,

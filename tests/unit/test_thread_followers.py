@@ -19,8 +19,8 @@ from fieldtwin.emulators.virtual.seal import sealed
 from fieldtwin.gateway.core.connection import ByteConnection
 from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
-from fieldtwin.twin.thread_link import Unwelcome
-from fieldtwin.twin.thread_tcp import ANSWERS_WITHIN_S, LET_IN_WITHIN_S, TcpDialler, TcpListening
+from fieldtwin.twin.thread.link import Unwelcome
+from fieldtwin.twin.thread.tcp import ANSWERS_WITHIN_S, LET_IN_WITHIN_S, TcpDialler, TcpListening
 
 PORTS = itertools.count(7000)
 

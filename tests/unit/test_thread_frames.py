@@ -10,7 +10,7 @@ from thread_frames_rig import EVENTS, ORIGIN, SCHEMA, TAG, numbered, there
 
 from fieldtwin.gateway.core.errors import Desync
 from fieldtwin.gateway.store.event import Event
-from fieldtwin.twin.thread_frames import (
+from fieldtwin.twin.thread.frames import (
     Ack,
     Ask,
     Data,

@@ -30,12 +30,12 @@ from fieldtwin.gateway.core.endpoint import Endpoint
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin import thread_tcp
-from fieldtwin.twin.command_gate import OLD_MS, CommandGate
-from fieldtwin.twin.mape.execute import Bounds
-from fieldtwin.twin.thread_frames import Ack, Data, Frame, Hello, tag_of
-from fieldtwin.twin.thread_link import Carrier, Link
-from fieldtwin.twin.thread_tcp import TcpDialler, TcpListening
+from fieldtwin.twin.model.mape.execute import Bounds
+from fieldtwin.twin.plant.command_gate import OLD_MS, CommandGate
+from fieldtwin.twin.thread import tcp as thread_tcp
+from fieldtwin.twin.thread.frames import Ack, Data, Frame, Hello, tag_of
+from fieldtwin.twin.thread.link import Carrier, Link
+from fieldtwin.twin.thread.tcp import TcpDialler, TcpListening
 
 CLOCK = WallClock()
 Settled = Callable[[Twin, Twin], Awaitable[None]]

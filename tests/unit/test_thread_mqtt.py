@@ -14,10 +14,10 @@ from thread_rig import SCHEMA, ShakyCarrier, Twin, equal, value
 from fieldtwin.gateway.core.errors import Unreachable
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.sparkplug import decode_payload
-from fieldtwin.twin.thread_link import Carrier, Unwelcome
-from fieldtwin.twin.thread_mqtt import Broker, MqttCarrier
-from fieldtwin.twin.thread_sparkplug import EdgeNode, HostApplication
+from fieldtwin.twin.thread.link import Carrier, Unwelcome
+from fieldtwin.twin.thread.mqtt import Broker, MqttCarrier
+from fieldtwin.twin.thread.sparkplug import EdgeNode, HostApplication
+from fieldtwin.twin.thread.sparkplug_payloads import decode_payload
 
 pytestmark = pytest.mark.interop
 CLOCK = WallClock()

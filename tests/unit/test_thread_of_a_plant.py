@@ -14,10 +14,10 @@ from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.options import RunOptions
 from fieldtwin.running.session import RunSession
-from fieldtwin.twin.physical import gateway_config, gateway_lost_ms, image_layout
-from fieldtwin.twin.plant_thread import REFRESH_MS, ImageProcess
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.thread_place import lent_transmitter, twin_carrier
+from fieldtwin.twin.plant.physical import gateway_config, gateway_lost_ms, image_layout
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.thread.place import lent_transmitter, twin_carrier
+from fieldtwin.twin.thread.plant_thread import REFRESH_MS, ImageProcess
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles" / "systems"
 OBSERVATORY = load_system(str(PROFILES / "observatory.yaml"))

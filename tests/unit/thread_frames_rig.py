@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import strategies as st
 
 from fieldtwin.gateway.store.event import Event
-from fieldtwin.twin.thread_frames import (
+from fieldtwin.twin.thread.frames import (
     Frame,
     FrameCodec,
     Schema,

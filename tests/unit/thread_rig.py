@@ -12,9 +12,9 @@ from fieldtwin.gateway.core.clock import Clock
 from fieldtwin.gateway.core.errors import ConnectionLost, Unreachable
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
-from fieldtwin.twin.thread_end import ThreadEnd
-from fieldtwin.twin.thread_frames import Frame, Schema
-from fieldtwin.twin.thread_link import Carrier, Link
+from fieldtwin.twin.thread.end import ThreadEnd
+from fieldtwin.twin.thread.frames import Frame, Schema
+from fieldtwin.twin.thread.link import Carrier, Link
 
 SCHEMA = Schema(("ctd.pressure", "ctd.temperature", "relay"))
 

@@ -15,12 +15,12 @@ from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.wallclock import WallClock
 from fieldtwin.running.twin_rules import load_planner, questions_of
-from fieldtwin.twin.mape.execute import Bounds, Execute
-from fieldtwin.twin.mape.messages import verdict
-from fieldtwin.twin.mape.what_if import PlannedCommand, Question
-from fieldtwin.twin.model import DigitalModel
-from fieldtwin.twin.status import encode_status
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.model.mape.execute import Bounds, Execute
+from fieldtwin.twin.model.mape.messages import verdict
+from fieldtwin.twin.model.mape.what_if import PlannedCommand, Question
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.status import encode_status
+from fieldtwin.twin.site.system import load_system
 from fieldtwin.whatif.asked import objection
 from fieldtwin.whatif.asking import Asked, Asking, Subject
 from fieldtwin.whatif.last_known import LastKnown

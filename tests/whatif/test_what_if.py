@@ -17,8 +17,8 @@ from fieldtwin.gateway.core.values import Quality, Reason
 from fieldtwin.gateway.store.event import Event, Kind
 from fieldtwin.gateway.store.sqlite_knowledge import SqliteKnowledge, in_place
 from fieldtwin.running.shore import Scripted
-from fieldtwin.twin.status import encode_status
-from fieldtwin.twin.system import load_system
+from fieldtwin.twin.model.status import encode_status
+from fieldtwin.twin.site.system import load_system
 from fieldtwin.whatif.fork import Fork, answer
 from fieldtwin.whatif.known import known_state
 from fieldtwin.whatif.last_known import of_period

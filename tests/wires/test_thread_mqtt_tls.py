@@ -15,12 +15,12 @@ from support import eventually, run
 
 from fieldtwin.gateway.core.errors import Unreachable, UsageError
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin import thread_mqtt
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.thread import schema_of
-from fieldtwin.twin.thread_end import ThreadEnd
-from fieldtwin.twin.thread_link import Carrier, Unwelcome
-from fieldtwin.twin.thread_place import plant_carrier, twin_carrier
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.thread import mqtt as thread_mqtt
+from fieldtwin.twin.thread.end import ThreadEnd
+from fieldtwin.twin.thread.link import Carrier, Unwelcome
+from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
+from fieldtwin.twin.thread.thread import schema_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
 from mosquitto_here import Mosquitto, broker, program

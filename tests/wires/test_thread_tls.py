@@ -12,9 +12,9 @@ from support import eventually, run
 
 from fieldtwin.gateway.core.errors import UsageError
 from fieldtwin.gateway.wallclock import WallClock
-from fieldtwin.twin.system import load_system
-from fieldtwin.twin.thread import schema_of
-from fieldtwin.twin.thread_place import plant_carrier, twin_carrier
+from fieldtwin.twin.site.system import load_system
+from fieldtwin.twin.thread.place import plant_carrier, twin_carrier
+from fieldtwin.twin.thread.thread import schema_of
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "unit"))
 from thread_rig import Twin, equal, value

@@ -1,0 +1,170 @@
+"""Analyze: the second stage. It compares what the plant reports with the digital model, and says what it finds.
+
+State mismatch, values outside the model, bad and stale values; and the figures of twinning: how often the two agree, how often
+they hear of each other, how late. It must never know a connection, nor anything that could send a command.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.values import DATA, Quality
+from fieldtwin.gateway.store.event import Kind
+from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus, Verdict, verdict
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.status import decode_status
+from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
+
+CAPACITY = 10_000
+LAGS = 10_000
+"""Arrivals of which the lag is kept for the figures."""
+LATE_MS = 10_000
+"""What is older than this when it arrives was backfilled: it is counted, and is no part of lag and rate. So was what is from
+before there was anybody to hear it."""
+
+
+class Analyze(DTDigitalThreadProcess):
+    """SPEC row Analyze. Values are held against the limits of the model's variables; what is not heard of for `stale_after_ms` is
+    stale.
+
+    Every status gets a verdict; of a tag only changes are told: outside and inside again, bad and good, stale and fresh. A change
+    that was history when it was heard of is told again when the plant says that it is so still: for who plans by what is.
+    """
+
+    def __init__(self, model: DigitalModel, clock: Clock, *, stale_after_ms: int) -> None:
+        super().__init__("analyze", clock)
+        self.consumer: Consumer[DATA] = Consumer("monitored", CAPACITY)
+        self.emitter: Producer[Verdict] = Producer("analyzed")
+        self.digital_model = model
+        self.compared = self.equal = 0
+        self.measurements = self.backfilled = 0
+        self._stale_after_ms = stale_after_ms
+        self._lags: deque[int] = deque(maxlen=LAGS)
+        self._heard: dict[str, int] = {}
+        self._wrong: dict[str, set[str]] = {}
+        """What is wrong with a tag now."""
+        self._history: set[tuple[str, str]] = set()
+        """Of what in `_wrong`, or no more in it, was heard as history only."""
+        self._began_ms = clock.utc_ns() // 1_000_000
+        self._first_ms = self._last_ms = self._reports = 0
+
+    def recall(self) -> None:
+        """Take in what was known before a restart. What was wrong then is told as soon as the plant says how it is now."""
+        for message in self.consumer.drain():
+            if isinstance(message, SeenMeasurement) and message.event.kind == Kind.VALUE:
+                name = message.event.name
+                self._wrong[name] = {wrong for wrong, _, is_so, _ in self._weighed(message) if is_so}
+                self._history |= {(name, wrong) for wrong in self._wrong[name]}
+
+    def check_statuses(self, status: SeenStatus) -> bool | None:
+        """CheckStatuses: whether the reported state and period are the model's. None for a status that is none."""
+        try:
+            state, period_s = decode_status(status.data)
+        except Desync:
+            return None
+        return (state, period_s) == (self.digital_model.state.name, self.digital_model.period_s)
+
+    def compare(self) -> None:
+        """compare: consume ; CheckStatuses ; emit. A measurement is held against its limits."""
+        for message in self.consumer.drain():
+            if isinstance(message, SeenStatus):
+                self._note_lag(message.t_ms, message.arrived_ms)
+                self._judge(message)
+            elif isinstance(message, SeenMeasurement):
+                self._note_lag(message.event.t_ms, message.arrived_ms)
+                self.measurements += 1
+                if message.event.kind == Kind.VALUE:
+                    self._weigh(message)
+
+    def _judge(self, status: SeenStatus) -> None:
+        equal = self.check_statuses(status)
+        if equal is None:
+            self._say("unreadable", status.whose, f"a status that is none: {status.data.hex() or 'empty'}", status.t_ms)
+            return
+        self.compared += 1
+        self.equal += equal
+        state, period_s = decode_status(status.data)
+        model = self.digital_model
+        if equal:
+            self._say("agree", status.whose, f"{state}, period {period_s} s", status.t_ms)
+        else:
+            text = f"the plant reports {state} with period {period_s} s; the model is {model.state.name} with {model.period_s} s"
+            self._say("mismatch", status.whose, text, status.t_ms)
+
+    def _weigh(self, message: SeenMeasurement) -> None:
+        event = message.event
+        self._heard[event.name] = message.arrived_ms
+        self._turn(event.name, "stale", "fresh", False, f"{event.name} is heard of again", message.arrived_ms)
+        late = message.arrived_ms - event.t_ms > LATE_MS
+        for wrong, right, is_wrong, text in self._weighed(message):
+            self._turn(event.name, wrong, right, is_wrong, text, event.t_ms, late=late)
+
+    def _weighed(self, message: SeenMeasurement) -> Iterator[tuple[str, str, bool, str]]:
+        """What a value can be found to be: the word for wrong, the one for right, which of them it is, and in words."""
+        event = message.event
+        bad = message.quality >= Quality.BAD
+        why = f"{event.name} is {message.quality}: {message.reason}" if bad else f"{event.name} is good again"
+        yield "bad", "good", bad, why
+        variable = self.digital_model.variables.get(event.name)
+        limits = variable.limits if variable is not None else None
+        if limits is None or bad or not isinstance(event.value, int | float):
+            return
+        outside = not limits[0] <= event.value <= limits[1]
+        text = f"{event.name} is {event.value:g}; the model has {limits[0]:g} to {limits[1]:g}"
+        yield "outside", "inside", outside, text
+
+    def look(self) -> None:
+        """Time has gone on: say which tags were not heard of for too long."""
+        now_ms = self._clock.utc_ns() // 1_000_000
+        for name, heard_ms in self._heard.items():
+            if now_ms - heard_ms > self._stale_after_ms:
+                text = f"{name} was not heard of for {(now_ms - heard_ms) / 1000:.0f} s"
+                self._turn(name, "stale", "fresh", True, text, now_ms)
+
+    def _turn(
+        self, name: str, wrong: str, right: str, is_wrong: bool, text: str, t_ms: int, *, late: bool = False
+    ) -> None:
+        now, about = self._wrong.setdefault(name, set()), (name, wrong)
+        again = is_wrong == (wrong in now)
+        if again and (late or about not in self._history):
+            return
+        (now.add if is_wrong else now.discard)(wrong)
+        (self._history.add if late else self._history.discard)(about)
+        self._say(wrong if is_wrong else right, name, text, t_ms, again=again)
+
+    def _say(self, finding: str, subject: str, text: str, t_ms: int, *, again: bool = False) -> None:
+        made = verdict(finding, subject, text, t_ms, again=again)
+        if not made.fine:
+            self.share(Kind.VERDICT, subject, f"{finding}: {text}", t_ms)
+        self.emitter.emit(made)
+
+    def _note_lag(self, t_ms: int, arrived_ms: int) -> None:
+        if arrived_ms - t_ms > LATE_MS or t_ms < self._began_ms:
+            self.backfilled += 1
+            return
+        self._lags.append(max(0, arrived_ms - t_ms))
+        self._reports += 1
+        self._first_ms = self._first_ms or arrived_ms
+        self._last_ms = arrived_ms
+
+    def figures(self) -> dict[str, Any]:
+        """Twinning: how often the two agreed, how often they heard of each other, and how late (ms)."""
+        lags = sorted(self._lags)
+        seconds = (self._last_ms - self._first_ms) / 1000
+        return {
+            "statuses": self.compared,
+            "agreed": self.equal,
+            "agreement": self.equal / self.compared if self.compared else None,
+            "measurements": self.measurements,
+            "backfilled": self.backfilled,
+            "twinning_rate_hz": (self._reports - 1) / seconds if seconds > 0 else None,
+            "lag_ms": {"median": lags[len(lags) // 2], "p95": lags[len(lags) * 95 // 100], "max": lags[-1]}
+            if lags
+            else None,
+            "wrong": {name: sorted(what) for name, what in sorted(self._wrong.items()) if what},
+        }

@@ -1,0 +1,55 @@
+"""Monitor: the first stage. It takes in what the plant reports, keeps the digital model up with it, and passes everything on.
+
+It must never know a connection, nor anything that could send a command.
+"""
+
+from __future__ import annotations
+
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import Desync
+from fieldtwin.gateway.core.events import Consumer, Producer
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import DATA
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.twin.model.mape.messages import SeenMeasurement, SeenStatus
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.status import decode_status
+from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess
+
+CAPACITY = 10_000
+
+
+class Monitor(DTDigitalThreadProcess):
+    """SPEC row Monitor. `statuses` and `measurements` are its consumers, `emitter` its producer; the model is the twin's."""
+
+    def __init__(self, model: DigitalModel, clock: Clock) -> None:
+        super().__init__("monitor", clock)
+        self.statuses: Consumer[SeenStatus] = Consumer("status", CAPACITY)
+        self.measurements: Consumer[SeenMeasurement] = Consumer("measurement", CAPACITY)
+        self.emitter: Producer[DATA] = Producer("monitored")
+        self.digital_model = model
+        self.unreadable = 0
+
+    def arrived(self, event: Event, arrived_ms: int) -> None:
+        """Sort an event into the two queues; what the plant knows beside statuses and measurements is its own business."""
+        if event.kind == Kind.STATE:
+            data = event.value if isinstance(event.value, bytes) else b""
+            self.statuses.observe(SeenStatus(data, event.name, event.t_ms, arrived_ms))
+        elif event.kind in (Kind.VALUE, Kind.PAYLOAD):
+            data = event.value if isinstance(event.value, bytes) else str(event.value).encode()
+            self.measurements.observe(SeenMeasurement(data, event, arrived_ms))
+
+    def handle_state(self) -> None:
+        """handleState: per STATUS consume ; digitalModel.ProcessEvent ; emit. One that is none changes nothing, and counts."""
+        for status in self.statuses.drain():
+            try:
+                _, period_s = decode_status(status.data)
+                self.digital_model.process_event(encode_period(period_s))
+            except Desync:
+                self.unreadable += 1
+            self.emitter.emit(status)
+
+    def handle_measurements(self) -> None:
+        """handleMeasurements: per MEASUREMENT consume ; emit. The model stays as it is."""
+        for measurement in self.measurements.drain():
+            self.emitter.emit(measurement)

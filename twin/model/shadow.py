@@ -1,0 +1,88 @@
+"""The digital shadow: Monitor and Analyze over what arrives from the plant. It cannot send: it holds nothing that could.
+
+What it receives is a queue (SPEC ruling 16). Whoever fills that queue, acknowledges and asks for what is missing stands outside
+of this module, which import contracts keep from connections, drivers, transmitters and threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.events import Consumer
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.model.mape.analyze import Analyze
+from fieldtwin.twin.model.mape.messages import Verdict
+from fieldtwin.twin.model.mape.monitor import Monitor
+from fieldtwin.twin.model.mape.upkeep import Upkeep
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.model.thread_process import DTDigitalThreadProcess, ReceivingEnd
+from fieldtwin.twin.model.variables import Variable
+
+VERDICTS = 1000
+
+
+class DigitalShadow:
+    """SPEC row DigitalShadow: a digital model of its own, thread processes, and a connection that only receives.
+
+    `step` runs the stages, one after the other, on what has arrived. `declared` are the variables of the model: events alone
+    change them. `verdicts` is a consumer for whoever wants to know.
+    """
+
+    def __init__(
+        self, receiving: ReceivingEnd, clock: Clock, *, declared: Iterable[Variable], stale_after_ms: int = 30_000
+    ) -> None:
+        self.digital_model = DigitalModel(declared)
+        self.receiving = receiving
+        self.monitor = Monitor(self.digital_model, clock)
+        self.analyze = Analyze(self.digital_model, clock, stale_after_ms=stale_after_ms)
+        self.upkeep = Upkeep(self.digital_model, self.monitor.emitter.event, self.analyze.emitter.event)
+        self.monitor.emitter.subscribe(self.upkeep.measured)
+        self.monitor.emitter.subscribe(self.analyze.consumer)
+        self.analyze.emitter.subscribe(self.upkeep.analyzed)
+        self.verdicts: Consumer[Verdict] = Consumer(self.analyze.emitter.event, VERDICTS)
+        self.analyze.emitter.subscribe(self.verdicts)
+        self._clock = clock
+
+    @property
+    def processes(self) -> tuple[DTDigitalThreadProcess, ...]:
+        """The thread processes; what they share is this side's knowledge."""
+        return (self.monitor, self.analyze)
+
+    def recall(self, events: Iterable[Event]) -> None:
+        """Begin with what was known before a restart, the last of each name: the model as it was, and what was wrong."""
+        for event in events:
+            self.monitor.arrived(event, event.t_ms)
+            self.monitor.handle_state()
+            self.monitor.handle_measurements()
+            self.upkeep.keep_up()
+            self.analyze.recall()
+
+    def step(self) -> int:
+        """Take in what arrived and analyze it, one by one: each is compared with the model as it was then. How many events."""
+        count = 0
+        now_ms = self._clock.utc_ns() // NS_PER_MS
+        while self.receiving.queue:
+            _, event = self.receiving.consume()
+            self.monitor.arrived(event, now_ms)
+            self.monitor.handle_state()
+            self.monitor.handle_measurements()
+            self.upkeep.keep_up()
+            self.analyze.compare()
+            count += 1
+        self.analyze.look()
+        self.upkeep.keep_up()
+        return count
+
+    def describe(self) -> dict[str, Any]:
+        """The model, and the figures of twinning."""
+        variables = self.digital_model.variables
+        return {
+            "state": self.digital_model.state.name,
+            "period_s": self.digital_model.period_s,
+            **self.analyze.figures(),
+            "dropped": self.receiving.dropped,
+            "undeclared": variables.undeclared,
+            "variables": variables.describe(),
+        }

@@ -1,0 +1,1 @@
+"""Several systems and the water between their modems."""

@@ -1,0 +1,205 @@
+"""A network: systems whose modems are in one water. What a network file says, resolved and checked as a whole.
+
+Each system is a plant of its own, with its own file, and knows nothing of the network. Where one view of all is
+wanted (a scenario, a report) `Network.whole` is one: every name with its system's in front, `west.ctd.pressure`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fieldtwin.emulators.wires.acoustic import AcousticMedium, Spoils, Water
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.twin.network.schema import NetworkForm, ShipForm
+from fieldtwin.twin.prototype.file import Prototype, load_prototype
+from fieldtwin.twin.site.data_files import find, search_path
+from fieldtwin.twin.site.schema import InputForm, PlcForm, ProgramForm
+from fieldtwin.twin.site.system import System, load_system
+
+WATER = "water"
+"""What faults call the water, as they call a bus."""
+SHIP = "ship"
+
+
+@dataclass(frozen=True)
+class Member:
+    """A system of a network. `modem`: the device that is in the water, at `at_m`."""
+
+    name: str
+    system: System
+    prototype: Prototype
+    modem: str
+    at_m: tuple[float, ...]
+
+    @property
+    def profile(self) -> DeviceProfile:
+        """The modem's."""
+        return self.prototype.devices[self.modem].profile
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network file, resolved. `members` in the file's order."""
+
+    name: str
+    path: Path
+    seed: int
+    water: Water
+    members: dict[str, Member]
+    ship: ShipForm | None
+    file: YamlFile
+
+    @property
+    def places(self) -> dict[str, tuple[float, ...]]:
+        """Where everybody is that speaks and hears."""
+        places = {name: member.at_m for name, member in self.members.items()}
+        return places | ({SHIP: tuple(self.ship.at_m)} if self.ship is not None else {})
+
+    def medium(self, seed: int, spoils: Spoils | None = None) -> AcousticMedium:
+        """The water, with everybody in it."""
+        return AcousticMedium(self.water, self.places, seed, spoils)
+
+    def split(self, name: str) -> tuple[str, str]:
+        """``west.ctd.pressure`` as ``west`` and ``ctd.pressure``. Raises `UsageError`."""
+        member, _, local = name.partition(".")
+        if member not in self.members or not local:
+            raise UsageError(
+                f"no system of the network in {name!r}",
+                expected=", ".join(self.members),
+                hint=did_you_mean(member, self.members),
+            )
+        return member, local
+
+    @property
+    def whole(self) -> System:
+        """All systems as if they were one, under their names; for those who read, never to be run."""
+        first = next(iter(self.members.values())).system
+        return System(
+            name=self.name,
+            path=self.path,
+            hash=" ".join(member.system.hash for member in self.members.values()),
+            buses={
+                f"{m.name}.{n}": replace(bus, name=f"{m.name}.{n}")
+                for m in self.members.values()
+                for n, bus in m.system.buses.items()
+            },
+            devices={
+                f"{m.name}.{n}": replace(device, name=f"{m.name}.{n}", bus=f"{m.name}.{device.bus}")
+                for m in self.members.values()
+                for n, device in m.system.devices.items()
+            },
+            plc=PlcForm.model_construct(
+                cycle_ms=first.plc.cycle_ms,
+                watchdog=first.plc.watchdog,
+                outputs_at=first.plc.outputs_at,
+                tasks={},
+                programs={
+                    f"{m.name}.{n}": _renamed(program, m)
+                    for m in self.members.values()
+                    for n, program in m.system.plc.programs.items()
+                },
+            ),
+            remote=first.remote,
+            file=self.file,
+        )
+
+
+def _renamed(program: ProgramForm, member: Member) -> ProgramForm:
+    beside = member.system.path.parent / program.source
+    return ProgramForm.model_construct(
+        source=str(beside.resolve()) if beside.is_file() else program.source,
+        task=None,
+        inputs={
+            n: InputForm.model_construct(tag=f"{member.name}.{i.tag}", if_bad=i.if_bad)
+            for n, i in program.inputs.items()
+        },
+        outputs={n: f"{member.name}.{tag}" for n, tag in program.outputs.items()},
+    )
+
+
+def load_network(path: Path, profiles: Iterable[Path] = ()) -> Network:
+    """Read a network file and all that it names. Raises `FileInvalid` at its spot."""
+    file, profiles = load(path), tuple(profiles)
+    form = validate(file, NetworkForm)
+    members = {name: _member(file, form, name, path, profiles) for name in form.systems}
+    _check(file, form, members)
+    water = Water(
+        form.water.range_m,
+        form.water.sound_m_per_s,
+        form.water.bytes_per_s,
+        form.water.overhead_bytes,
+        form.water.loss,
+    )
+    return Network(form.network, path, form.seed, water, members, form.ship, file)
+
+
+def _member(file: YamlFile, form: NetworkForm, name: str, path: Path, profiles: tuple[Path, ...]) -> Member:
+    said, loc = form.systems[name], ("systems", name)
+    try:
+        system = load_system(str(find("systems", said.system, beside=path, extra=profiles)), profiles)
+    except UsageError as e:
+        near = did_you_mean(
+            said.system, [p.name for folder in (path.parent, *search_path(profiles)) for p in _files(folder)]
+        )
+        raise file.error((*loc, "system"), e.message, expected=e.expected, hint=near or e.hint) from e
+    other = path.parent / said.prototype if said.prototype is not None else None
+    if other is not None and not other.is_file():
+        raise file.error((*loc, "prototype"), f"no file {said.prototype!r}", expected="one beside this file")
+    prototype = load_prototype(system, other)
+    modems = [n for n, d in prototype.devices.items() if d.form.model == "mailbox"]
+    if said.modem not in modems:
+        raise file.error(
+            (*loc, "modem"),
+            f"{said.modem!r} is no modem of {system.name}",
+            expected=", ".join(modems) or "a device with `model: mailbox` in its prototype file",
+            hint=did_you_mean(said.modem, modems),
+        )
+    return Member(name, system, prototype, said.modem, tuple(said.at_m))
+
+
+def _files(folder: Path) -> list[Path]:
+    """System files there, and where a folder of profiles has them."""
+    return [p for place in (folder, folder / "systems") for p in sorted(place.glob("*.yaml")) if "." not in p.stem]
+
+
+def _check(file: YamlFile, form: NetworkForm, members: dict[str, Member]) -> None:
+    """What only all of them together can be wrong in."""
+    first = next(iter(form.systems.values()))
+    places: list[tuple[tuple[Key, ...], list[float]]] = [(("systems", n), m.at_m) for n, m in form.systems.items()]
+    if form.ship is not None:
+        places.append((("ship",), form.ship.at_m))
+    for loc, at_m in places:
+        if len(at_m) != len(first.at_m):
+            raise file.error(
+                (*loc, "at_m"),
+                "not as many coordinates as the first has",
+                expected=str(len(first.at_m)),
+                got=str(len(at_m)),
+            )
+    for reserved in (SHIP, WATER):
+        if reserved in members:
+            raise file.error(("systems", reserved), f"{reserved!r} is no name for a system of a network")
+    smallest = min(m.profile.inbox.bytes for m in members.values() if m.profile.inbox is not None)
+    seen: dict[str, str] = {}
+    for name, member in members.items():
+        outbox = member.profile.outbox
+        if outbox is not None and outbox.bytes > smallest:
+            raise file.error(
+                ("systems", name, "modem"),
+                "it says what another one's mailbox cannot hold",
+                expected=f"at most {smallest} bytes",
+                got=str(outbox.bytes),
+            )
+        address = member.prototype.devices[member.modem].form.identity.get("address", "")
+        if address and address in seen:
+            raise file.error(
+                ("systems", name),
+                f"its modem has the address {address}, as {seen[address]}'s has",
+                expected="one of its own",
+            )
+        seen[address] = name

@@ -1,0 +1,57 @@
+"""What a network file may say: systems, and the water between their modems. Of the prototype alone: no plant opens it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import ConfigDict, Field
+
+from fieldtwin.twin.site.schema import Name, Strict
+
+Place = Annotated[list[float], Field(min_length=2, max_length=3)]
+
+
+class WaterForm(Strict):
+    """The water: how far it carries, how fast, how much, and what it loses."""
+
+    range_m: float = Field(gt=0, le=1_000_000)
+    sound_m_per_s: float = Field(default=1500.0, ge=100, le=10_000)
+    bytes_per_s: float = Field(default=80.0, gt=0, le=1_000_000)
+    overhead_bytes: int = Field(default=8, ge=0, le=1024, description="of each packet, besides what it carries")
+    loss: float = Field(
+        default=0.0, ge=0.0, lt=1.0, description="share of the packets that each listener misses by chance"
+    )
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class MemberForm(Strict):
+    """A system of the network, which of its devices is the modem, and where that is."""
+
+    system: str
+    modem: Name
+    at_m: Place
+    prototype: str | None = Field(default=None, description="default: the one beside the system")
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class ShipForm(Strict):
+    """Where commands come from: a modem that says each of them more than once, since nobody acknowledges."""
+
+    at_m: Place
+    says: int = Field(default=3, ge=1, le=10)
+    every_s: float = Field(default=20.0, gt=0, le=3600)
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class NetworkForm(Strict):
+    """Systems that hear each other, as prototypes: all of them, and what is between."""
+
+    fieldtwin: Literal[1]
+    network: Name
+    seed: int = 1
+    water: WaterForm
+    systems: dict[Name, MemberForm] = Field(min_length=2, max_length=100)
+    ship: ShipForm | None = None

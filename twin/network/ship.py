@@ -1,0 +1,43 @@
+"""The ship of a network: a modem in the water with nothing behind it but whoever commands (`far end`), on a socket of its own."""
+
+from __future__ import annotations
+
+from fieldtwin.emulators.endpoints.ports import Listening, Ports
+from fieldtwin.emulators.modbus.mbap import MbapSlave
+from fieldtwin.emulators.modbus.serve import serve_mbap
+from fieldtwin.emulators.modbus.unit import ModbusUnit
+from fieldtwin.emulators.models.acoustic_link import AcousticLink
+from fieldtwin.emulators.models.mailbox_modem import MailboxModem
+from fieldtwin.emulators.wires.acoustic import AcousticMedium
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.twin.network.network import SHIP, Network
+from fieldtwin.twin.prototype.field import unit_limits
+
+MOST_CLIENTS = 4
+
+
+class Ship:
+    """``await ship.open(ports)``, then `endpoint` is where its modem is served; its kind is that of the first system's."""
+
+    def __init__(self, network: Network, medium: AcousticMedium, clock: Clock) -> None:
+        assert network.ship is not None
+        self.like = next(iter(network.members.values()))
+        self._clock = clock
+        link = AcousticLink(medium, SHIP, times=network.ship.says, every_ns=round(network.ship.every_s * NS_PER_S))
+        self._unit = ModbusUnit(
+            MailboxModem(self.like.profile, link, link), unit_limits(self.like.profile), name="ship's modem"
+        )
+        self._listener: Listening | None = None
+
+    async def open(self, ports: Ports) -> Endpoint:
+        """Raises `EndpointBusy`."""
+        slave = MbapSlave({self.like.system.devices[self.like.modem].address: self._unit})
+        self._listener = await ports.listen(
+            Endpoint.parse("tcp://127.0.0.1:0"), lambda c: serve_mbap(c, slave, self._clock, 0.0), MOST_CLIENTS
+        )
+        return self._listener.bound
+
+    async def aclose(self) -> None:
+        if self._listener is not None:
+            await self._listener.aclose()

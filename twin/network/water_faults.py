@@ -1,0 +1,82 @@
+"""The faults of a network's water: what is said and does not arrive. Aimed by the network file, told as those of a bus."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from random import Random
+from typing import Any
+
+from fieldtwin.emulators.faults.drop import Drop
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active
+from fieldtwin.emulators.faults.frames import Frame, Framing, Way
+from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.twin.network.network import WATER, Network
+from fieldtwin.twin.prototype.fault_aims import known
+from fieldtwin.twin.prototype.fault_history import FaultHistory
+
+MOST = 1_000
+_AIMS = frozenset({"bus", "device", "nth", "every", "from_", "until", "probability", "optional"})
+
+
+class WaterFaults:
+    """What is in. `start_ns`: when the run began; `from` and `until` count from then."""
+
+    def __init__(self, network: Network, seed: int) -> None:
+        self.start_ns = 0
+        self._network = network
+        self._seed = seed
+        self._wire = WireFaults(Framing.RAW)
+        self.history = FaultHistory()
+        self._numbers = {name: number for number, name in enumerate(network.places, 1)}
+
+    def spoils(self, t_ns: int, listener: int, payload: bytes) -> bool:
+        """`fieldtwin.emulators.wires.acoustic.Spoils`."""
+        return self._wire.decide(Frame(Way.REPLY, Framing.RAW, payload, listener), t_ns) is not None
+
+    def inject(self, said: Mapping[str, Any]) -> str:
+        """Put one in; its id. Raises `UsageError`."""
+        spec = parse_fault(dict(said), number=len(self._wire.active) + 1)
+        check_water_fault(self._network, spec)
+        if spec.id in self._wire.active:
+            raise UsageError(f"the fault {spec.id!r} is in already", hint="clear it first, or give another id")
+        if len(self._wire.active) >= MOST:
+            raise UsageError("too many faults at once", expected=f"at most {MOST}")
+        until_ns = None if spec.until_s is None else self.start_ns + round(spec.until_s * NS_PER_S)
+        units = (self._numbers[spec.aim.device],) if spec.aim.device else ()
+        active = Active(
+            spec.id,
+            spec.make(),
+            spec.aim,
+            Random(f"{self._seed} {spec.id}"),
+            self.start_ns + round(spec.from_s * NS_PER_S),
+            until_ns,
+            units=units,
+        )
+        self._wire.put_in(active)
+        self.history.add(active, f"{WATER} {spec.aim.device}".strip())
+        return spec.id
+
+    def clear(self, id: str) -> None:
+        """Take it away; one that is not in, or whose time is over, is none."""
+        self._wire.take_away(id)
+
+    def describe(self) -> list[dict[str, Any]]:
+        """What is in, and how often it struck."""
+        return [
+            {"id": id, "name": active.fault.name, "bus": WATER, "device": active.aim.device, "struck": active.struck}
+            for id, active in self._wire.active.items()
+        ]
+
+
+def check_water_fault(network: Network, spec: FaultSpec) -> None:
+    """Raises `WrongAim` for what the water cannot suffer, or somebody who is not in it."""
+    if spec.kind is not Drop:
+        raise WrongAim("name", f"fault {spec.kind.name!r} is nothing of the water", expected=Drop.name)
+    for key in sorted(spec.aim.model_fields_set - _AIMS):
+        raise WrongAim(key, f"{key!r} says nothing about the water", expected="device: who shall hear nothing")
+    if spec.aim.device:
+        known("modem in the water", spec.aim.device, network.places, "device")

@@ -1,0 +1,286 @@
+"""The gateway's process: ``python -m fieldtwin.twin.plant.controller CONFIG.json``. The same for a plant and for its prototype.
+
+The configuration names the system file, the run directory and, for a prototype, where each plant endpoint is to be opened. That
+mapping goes into the Connector and nowhere else. Control verbs: ready, get, published, watch, gate, command, reload,
+stop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.gateway.connections.os_connector import OsConnector
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.connection import Connector
+from fieldtwin.gateway.core.control import ControlServer
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.learnt import LearntFile, describe_learnt
+from fieldtwin.gateway.runtime.reconfigure import reconfigure
+from fieldtwin.gateway.runtime.status import describe
+from fieldtwin.gateway.runtime.taken import TakenFile
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.twin.plant.mapping import MappedConnector, mapping_from_json
+from fieldtwin.twin.plant.physical import EmbeddedControlSystem, attached, gateway_config
+from fieldtwin.twin.plant.refusal_places import RefusalPlaces
+from fieldtwin.twin.plant.reloading import compare, limits_changed
+from fieldtwin.twin.plant.watching import TagWatch
+from fieldtwin.twin.site.system import System, load_system
+
+FLUSH_EVERY_NS = NS_PER_S // 2
+LOOK_EVERY_NS = NS_PER_S // 20
+FLUSH_ROWS = 8
+"""As many rows are stored at once: the PLC keeps what is not stored, and holds 16 of each program."""
+MOST_COMMAND_BYTES = 64
+MOST_CHANGES_TOLD = 20
+PUBLISHED_AT_ONCE = 20_000
+"""What a line of the control channel takes."""
+
+
+class ControllerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the process is told. `mapping` is None on a plant; `taps` is a file for what goes over the wires, or empty."""
+
+    system: str
+    run_dir: str
+    allow_writes: bool
+    mapping: dict[str, str] | None = None
+    profiles: tuple[str, ...] = ()
+    capture: str = ""
+    lent: tuple[str, ...] = ()
+    """Transmitters whose mailboxes belong to the digital thread."""
+
+
+class GatewayProcess:
+    """One gateway with its control channel, until told to stop."""
+
+    def __init__(self, config: ControllerConfig) -> None:
+        self._config = config
+        self._clock = WallClock()
+        self._stop = asyncio.Event()
+        self._store_error = ""
+        self._reloads = 0
+        self._changed: list[str] = []
+        self._reloading = asyncio.Lock()
+
+    def _load(self) -> System:
+        return load_system(self._config.system, [Path(p) for p in self._config.profiles])
+
+    async def run(self) -> int:
+        run_dir = Path(self._config.run_dir)
+        system = self._system = self._load()
+        connector: Connector = OsConnector()
+        if self._config.mapping is not None:
+            connector = MappedConnector(connector, mapping_from_json(self._config.mapping))
+        tap = None
+        if self._config.capture:
+            from fieldtwin.gateway.connections.tap import TapFile, TappedConnector
+
+            started = datetime.fromtimestamp(self._clock.utc_ns() / NS_PER_S, UTC).isoformat(timespec="milliseconds")
+            of_run = {"started": started, "system": system.name, "prototype": self._config.mapping is not None}
+            tap = TapFile(Path(self._config.capture), head={**of_run, "t_ns": self._clock.monotonic_ns()})
+            connector = TappedConnector(connector, [tap], self._clock)
+        audit = self._audit = AuditLog(run_dir / "audit.jsonl", self._clock)
+        log = ExchangeLog(run_dir / "store.sqlite", system=system.name, prototype=self._config.mapping is not None)
+        try:
+            ecs = EmbeddedControlSystem(system)
+            with attached(ecs.layout, run_dir / "image") as image:
+                # What emulators did or taught is no fact about the devices of a plant.
+                of = "" if self._config.mapping is None else ".prototype"
+                self._gateway = ecs.gateway(
+                    connector,
+                    self._clock,
+                    image,
+                    audit,
+                    log,
+                    allow_writes=self._config.allow_writes,
+                    free_ports=self._config.mapping is not None,
+                    lent=self._config.lent,
+                    taken=TakenFile(run_dir / f"taken{of}.json"),
+                )
+                drivers = [d for d in self._gateway.drivers.values() if isinstance(d, RegisterDriver)]
+                self._learnt = LearntFile(run_dir / f"learnt{of}.json", drivers, system.buses)
+                self._learnt.load()
+                journal = self._gateway.outputs.journal
+                self._places = RefusalPlaces(journal, run_dir / "plc.sock", tap.on_refusal if tap else None)
+                self._watching = TagWatch(self._gateway.tags, self._clock, journal)
+                await self._serve(run_dir / "gateway.sock")
+        finally:
+            log.close()
+            audit.close()
+            if tap is not None:
+                tap.close()
+        return 0
+
+    async def _serve(self, socket: Path) -> None:
+        server = ControlServer(
+            {
+                "ready": self._ready,
+                "get": self._get,
+                "published": self._published,
+                "watch": self._watch,
+                "gate": self._gate,
+                "command": self._command,
+                "reload": self._reload,
+                "stop": self._request_stop,
+            }
+        )
+        await server.listen_unix(socket)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self._stop.set)
+        try:
+            async with Nursery() as nursery:
+                running = nursery.start(self._gateway.run(), "gateway")
+                nursery.start(self._flush(), "store")
+                nursery.start(self._places.run(), "lines of refused outputs")
+                stopping = asyncio.ensure_future(self._stop.wait())
+                try:
+                    await asyncio.wait([running, stopping], return_when=asyncio.FIRST_COMPLETED)
+                finally:
+                    stopping.cancel()
+                if running.done():
+                    running.result()
+                await self._gateway.shut_down()
+        finally:
+            await server.aclose()
+            socket.unlink(missing_ok=True)
+
+    async def _flush(self) -> None:
+        """Store what was logged, twice a second, or sooner if there is much. A disk that refuses is reported and tried again."""
+        flushed_ns = self._clock.monotonic_ns()
+        while True:
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + LOOK_EVERY_NS)
+            now_ns = self._clock.monotonic_ns()
+            if now_ns - flushed_ns < FLUSH_EVERY_NS and self._gateway.log.waiting < FLUSH_ROWS:
+                continue
+            flushed_ns = now_ns
+            try:
+                await asyncio.to_thread(self._gateway.log.flush)
+                self._learnt.save()
+                self._store_error = ""
+            except Unreachable as e:
+                self._store_error = str(e)
+
+    async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"ready": True, "pid": os.getpid()}
+
+    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+        return self._status()
+
+    def _status(self) -> dict[str, Any]:
+        return {
+            **describe(self._gateway, self._clock.monotonic_ns()),
+            "learnt": describe_learnt(self._gateway.drivers.values()),
+            "store_error": self._store_error,
+            "config": {
+                "system": self._system.name,
+                "hash": self._system.hash,
+                "reloads": self._reloads,
+                "changed": self._changed,
+            },
+        }
+
+    async def _published(self, args: dict[str, Any]) -> dict[str, Any]:
+        """At most `PUBLISHED_AT_ONCE` entries, the oldest first: who wants them all asks again."""
+        since = int(args.get("since", 0))
+        tags = self._gateway.tags
+        newer = tags.journal_since(since)[:PUBLISHED_AT_ONCE]
+        entries = [(p.number, p.tag, p.raw.hex(), p.t_ns, _plain(p.value)) for p in newer]
+        return {"entries": entries, "published": tags.published, "dropped": tags.journal_dropped}
+
+    async def _watch(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Changes of tags since the last question, and some tags now (`fieldtwin.twin.plant.watching`)."""
+        return self._watching.answer(args)
+
+    async def _gate(self, args: dict[str, Any]) -> dict[str, Any]:
+        """The plant's switch, and what a digital twin may command, as they are now."""
+        may = self._system.commands
+        return {"remote": self._gateway.config.remote, "period_s": list(may.period_s), "per_minute": may.per_minute}
+
+    async def _command(self, args: dict[str, Any]) -> dict[str, Any]:
+        """A command of the digital twin, ``payload`` in hex, as if the transmitter had brought it: the control logic decides."""
+        if len(self._gateway.pumps) != 1:
+            raise UsageError("a command for the transmitter", expected="one", got=str(len(self._gateway.pumps)))
+        try:
+            payload = bytes.fromhex(str(args.get("payload", "")))
+        except ValueError as e:
+            raise UsageError("a command's payload", expected="hex", got=repr(args.get("payload"))) from e
+        if not payload or len(payload) > MOST_COMMAND_BYTES:
+            raise UsageError("a command's payload", expected=f"1 to {MOST_COMMAND_BYTES} bytes", got=str(len(payload)))
+        return {"taken": self._gateway.pumps[0].command(payload, str(args.get("by", "digital twin")))}
+
+    async def _reload(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Read the files again and take over what is otherwise in them: all of it, or nothing where some needs a restart.
+
+        With "check" nothing is taken over. Polls go on meanwhile. Raises `FileInvalid` for files that are not right; `limits` in
+        the answer are for the PLC.
+        """
+        async with self._reloading:
+            new = await asyncio.to_thread(self._load)
+            changes = await asyncio.to_thread(compare, self._system, new)
+            told = [{"where": c.where, "what": str(c), "live": c.live} for c in changes]
+            if args.get("check") is True or not all(c.live for c in changes):
+                return {
+                    "applied": False,
+                    "changes": told,
+                    "limits": {},
+                    "hash": self._system.hash,
+                    "warnings": new.warnings,
+                }
+            limits = await asyncio.to_thread(limits_changed, self._system, new)
+            if changes:
+                texts = [str(c) for c in changes]
+                self._audit.note("reload", new.name, by=str(args.get("by", ""))[:64], result="asked", changes=texts)
+                writes, free = self._config.allow_writes, self._config.mapping is not None
+                await reconfigure(
+                    self._gateway, gateway_config(new, allow_writes=writes, free_ports=free, lent=self._config.lent)
+                )
+                self._reloads, self._changed = self._reloads + 1, texts[:MOST_CHANGES_TOLD]
+            self._system = new
+            return {
+                "applied": bool(changes),
+                "changes": told,
+                "limits": limits,
+                "hash": new.hash,
+                "warnings": new.warnings,
+            }
+
+    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Safe outputs first; the answer says whether the devices confirmed them, and holds the final counters."""
+        safe = await self._gateway.shut_down()
+        await self._places.settle()
+        with suppress(Unreachable):  # then it is learnt again
+            self._learnt.save()
+        status = self._status()
+        asyncio.get_running_loop().call_later(0.05, self._stop.set)
+        return {"safe": safe, "status": status}
+
+
+def _plain(value: object) -> object:
+    return value.hex() if isinstance(value, bytes) else value
+
+
+def main(argv: list[str]) -> int:
+    """Run the process; errors go to stderr as one line."""
+    try:
+        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=ControllerConfig)
+        return run(GatewayProcess(config).run())
+    except FieldtwinError as e:
+        print(e, file=sys.stderr)
+        return e.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,24 @@
+"""The variables that a system file declares: every tag with a value or a payload that the plant reports, and of each program
+whether it runs. The digital model's are these, whichever twin it is in, and so are those of a template's ``model.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from fieldtwin.gateway.core.image import TagKind
+from fieldtwin.twin.model.variables import Limits, Variable
+from fieldtwin.twin.plant.physical import plant_tags
+from fieldtwin.twin.site.system import System
+
+
+def declared_variables(system: System, limits: Mapping[str, Limits] | None = None) -> tuple[Variable, ...]:
+    """One for each, in the system file's order. `limits` are held against values instead of those of the profiles.
+
+    A transmitter's inbox is none: what comes in there are commands, which a model takes as such (`DigitalModel.process_event`).
+    """
+    tags = [
+        Variable(tag.name, tag.kind.name.lower(), tag.unit, tag.limits if limits is None else limits.get(tag.name))
+        for tag in plant_tags(system).values()
+        if not (tag.kind is TagKind.MESSAGE and tag.name.endswith(".inbox"))
+    ]
+    return (*tags, *(Variable(program, "bool") for program in system.plc.programs))

@@ -1,0 +1,303 @@
+"""The physical twin: gateway and PLC of a system, and the memory that they share.
+
+Everything that both processes must agree on is made here, once: the process image's layout from the system file, the file that
+holds it, and each process's own configuration. Emulators are unknown (`fieldtwin run --plant` works without that folder).
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from fieldtwin.gateway.connections.listeners import TcpListener
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.connection import Connector, Listen
+from fieldtwin.gateway.core.errors import FieldtwinError, FileInvalid, Unreachable
+from fieldtwin.gateway.core.image import Image, ImageLayout, TagKind, TagSpec, message_tag
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.gateway.devices.canopen_device import CanopenDriver
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.gateway.devices.register_device import RegisterDriver
+from fieldtwin.gateway.runtime.audit import AuditLog
+from fieldtwin.gateway.runtime.gateway import Gateway, GatewayConfig, make_driver
+from fieldtwin.gateway.runtime.tags import TagTable
+from fieldtwin.gateway.runtime.taken import TakenFile
+from fieldtwin.gateway.store.exchange_log import ExchangeLog
+from fieldtwin.plc.binding import BoundProgram, InputBinding, image_for
+from fieldtwin.plc.config import PlcConfig, ProgramConfig, TaskSpec
+from fieldtwin.plc.program import Role
+from fieldtwin.plc.start import StartPolicy
+from fieldtwin.twin.site.schema import StartForm
+from fieldtwin.twin.site.system import System
+
+MESSAGE_DEPTH = 16
+PLC_LOST_CYCLES = 50
+"""The PLC's outputs count no more when it has not published for so many cycles, and for `PLC_LOST_MS` at least."""
+PLC_LOST_MS = 500
+GATEWAY_LOST_MS = 1000
+MIN_STUCK_MS = 200
+
+
+def fastest_ms(system: System) -> int:
+    """The interval of the PLC's fastest cyclic task: how often it publishes."""
+    intervals = [task.interval_ms for task in system.plc.tasks.values() if task.interval_ms]
+    return min(intervals, default=system.plc.cycle_ms)
+
+
+def plc_lost_ms(system: System) -> int:
+    """How old the PLC's last scan is when it counts as lost, and its outputs are made safe."""
+    return max(PLC_LOST_MS, PLC_LOST_CYCLES * fastest_ms(system))
+
+
+def gateway_lost_ms(system: System) -> int:
+    """How old what the gateway published last is when it counts as dead, and everything that it read as bad."""
+    return max(GATEWAY_LOST_MS, 10 * fastest_ms(system))
+
+
+def _kind(tag: Tag) -> TagKind:
+    if tag.type == "bool":
+        return TagKind.BOOL
+    return TagKind.INT if tag.is_integer else TagKind.REAL
+
+
+def plant_tags(system: System) -> dict[str, TagSpec]:
+    """Every tag of the system that a process image can hold: numbers, messages and mailboxes."""
+    specs: dict[str, TagSpec] = {}
+
+    def add(spec: TagSpec) -> None:
+        specs[spec.name] = spec
+
+    for device in system.devices.values():
+        profile = device.profile
+        for tag in profile.tags.values():
+            if not tag.is_text:
+                add(TagSpec(f"{device.name}.{tag.name}", _kind(tag), tag.unit, limits=tag.limits))
+        for message in profile.messages.values():
+            add(message_tag(f"{device.name}.{message.name}", 2 * message.at.count, MESSAGE_DEPTH))
+        if profile.inbox is not None and profile.outbox is not None:
+            add(message_tag(f"{device.name}.inbox", profile.inbox.bytes, MESSAGE_DEPTH))
+            add(message_tag(f"{device.name}.outbox", profile.outbox.bytes, MESSAGE_DEPTH))
+    return specs
+
+
+def programs_of(system: System) -> tuple[ProgramConfig, ...]:
+    """The PLC's programs as its process wants them."""
+    return tuple(
+        ProgramConfig(
+            name,
+            form.source,
+            {v: InputBinding(i.tag, i.if_bad) for v, i in form.inputs.items()},
+            dict(form.outputs),
+            form.task or "",
+            _start_policy(form.start or system.plc.start),
+        )
+        for name, form in system.plc.programs.items()
+    )
+
+
+def _start_policy(form: StartForm) -> StartPolicy:
+    return StartPolicy(float(form.timeout_ms), form.at_timeout)
+
+
+def image_layout(system: System) -> ImageLayout:
+    """The process image of a system: what its programs are bound to, and every other number for watchers."""
+    _check_tasks(system)
+    folder = str(system.path.parent)
+    plant = plant_tags(system)
+    bound = []
+    for config in programs_of(system):
+        try:
+            program = config.bind((folder,))
+        except FieldtwinError as e:
+            raise system.file.error(("plc", "programs", config.name, "source"), str(e)) from e
+        _check_variables(system, program)
+        bound.append(program)
+    watched = [
+        f"{d.name}.{t.name}"
+        for d in system.devices.values()
+        for t in d.profile.tags.values()
+        if t.readable and not t.is_text
+    ]
+    watched += [form.single for form in system.plc.tasks.values() if form.single]
+    try:
+        return image_for(bound, plant, dict.fromkeys(watched))
+    except FileInvalid as e:
+        at = next(
+            (("plc", "tasks", n, "single") for n, t in system.plc.tasks.items() if e.got and t.single == e.got), None
+        )
+        raise system.file.error(at or ("plc", "programs"), e.message, expected=e.expected, got=e.got) from e
+
+
+def _check_tasks(system: System) -> None:
+    """Every program is in a task that there is, and one of them runs by itself and looks at the triggers of the others."""
+    names = list(system.plc.tasks) or ["main"]
+    for program, form in system.plc.programs.items():
+        if form.task and form.task not in names:
+            at = ("plc", "programs", program, "task")
+            raise system.file.error(at, "a task that there is not", expected=", ".join(names), got=form.task)
+    if system.plc.tasks and all(form.single for form in system.plc.tasks.values()):
+        raise system.file.error(("plc", "tasks"), "only SINGLE tasks", expected="at least one with interval_ms")
+
+
+def _check_variables(system: System, bound: BoundProgram) -> None:
+    """What the file binds must be variables of the program, of the right kind."""
+    for key, role, names in (("inputs", Role.INPUT, bound.inputs), ("outputs", Role.OUTPUT, bound.outputs)):
+        declared = [v.name for v in bound.variables(role)]
+        for name in names:
+            if name not in declared:
+                raise system.file.error(
+                    ("plc", "programs", bound.name, key, name),
+                    f"program {bound.name!r} has no {role.value} {name!r}",
+                    expected=", ".join(declared) or "none",
+                )
+
+
+def gateway_config(
+    system: System,
+    *,
+    allow_writes: bool,
+    free_ports: bool = False,
+    true_silences: bool | None = None,
+    lent: Sequence[str] = (),
+) -> GatewayConfig:
+    """What the gateway runs. With `free_ports` it serves and bridges where there is room, so that several run on one host.
+    Without `true_silences` no line is strict about them: those of virtual ports say nothing, which `free_ports` implies. The
+    mailboxes of the transmitters `lent` are left to a digital thread."""
+    true_silences = not free_ports if true_silences is None else true_silences
+    serving = system.serving.for_run(allow_writes=allow_writes, free_ports=free_ports)
+    outputs = {tag for form in system.plc.programs.values() for tag in form.outputs.values()}
+    return GatewayConfig(
+        buses={name: replace(bus, strict=bus.strict and true_silences) for name, bus in system.buses.items()},
+        devices={n: _without_inbox(d) if n in lent else d for n, d in system.devices.items()},
+        cycle_ms=fastest_ms(system),
+        plc_lost_ms=plc_lost_ms(system),
+        outputs=frozenset(outputs),
+        log_tags=frozenset(f"{name}.log" for name in system.plc.programs),
+        allow_writes=allow_writes,
+        remote=system.remote == "remote",
+        serve=serving.serve,
+        bridges=serving.bridges,
+        lent=frozenset(lent),
+    )
+
+
+def _without_inbox(device: DeviceConfig) -> DeviceConfig:
+    return replace(device, poll={group: ms for group, ms in device.poll.items() if group != "inbox"})
+
+
+def plc_config(system: System, run_dir: Path, *, cold: bool = False) -> PlcConfig:
+    """What the PLC process is told. With `cold` its retained variables begin with their initial values."""
+    watchdog = system.plc.watchdog
+    return PlcConfig(
+        image_path=str(run_dir / "image"),
+        layout=image_layout(system).describe(),
+        control_path=str(run_dir / "plc.sock"),
+        audit_path=str(run_dir / "audit.jsonl"),
+        programs=programs_of(system),
+        cycle_ms=float(fastest_ms(system)),
+        late_ms=float(watchdog.late_ms),
+        stop_after=watchdog.stop_after,
+        heartbeat_limit_ms=float(gateway_lost_ms(system)),
+        python_path=(str(system.path.parent),),
+        tasks=tuple(
+            TaskSpec(name, float(form.interval_ms or 0), form.priority, form.single or "", float(form.late_ms or 0))
+            for name, form in system.plc.tasks.items()
+        ),
+        stuck_ms=float(watchdog.stuck_ms or max(MIN_STUCK_MS, 20 * fastest_ms(system))),
+        restart_after_ms=float(watchdog.restart_after_ms),
+        max_restarts=watchdog.restarts,
+        retain_path=str(run_dir / "retain"),
+        cold=cold,
+        outputs_first=system.plc.outputs_at == "start",
+    )
+
+
+def make_image(layout: ImageLayout, path: Path) -> None:
+    """Make the file that holds the image, readable and writable for its owner only. It replaces an older one."""
+    temporary = path.with_suffix(".new")
+    try:
+        with open(os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600), "r+b") as file:
+            file.truncate(layout.size)
+            with mmap.mmap(file.fileno(), layout.size) as mapped, memoryview(mapped) as memory:
+                layout.format(memory)
+        temporary.replace(path)
+    except OSError as e:
+        raise Unreachable(f"cannot make the process image: {e.strerror or e}", where=str(path)) from e
+
+
+@contextmanager
+def attached(layout: ImageLayout, path: Path) -> Iterator[Image]:
+    """Map the image file and attach to it."""
+    try:
+        with path.open("r+b") as file:
+            mapped = mmap.mmap(file.fileno(), 0)
+    except (OSError, ValueError) as e:
+        raise Unreachable(f"cannot map the process image: {e}", where=str(path)) from e
+    with mapped, memoryview(mapped) as memory, layout.attach(memory) as image:
+        yield image
+
+
+def make_drivers(system: System, tags: TagTable, clock: Clock) -> dict[str, RegisterDriver | CanopenDriver]:
+    """The driver of every device, in the file's order, attached to nothing yet."""
+    return {d.name: make_driver(d, system.buses[d.bus], tags, clock) for d in system.devices.values()}
+
+
+class EmbeddedControlSystem:
+    """SPEC row EmbeddedControlSystem: the drivers and the control logic of a system, from its file and nothing else.
+
+    The plant and its prototype run this very class. It is spread over two processes, the gateway with the drivers and the PLC
+    with the control logic, which share the process image; what each is told, and the gateway itself, is made here.
+    """
+
+    def __init__(self, system: System) -> None:
+        self.system = system
+        self.control_logic: tuple[ProgramConfig, ...] = programs_of(system)
+        self.layout: ImageLayout = image_layout(system)
+
+    def gateway(
+        self,
+        connector: Connector,
+        clock: Clock,
+        image: Image,
+        audit: AuditLog,
+        log: ExchangeLog,
+        *,
+        allow_writes: bool,
+        free_ports: bool = False,
+        true_silences: bool | None = None,
+        listen: Listen = TcpListener.open,
+        lent: Sequence[str] = (),
+        taken: TakenFile | None = None,
+    ) -> Gateway:
+        """The gateway with its drivers. Which wires `connector` opens, and where `listen` lets clients in, nobody from here
+        on knows. `taken` keeps which commands need not be handed on again; None: nobody comes after it."""
+        config = gateway_config(
+            self.system, allow_writes=allow_writes, free_ports=free_ports, true_silences=true_silences, lent=lent
+        )
+        return Gateway(config, connector, clock, image, audit, log, listen, taken)
+
+    def command_lists(self, clock: Clock) -> dict[str, frozenset[str]]:
+        """What the driver of each device can ask of it."""
+        return {name: d.command_list for name, d in make_drivers(self.system, TagTable(clock), clock).items()}
+
+    def prepare(self, run_dir: Path, *, cold: bool = False) -> PlcConfig:
+        """Make the process image in `run_dir`; what the PLC's process is to be told. `cold`: without what was retained."""
+        make_image(self.layout, run_dir / "image")
+        return plc_config(self.system, run_dir, cold=cold)
+
+
+class PhysicalTwin:
+    """SPEC row PhysicalTwin: sensors, transmitters and the embedded control system.
+
+    The devices are hardware out there; of them this side has what the system file says. CANopen nodes are sensors here (SPEC
+    ruling 13).
+    """
+
+    def __init__(self, system: System) -> None:
+        self.ecs = EmbeddedControlSystem(system)
+        self.sensors = {n: d for n, d in system.devices.items() if d.profile.inbox is None}
+        self.transmitters = {n: d for n, d in system.devices.items() if d.profile.inbox is not None}

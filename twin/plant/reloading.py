@@ -1,0 +1,160 @@
+"""Two versions of a system's files: what is otherwise, and what of that a running gateway can take over.
+
+Pace, periods, limits, scaling and safe values can change between two polls, and so can the plant's switch and what may be
+commanded over a thread. Ports, addresses, what a device is, programs and
+what is bound to them cannot: that is named, and nothing at all is taken over then. What is not listed here as changeable is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.gateway.core.profile import DeviceProfile
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.devices.config import DeviceConfig
+from fieldtwin.twin.plant.physical import plant_tags
+from fieldtwin.twin.site.schema import SystemForm
+from fieldtwin.twin.site.system import System
+
+Loc = tuple[Key, ...]
+GATE = frozenset({"remote", "commands"})
+"""Who may command, and what: the plant's own say, and nobody who throws a switch may have to stop a plant for it."""
+BUS = frozenset({"timeout_ms", "retries", "spacing_ms", "turnaround_ms", "connect_pause_ms", "probe_percent"})
+"""Of a Modbus bus. A CAN bus has nothing that could change."""
+DEVICE = frozenset({"poll", "stale_after_ms", "safe", "backoff_first_ms", "backoff_limit_ms"})
+MODBUS_DEVICE = DEVICE | {"timeout_ms", "retries", "spacing_ms", "writable"}
+PROFILE = frozenset({"source", "limits", "gaps", "timing"})
+TAG = frozenset({"scale", "offset", "sentinels", "values", "range", "secret", "danger", "description"})
+SCALING = frozenset({"scale", "offset"})
+NOTHING = object()
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One value that is otherwise: in which file and where there, under which keys, and whether it can be taken over."""
+
+    where: str
+    what: str
+    old: str
+    new: str
+    live: bool
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.old} -> {self.new}" if self.old or self.new else self.what
+
+
+def compare(old: System, new: System) -> list[Change]:
+    """What is otherwise in `new`, the system file first, in the order of its keys; then profiles, then what they name."""
+    before, after = _dump(old), _dump(new)
+    found = [
+        _change(new.file, at, a, b, live=_is_live(new, at, before, after), secret=_is_secret(new, at))
+        for at, a, b in _differences(before, after)
+    ]
+    found += _of_profiles(old, new)
+    if all(c.live for c in found):
+        found += _unexplained(old, new)
+    return found
+
+
+def limits_changed(old: System, new: System) -> dict[str, tuple[float, float] | None]:
+    """The tags whose smallest and largest values are others now: the PLC has a copy of them, for forces."""
+    before, after = plant_tags(old), plant_tags(new)
+    return {name: spec.limits for name, spec in after.items() if name in before and spec.limits != before[name].limits}
+
+
+def _dump(system: System) -> dict[str, Any]:
+    return validate(system.file, SystemForm).model_dump(by_alias=True)
+
+
+def _differences(old: Any, new: Any, at: Loc = ()) -> Iterator[tuple[Loc, Any, Any]]:
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for key in [*new, *(k for k in old if k not in new)]:
+            yield from _differences(old.get(key, NOTHING), new.get(key, NOTHING), (*at, key))
+    elif old != new:
+        yield at, old, new
+
+
+def _is_live(new: System, at: Loc, before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
+    if at[0] in GATE:
+        return True
+    if len(at) < 3:
+        return False
+    section, name, key = at[:3]
+    if section == "buses":
+        bus = new.buses.get(str(name))
+        return bus is not None and not bus.endpoint.is_can and key in BUS
+    if section != "devices" or name not in new.devices:
+        return False
+    if new.devices[str(name)].profile.protocol == "modbus":
+        return key in MODBUS_DEVICE
+    polled = [bool(form["devices"][name]["poll"]) for form in (before, after)]
+    return key in DEVICE and (key != "poll" or all(polled))
+
+
+def _is_secret(system: System, at: Loc) -> bool:
+    if len(at) < 4 or at[0] != "devices" or at[1] not in system.devices:
+        return False
+    tag = system.devices[str(at[1])].profile.tags.get(str(at[3]))
+    return tag is not None and tag.secret
+
+
+def _of_profiles(old: System, new: System) -> list[Change]:
+    found: dict[tuple[str, str], Change] = {}
+    for name, device in new.devices.items():
+        if name not in old.devices:
+            continue
+        profile, before = device.profile, old.devices[name].profile
+        if profile.path == before.path and profile.hash == before.hash:
+            continue
+        file = load(Path(profile.path))
+        for at, a, b in _differences(before.form.model_dump(by_alias=True), profile.form.model_dump(by_alias=True)):
+            change = _change(file, at, a, b, live=_is_live_in_profile(before, profile, at))
+            found.setdefault((change.where, change.what), replace(change, what=f"{profile.name}: {change.what}"))
+    return list(found.values())
+
+
+def _is_live_in_profile(before: DeviceProfile, after: DeviceProfile, at: Loc) -> bool:
+    if at[0] != "tags":
+        return at[0] in PROFILE or at == ("sampled", "slack_ms")
+    if len(at) < 3 or at[2] not in TAG:
+        return False
+    tag = str(at[1])  # the process image holds it as a whole number, or not
+    return at[2] not in SCALING or before.tags[tag].is_integer == after.tags[tag].is_integer
+
+
+def _unexplained(old: System, new: System) -> list[Change]:
+    """What differs though nothing that may change says so: a DCF or an EDS that the files name, a profile's messages."""
+    found = []
+    for name, device in new.devices.items():
+        before = old.devices[name]
+        if _fixed(device) != _fixed(before) or device.canopen != before.canopen:
+            found.append(_change(new.file, ("devices", name), "", "", live=False))
+    if new.serving != old.serving or new.plc != old.plc:
+        found.append(_change(new.file, ("serve",), "", "", live=False))
+    return found
+
+
+def _fixed(device: DeviceConfig) -> tuple[object, ...]:
+    p = device.profile
+    return (
+        device.bus, device.address, device.expect, device.heartbeat, device.tpdo1, device.start,
+        p.messages, p.inbox, p.outbox, p.command_list, p.eds_path,
+        {n: (t.at, t.object, t.type, t.poll, t.access, t.unit, t.is_integer) for n, t in p.tags.items()},
+    )  # fmt: skip
+
+
+def _change(file: YamlFile, at: Loc, old: Any, new: Any, *, live: bool, secret: bool = False) -> Change:
+    spot: FileInvalid = file.error(at, "")
+    texts = ("(secret)", "(secret)") if secret else (_text(old), _text(new))
+    return Change(f"{spot.path}:{spot.line}:{spot.column}", ".".join(map(str, at)), *texts, live)
+
+
+def _text(value: Any) -> str:
+    if value is NOTHING:
+        return "nothing"
+    text = value if isinstance(value, str) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,88 @@
+"""What a fault's aim means in a system: a bus, a device, a register or a tag by name become units, addresses and objects.
+
+Pure: what makes no sense is found before anything runs. The physical twin knows nothing of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from fieldtwin.emulators.faults.fault import Aim, Kind
+from fieldtwin.emulators.faults.schema import FUNCTIONS_OF, FaultSpec, addressed, counted
+from fieldtwin.emulators.faults.value_ranges import check_fault
+from fieldtwin.emulators.faults.wrong_aim import WrongAim
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import Tag
+from fieldtwin.twin.site.system import System
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What is struck. `units` empty: all of the bus; `addresses` None and `functions` empty: all."""
+
+    bus: str
+    units: tuple[int, ...]
+    aim: Aim
+    addresses: range | None = None
+    functions: frozenset[int] = frozenset()
+    counts: range | None = None
+
+
+def target(system: System, spec: FaultSpec) -> Target:
+    """Raises `WrongAim` with the nearest name for what the system does not have, and for what such a bus cannot suffer."""
+    aim, kind = spec.aim, spec.kind.kind
+    bus = _bus(system, spec)
+    tag = None
+    if aim.register_:
+        if not aim.device:
+            raise WrongAim("register", "a register is one of a device", expected="device: NAME")
+        tag = tag_of(system, aim.device, aim.register_, "register")
+    if kind is Kind.VALUE and tag is not None and tag.is_text:
+        raise WrongAim("register", f"{aim.device}.{tag.name} is no number", expected="a tag that is one")
+    if aim.device:
+        check_fault(spec.make(), aim.register_, system.devices[aim.device].profile.tags.values(), aim.device)
+    is_can = system.buses[bus].endpoint.is_can
+    if kind is not Kind.VALUE and is_can != (kind is Kind.CAN):
+        raise WrongAim("name", f"fault {spec.kind.name} is for {kind.value}", got=f"bus {bus!r}")
+    units = (aim.unit,) if aim.unit is not None else (system.devices[aim.device].address,) if aim.device else ()
+    if kind is Kind.CAN and tag is not None and tag.object is not None:
+        return Target(bus, units, aim.model_copy(update={"index": tag.object[0]}))
+    if kind is not Kind.BYTES:
+        return Target(bus, units, aim)
+    if tag is not None:
+        at = tag.registers
+        return Target(bus, units, aim, range(at.address, at.end), FUNCTIONS_OF[at.table], counted(aim.registers))
+    addresses, functions = (None, frozenset[int]()) if aim.address is None else addressed(aim.address)
+    return Target(bus, units, aim, addresses, functions, counted(aim.registers))
+
+
+def tag_of(system: System, device: str, tag: str, key: str = "") -> Tag:
+    """A device's tag by its name. Raises `WrongAim`."""
+    known("device", device, system.devices, "device")
+    tags = system.devices[device].profile.tags
+    known(f"tag of {device}", tag, tags, key)
+    return tags[tag]
+
+
+def known(what: str, name: str, names: Iterable[str], key: str = "") -> None:
+    """Raises `WrongAim` for a name that is none of `names`, with the nearest."""
+    names = list(names)
+    if name not in names:
+        hint = did_you_mean(name, names)
+        raise WrongAim(key, f"no {what} {name!r}", expected=", ".join(names), hint=hint)
+
+
+def _bus(system: System, spec: FaultSpec) -> str:
+    aim = spec.aim
+    if aim.bus:
+        known("bus", aim.bus, system.buses, "bus")
+    if aim.device:
+        known("device", aim.device, system.devices, "device")
+        on = system.devices[aim.device].bus
+        if aim.bus and aim.bus != on:
+            raise WrongAim("bus", f"{aim.device} is on another bus", expected=on, got=aim.bus)
+        return on
+    if not aim.bus:
+        raise WrongAim("name", f"fault {spec.kind.name} aims at nothing", expected="device: NAME, or bus: NAME")
+    return aim.bus

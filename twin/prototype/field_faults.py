@@ -1,0 +1,202 @@
+"""The faults of a field side: what is put in by name is aimed here, by the system file, at a bus, a device, a register or a tag.
+
+A plant has none of this. Whoever asks is `fieldtwin run --faults`, a scenario, or somebody at the control channel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from random import Random
+from typing import Any
+
+from fieldtwin.emulators.distortion import Distortions
+from fieldtwin.emulators.endpoints.faulty import FaultyEnd
+from fieldtwin.emulators.endpoints.faulty_can import FaultyCan, bus_rule
+from fieldtwin.emulators.endpoints.faulty_udp import FaultyDatagrams
+from fieldtwin.emulators.endpoints.ports import Datagrams
+from fieldtwin.emulators.faults.can_fault import BusFault
+from fieldtwin.emulators.faults.engine import WireFaults
+from fieldtwin.emulators.faults.fault import Active, Aim, ValueFault
+from fieldtwin.emulators.faults.frames import Framing, Way
+from fieldtwin.emulators.faults.schema import FaultSpec, parse_fault
+from fieldtwin.emulators.faults.set_value import Form, SetValue
+from fieldtwin.emulators.faults.value_ranges import check_value
+from fieldtwin.emulators.wires.can_faults import Rule
+from fieldtwin.gateway.core.clock import NS_PER_S, Clock
+from fieldtwin.gateway.core.connection import ByteConnection, CanConnection
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.twin.prototype.fault_aims import tag_of, target
+from fieldtwin.twin.prototype.fault_history import FaultHistory
+from fieldtwin.twin.site.system import System
+
+MOST = 1_000
+
+
+class FieldFaults:
+    """What is in on the buses of a system, and in its devices. `start_ns`: when the run began; `from` and `until` count from
+    then."""
+
+    def __init__(self, system: System, seed: int, clock: Clock) -> None:
+        self.start_ns = clock.monotonic_ns()
+        self._system = system
+        self._seed = seed
+        self._clock = clock
+        self._buses = {name: WireFaults(framing_of(bus.endpoint)) for name, bus in system.buses.items()}
+        self._distortions: dict[str, Distortions] = {}
+        self._rules: dict[str, tuple[str, Rule]] = {}
+        self._disturb: dict[str, Callable[[Rule], None]] = {}
+        self._undisturb: dict[str, Callable[[Rule], None]] = {}
+        self._active: dict[str, tuple[FaultSpec, Active, str]] = {}
+        self._set: dict[tuple[str, str], float] = {}
+        self.history = FaultHistory()
+
+    # -- where faults can be --------------------------------------------------------------------------------------------
+
+    def on_bytes(self, bus: str, connection: ByteConnection) -> FaultyEnd:
+        """An emulator's end of a line or socket, behind the faults of its bus."""
+        return FaultyEnd(connection, self._buses[bus])
+
+    def on_datagrams(self, bus: str, socket: Datagrams) -> FaultyDatagrams:
+        """An emulator's UDP socket, behind the faults of its bus."""
+        return FaultyDatagrams(socket, self._buses[bus])
+
+    def on_can(self, bus: str, connection: CanConnection, node: int) -> FaultyCan:
+        """A node's end of a bus, behind the faults of that bus."""
+        return FaultyCan(connection, self._buses[bus], node)
+
+    def on_values(self, device: str, distortions: Distortions) -> None:
+        """What `device` holds can be distorted."""
+        self._distortions[device] = distortions
+
+    def on_wire(self, bus: str, disturb: Callable[[Rule], None], undisturb: Callable[[Rule], None]) -> None:
+        """A modelled CAN bus, on which errors can happen."""
+        self._disturb[bus], self._undisturb[bus] = disturb, undisturb
+
+    def refuses(self, bus: str) -> bool:
+        """Whether who connects to the emulators of `bus` is turned away now."""
+        return self._buses[bus].refuses(self._clock.monotonic_ns())
+
+    def watch(self, told: Callable[[str, object, bool, bytes], None]) -> None:
+        """From now on `told` learns what is on each line and socket: the bus, who carries it (one for each connection), whether
+        it comes from an emulator, and the bytes. CAN buses have listeners of their own (`FieldSide.join`)."""
+        for name, wire in self._buses.items():
+            wire.watch = _watcher(name, told)
+
+    # -- putting in and taking away -------------------------------------------------------------------------------------
+
+    def inject(self, said: Mapping[str, Any], start_ns: int | None = None) -> str:
+        """Put a fault in; its id. Its times count from `start_ns`, by default from the run's start. Raises `UsageError` for what
+        makes no sense, or an id that is in already."""
+        start_ns = self.start_ns if start_ns is None else start_ns
+        spec = parse_fault(dict(said), number=len(self._active) + 1)
+        if spec.id in self._active:
+            raise UsageError(f"the fault {spec.id!r} is in already", hint="clear it first, or give another id")
+        if len(self._active) >= MOST:
+            raise UsageError("too many faults at once", expected=f"at most {MOST}")
+        fault = spec.make()
+        at = target(self._system, spec)
+        until_ns = None if spec.until_s is None else start_ns + round(spec.until_s * NS_PER_S)
+        active = Active(
+            spec.id,
+            fault,
+            at.aim,
+            Random(f"{self._seed} {spec.id}"),
+            start_ns + round(spec.from_s * NS_PER_S),
+            until_ns,
+            units=at.units,
+            addresses=at.addresses,
+            functions=at.functions,
+            counts=at.counts,
+        )
+        self._put(spec, active, at.bus)
+        self._active[spec.id] = (spec, active, at.bus)
+        self.history.add(active, spec.aim.device or at.bus)
+        return spec.id
+
+    def _put(self, spec: FaultSpec, active: Active, bus: str) -> None:
+        if isinstance(active.fault, ValueFault):
+            found = self._distortions.get(spec.aim.device)
+            if found is None:
+                raise UsageError(
+                    f"what {spec.aim.device} holds cannot be changed", expected="a device that is emulated here"
+                )
+            active.fault.learn(self._system.devices[spec.aim.device].profile.tags.values())
+            found.put_in(active, spec.aim.register_)
+        elif isinstance(active.fault, BusFault):
+            disturb = self._disturb.get(bus)
+            if disturb is None:
+                raise UsageError(f"no errors on the wire of bus {bus!r}", expected="the software CAN bus")
+            nodes = frozenset(active.units) or frozenset(d.address for d in self._system.devices_on(bus))
+            rule = bus_rule(active, self._clock.monotonic_ns, nodes)
+            self._rules[spec.id] = bus, rule
+            disturb(rule)
+        else:
+            self._buses[bus].put_in(active)
+
+    def clear(self, id: str) -> None:
+        """Take a fault away. Raises `UsageError` for an id that is not in."""
+        if id not in self._active:
+            raise UsageError(f"no fault {id!r} is in", expected=", ".join(self._active) or "one; there is none")
+        spec, _, bus = self._active.pop(id)
+        if spec.aim.device in self._distortions:
+            self._distortions[spec.aim.device].take_away(id)
+        if id in self._rules:
+            on, rule = self._rules.pop(id)
+            self._undisturb[on](rule)
+        elif bus:
+            self._buses[bus].take_away(id)
+
+    def set_value(self, device: str, tag: str, value: float | str | bool | None) -> None:
+        """From now on the device holds `value` for `tag`; None: what it says by itself again."""
+        found = tag_of(self._system, device, tag)
+        distortions = self._distortions.get(device)
+        if distortions is None or found.is_text:
+            raise UsageError(f"{device}.{tag} cannot be set", expected="a number of a device that is emulated here")
+        if isinstance(value, str):
+            raise UsageError(f"{device}.{tag}", expected="a number", got=repr(value))
+        if value is not None:
+            check_value(found, float(value), f"{device}.{tag}")
+        id = f"set {device}.{tag}"
+        distortions.take_away(id)
+        self._set.pop((device, tag), None)
+        if value is None:
+            return
+        now_ns = self._clock.monotonic_ns()
+        fault = SetValue(Form(value=float(value)))
+        active = Active(id, fault, Aim(), Random(id), now_ns, None)
+        distortions.put_in(active, tag)
+        self.history.add(active, f"{device}.{tag}")
+        self._set[device, tag] = float(value)
+
+    def value_set(self, device: str, tag: str) -> float | None:
+        """The value that `set_value` holds the device at; None where none is set."""
+        return self._set.get((device, tag))
+
+    def values_set(self) -> dict[str, float]:
+        """Each value that is set, by DEVICE.TAG."""
+        return {f"{device}.{tag}": value for (device, tag), value in self._set.items()}
+
+    def ids(self) -> list[str]:
+        """The ids of the faults that are in."""
+        return list(self._active)
+
+    def describe(self) -> list[dict[str, Any]]:
+        """What is in, and how often it struck."""
+        return [
+            {"id": id, "name": spec.kind.name, "bus": bus, "device": spec.aim.device, "struck": active.struck}
+            for id, (spec, active, bus) in self._active.items()
+        ]
+
+
+def framing_of(endpoint: Endpoint) -> Framing:
+    """How frames look on a bus."""
+    if endpoint.is_can:
+        return Framing.RAW
+    if endpoint.scheme == "ascii":
+        return Framing.ASCII
+    return Framing.RTU if endpoint.is_serial or endpoint.scheme == "rtu+tcp" else Framing.MBAP
+
+
+def _watcher(bus: str, told: Callable[[str, object, bool, bytes], None]) -> Callable[[object, Way, bytes], None]:
+    return lambda end, way, data: told(bus, end, way is Way.REPLY, data)

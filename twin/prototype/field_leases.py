@@ -1,0 +1,145 @@
+"""Leases on the simulated field devices: what a judge puts in stays only as long as the judge renews its lease.
+
+A judge (a scenario on a running system) opens a lease on the control channel, puts faults and values in under its id, and renews
+it. Whatever happens to the judge, kill -9 and a cut network included, all that it put in is taken out when the lease ends: faults
+are cleared, and each device value is what it was before the judge's first `set`. One judge at a time: two of them would change
+each other's verdicts.
+
+Pure: the time is passed in. Times are ns on the clock of the field process.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.errors import UsageError
+
+if TYPE_CHECKING:  # a judge on a plant, which loads no emulators, takes its times from here
+    from fieldtwin.twin.prototype.field_faults import FieldFaults
+
+
+LEASE_S = 10.0
+"""A lease that was not renewed for this many seconds ends, unless the judge asks for another time."""
+MOST_LEASE_S = 60.0
+MOST_ID = 100
+
+
+class LeaseEnded(UsageError):
+    """The lease has expired or was released: what was put in under it has been taken out."""
+
+
+class LeaseTaken(UsageError):
+    """Another judge holds the lease."""
+
+
+@dataclass
+class _Lease:
+    id: str
+    until_ns: int
+    faults: set[str] = field(default_factory=set)
+    before: dict[tuple[str, str], float | None] = field(default_factory=dict)
+    """By device and tag: the value that was set before this lease, None where none was."""
+
+
+class FieldLeases:
+    """The lease on `faults`, at most one."""
+
+    def __init__(self, faults: FieldFaults) -> None:
+        self._faults = faults
+        self._lease: _Lease | None = None
+        self.expired = 0
+        """How many leases ended because their judge did not renew them."""
+
+    @property
+    def until_ns(self) -> int | None:
+        """When the lease ends unless it is renewed; None without a lease."""
+        return None if self._lease is None else self._lease.until_ns
+
+    def open(self, id: str, for_s: float, now_ns: int) -> None:
+        """Give the lease to judge `id` for `for_s` seconds. Raises `LeaseTaken` while another judge holds it."""
+        self.expire(now_ns)
+        if not id or len(id) > MOST_ID:
+            raise UsageError("the lease's id", expected=f"1 to {MOST_ID} characters", got=repr(id)[:60])
+        if self._lease is not None and self._lease.id != id:
+            left_s = (self._lease.until_ns - now_ns) / NS_PER_S
+            raise LeaseTaken(
+                f"another judge ({self._lease.id}) uses these simulated field devices",
+                hint=f"wait until it ends; without a sign of life its lease expires in {left_s:.1f} s",
+            )
+        if self._lease is None:
+            self._lease = _Lease(id, 0)
+        self._lease.until_ns = now_ns + _duration_ns(for_s)
+
+    def renew(self, id: str, for_s: float, now_ns: int) -> None:
+        """Prolong the lease, `for_s` seconds from now on. Raises `LeaseEnded`."""
+        self.of(id, now_ns).until_ns = now_ns + _duration_ns(for_s)
+
+    def of(self, id: str, now_ns: int) -> _Lease:
+        """The lease `id`. Raises `LeaseEnded` where it is over."""
+        self.expire(now_ns)
+        if self._lease is None or self._lease.id != id:
+            raise LeaseEnded(
+                "the judge's lease on the simulated field devices has ended: what it had put in was taken out",
+                expected=f"a lease that is renewed in time (every few seconds; it lasts {LEASE_S:g} s)",
+            )
+        return self._lease
+
+    def inject(self, id: str, said: dict[str, Any], start_ns: int | None, now_ns: int) -> str:
+        """Put a fault in under the lease; the fault's id."""
+        lease = self.of(id, now_ns)
+        fault = self._faults.inject(said, start_ns)
+        lease.faults.add(fault)
+        return fault
+
+    def set_value(self, id: str, device: str, tag: str, value: float | str | bool | None, now_ns: int) -> None:
+        """Set a device value under the lease, None: no longer. The lease's end restores what was set before."""
+        lease, before = self.of(id, now_ns), self._faults.value_set(device, tag)
+        self._faults.set_value(device, tag, value)
+        lease.before.setdefault((device, tag), before)
+
+    def release(self, id: str) -> None:
+        """Take out what was put in under the lease `id`. Does nothing where that lease has ended already."""
+        if self._lease is not None and self._lease.id == id:
+            self._end()
+
+    def expire(self, now_ns: int) -> bool:
+        """End the lease where its time is over; whether it was."""
+        if self._lease is None or now_ns < self._lease.until_ns:
+            return False
+        self.expired += 1
+        self._end()
+        return True
+
+    def _end(self) -> None:
+        lease, self._lease = self._lease, None
+        assert lease is not None
+        for fault in sorted(lease.faults & set(self._faults.ids())):  # the judge may have cleared some
+            self._faults.clear(fault)
+        for (device, tag), value in lease.before.items():
+            self._faults.set_value(device, tag, value)
+
+    def moved_to(self, faults: FieldFaults) -> None:
+        """The devices were made anew with `faults`: the lease goes on, and nothing is in under it."""
+        self._faults = faults
+        if self._lease is not None:
+            self._lease = _Lease(self._lease.id, self._lease.until_ns)
+
+    def describe(self, now_ns: int) -> dict[str, Any]:
+        """For the control channel."""
+        lease = self._lease
+        held = None
+        if lease is not None:
+            left_s = max(0.0, (lease.until_ns - now_ns) / NS_PER_S)
+            sets = [f"{device}.{tag}" for device, tag in lease.before]
+            held = {"id": lease.id, "left_s": round(left_s, 3), "faults": sorted(lease.faults), "set": sets}
+        return {"held": held, "expired": self.expired}
+
+
+def _duration_ns(for_s: float) -> int:
+    if not 0 < for_s <= MOST_LEASE_S:
+        raise UsageError(
+            "how long a lease lasts", expected=f"more than 0 s, at most {MOST_LEASE_S:g} s", got=f"{for_s}"
+        )
+    return round(for_s * NS_PER_S)

@@ -1,0 +1,309 @@
+"""The field side's process: ``python -m fieldtwin.twin.prototype.field_process CONFIG.json``, or inside `fieldtwin emulate
+SYSTEM`.
+
+Control verbs: ready, get (listening endpoints, counters), held (what the devices really held), fault, clear, set, lease, fresh,
+stop. On a Unix socket in the run directory, and on TCP where asked for, so that a controller elsewhere learns where each plant
+endpoint's emulator listens.
+
+    lease     {"id": ..., "for_s": 10}: open the lease `id` on these devices (`fieldtwin.twin.prototype.field_leases`); {"renew":
+    true} prolongs it,
+              {"release": true} ends it. `fault` and `set` with "lease": ID are taken out when that lease ends
+    fresh     {"lease": ID}: every device, recording and simulation from its beginning, on the same ports and without a fault
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import secrets
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from fieldtwin.emulators.endpoints.acoustic_end import AcousticEnd
+from fieldtwin.gateway.core.clock import NS_PER_S
+from fieldtwin.gateway.core.control import ControlServer
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FieldtwinError, UsageError
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.wallclock import WallClock, run
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.field_leases import LEASE_S, FieldLeases
+from fieldtwin.twin.prototype.file import Prototype, load_prototype
+from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype
+from fieldtwin.twin.site.system import System, load_system
+
+HELD_AT_ONCE = 5_000
+"""A field side that stood for hours holds more than a line of the control channel takes."""
+
+
+class FieldConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the process is told. `recordings` maps a device to a file, `listen` a bus to an endpoint, over the prototype
+    file; `seed` None: the prototype file's; `control` is ``HOST:PORT`` for a TCP control channel, or empty."""
+
+    system: str
+    run_dir: str
+    prototype: str = ""
+    profiles: tuple[str, ...] = ()
+    recordings: dict[str, str] = {}
+    speed: float = 0.0
+    listen: dict[str, str] = {}
+    control: str = ""
+    token: str = ""
+    seed: int | None = None
+    water: dict[str, tuple[str, str]] = {}
+    """Transmitters that are in a network's water: the Unix socket that serves it, and their names there."""
+
+
+def resolve(config: FieldConfig) -> DigitalTwinPrototype:
+    """Read system and prototype file, apply what the command line says, and put both sides together, checked."""
+    return DigitalTwinPrototype(*resolve_files(config), WallClock())
+
+
+def resolve_files(config: FieldConfig) -> tuple[System, Prototype]:
+    """The field side's part of it: without the gateway's and the PLC's, and so without the programs."""
+    system = load_system(config.system, [Path(p) for p in config.profiles])
+    prototype = load_prototype(system, Path(config.prototype) if config.prototype else None)
+    for device, path in config.recordings.items():
+        if device not in prototype.devices:
+            raise UsageError(f"no emulated device {device!r}", expected=", ".join(prototype.devices))
+        prototype = prototype.with_recording(device, Path(path))
+    if config.speed:
+        prototype = prototype.with_speed(config.speed)
+    if config.seed is not None:
+        prototype = replace(prototype, seed=config.seed)
+    for bus, url in config.listen.items():
+        if bus not in prototype.buses:
+            raise UsageError(f"no bus {bus!r}", expected=", ".join(prototype.buses))
+        prototype = prototype.with_listen(system, bus, Endpoint.parse(url))
+    return system, prototype
+
+
+class FieldProcess:
+    """One field side with its control channel, until told to stop."""
+
+    def __init__(self, config: FieldConfig) -> None:
+        self._config = config
+        self._clock = WallClock()
+        self._stop = asyncio.Event()
+        self._fresh_asked = asyncio.Event()
+        self._fresh_done: asyncio.Future[None] | None = None
+        self._lease_changed = asyncio.Event()
+        self._field: FieldSide
+        self._leases: FieldLeases
+        self.control_port = 0
+        self._life = secrets.token_hex(8)  # of these devices: made anew, they have another one, and count from nothing
+
+    async def run(self, on_ready: Callable[[FieldSide], None] | None = None) -> int:
+        """Open, call `on_ready`, serve until stopped."""
+        run_dir = Path(self._config.run_dir)
+        twin = resolve(self._config)
+        async with AsyncExitStack() as stack:
+            water = {}
+            for device, (path, name) in self._config.water.items():
+                water[device] = end = await AcousticEnd.open(Path(path), name)
+                stack.push_async_callback(end.aclose)
+            self._field = twin.field(run_dir, water=water)
+            self._leases = FieldLeases(self._field.faults)
+            return await self._run(run_dir, on_ready)
+
+    async def _run(self, run_dir: Path, on_ready: Callable[[FieldSide], None] | None) -> int:
+        await self._field.open()
+        server = ControlServer(
+            {
+                "ready": self._ready,
+                "get": self._get,
+                "held": self._held,
+                "fault": self._fault,
+                "clear": self._clear,
+                "set": self._set,
+                "lease": self._lease,
+                "fresh": self._fresh,
+                "stop": self._request_stop,
+            },
+            token=self._config.token,
+        )
+        socket = run_dir / "field.sock"
+        try:
+            await server.listen_unix(socket)
+            if self._config.control:
+                host, _, port = self._config.control.rpartition(":")
+                if not port.isdigit():
+                    raise UsageError("the control channel's address", expected="HOST:PORT", got=self._config.control)
+                self.control_port = await server.listen_tcp(host or "127.0.0.1", int(port))
+            loop = asyncio.get_running_loop()
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, self._stop.set)
+            if on_ready is not None:
+                on_ready(self._field)
+            await self._serve()
+        finally:
+            await server.aclose()
+            socket.unlink(missing_ok=True)
+            await self._field.aclose()
+        return 0
+
+    async def _serve(self) -> None:
+        async with Nursery() as nursery:
+            stopping = nursery.start(self._stop.wait(), "until stopped")
+            expiring = nursery.start(self._end_leases(), "leases")
+            while not stopping.done():
+                asked = asyncio.ensure_future(self._fresh_asked.wait())
+                running = asyncio.ensure_future(self._field.run())
+                try:
+                    await asyncio.wait([running, stopping, asked, expiring], return_when=asyncio.FIRST_COMPLETED)
+                    if running.done():
+                        running.result()
+                    if expiring.done():
+                        expiring.result()
+                finally:
+                    asked.cancel()
+                    running.cancel()
+                    await asyncio.gather(asked, running, return_exceptions=True)
+                if self._fresh_asked.is_set() and not stopping.done():
+                    self._fresh_asked.clear()
+                    await self._make_anew()
+
+    async def _end_leases(self) -> None:
+        """Take out what a judge put in as soon as its lease has expired."""
+        while True:
+            self._lease_changed.clear()
+            until_ns = self._leases.until_ns
+            if until_ns is None:
+                await self._lease_changed.wait()
+                continue
+            left_s = (until_ns - self._clock.monotonic_ns()) / NS_PER_S
+            try:
+                async with asyncio.timeout(max(0.0, left_s)):
+                    await self._lease_changed.wait()
+            except TimeoutError:
+                self._leases.expire(self._clock.monotonic_ns())
+
+    async def _make_anew(self) -> None:
+        """The devices again, from the same files, where the old ones listened. What fails ends the process."""
+        old, done = self._field, self._fresh_done
+        twin = resolve(self._config)
+        prototype = _listening_as(twin.prototype, old)
+        self._field = FieldSide(old.system, prototype, Path(self._config.run_dir), self._clock)
+        try:
+            await self._field.open()
+        except BaseException as e:
+            if done is not None and not done.done() and isinstance(e, Exception):
+                done.set_exception(e)
+            raise
+        self._leases.moved_to(self._field.faults)
+        self._life = secrets.token_hex(8)
+        if done is not None and not done.done():
+            done.set_result(None)
+
+    async def _ready(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {"ready": True, "pid": os.getpid()}
+
+    async def _get(self, args: dict[str, Any]) -> dict[str, Any]:
+        return {
+            "life": self._life,
+            **self._field.status(),
+            "set": self._field.faults.values_set(),
+            "lease": self._leases.describe(self._clock.monotonic_ns()),
+        }
+
+    async def _held(self, args: dict[str, Any]) -> dict[str, Any]:
+        """At most `HELD_AT_ONCE` entries a device, the oldest first: who wants them all asks again."""
+        since = {str(name): int(number) for name, number in (args.get("since") or {}).items()}
+        return {name: held[:HELD_AT_ONCE] for name, held in self._field.held_since(since).items()}
+
+    async def _fault(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Put in ``{"fault": {"name": ..., "device": ...}}``; its times count from ``"start_ns"`` (monotonic), if given. With
+        ``"lease"`` it is taken out when that lease ends."""
+        start_ns = args["start_ns"] if isinstance(args.get("start_ns"), int) else None
+        said = args.get("fault")
+        if not isinstance(said, dict):
+            raise UsageError("a fault", expected='{"name": ..., "device": ...}', got=repr(said)[:60])
+        if args.get("lease"):
+            id = self._leases.inject(str(args["lease"]), said, start_ns, self._clock.monotonic_ns())
+        else:
+            id = self._field.faults.inject(said, start_ns)
+        faults = self._field.faults
+        return {"id": id, "number": faults.history.count, "faults": faults.describe()}
+
+    async def _clear(self, args: dict[str, Any]) -> dict[str, Any]:
+        self._field.faults.clear(str(args.get("id", "")))
+        return {"faults": self._field.faults.describe()}
+
+    async def _set(self, args: dict[str, Any]) -> dict[str, Any]:
+        device, tag, value = str(args.get("device", "")), str(args.get("tag", "")), args.get("value")
+        if args.get("lease"):
+            self._leases.set_value(str(args["lease"]), device, tag, value, self._clock.monotonic_ns())
+        else:
+            self._field.faults.set_value(device, tag, value)
+        return {"number": self._field.faults.history.count}
+
+    async def _lease(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Open, prolong or end a judge's lease; what was in before it was opened is in the answer."""
+        id, for_s, now_ns = str(args.get("id", "")), args.get("for_s", LEASE_S), self._clock.monotonic_ns()
+        if not isinstance(for_s, int | float):
+            raise UsageError("how long a lease lasts", expected="a number of seconds", got=repr(for_s)[:60])
+        if args.get("release") is True:
+            self._leases.release(id)
+        elif args.get("renew") is True:
+            self._leases.renew(id, for_s, now_ns)
+        else:
+            self._leases.open(id, for_s, now_ns)
+        self._lease_changed.set()
+        faults = self._field.faults
+        return {
+            "life": self._life,
+            "lease": self._leases.describe(now_ns),
+            "faults": faults.describe(),
+            "set": faults.values_set(),
+        }
+
+    async def _fresh(self, args: dict[str, Any]) -> dict[str, Any]:
+        """Returns when the new devices listen. Raises `LeaseEnded` or `UsageError`, and nothing has changed."""
+        self._leases.of(str(args.get("lease", "")), self._clock.monotonic_ns())
+        if self._config.water:
+            raise UsageError("devices in a network's water cannot be made anew one system at a time")
+        if self._fresh_done is None or self._fresh_done.done():
+            self._fresh_done = asyncio.get_running_loop().create_future()
+        self._fresh_asked.set()
+        await asyncio.shield(self._fresh_done)
+        return {"life": self._life, "now_ns": self._clock.monotonic_ns()}
+
+    async def _request_stop(self, args: dict[str, Any]) -> dict[str, Any]:
+        asyncio.get_running_loop().call_later(0.05, self._stop.set)
+        return self._field.status()
+
+
+def _listening_as(prototype: Prototype, field: FieldSide) -> Prototype:
+    """`prototype` with every bus and every far modem where `field` has them: free ports were chosen once."""
+    buses = {
+        name: replace(bus, listen=field.listening[name]) if name in field.listening else bus
+        for name, bus in prototype.buses.items()
+    }
+    devices = {
+        name: replace(device, form=device.form.model_copy(update={"far": str(field.far[name])}))
+        if name in field.far
+        else device
+        for name, device in prototype.devices.items()
+    }
+    return replace(prototype, buses=buses, devices=devices)
+
+
+def main(argv: list[str]) -> int:
+    """Run the process; errors go to stderr as one line."""
+    try:
+        config = msgspec.json.decode(Path(argv[0]).read_bytes(), type=FieldConfig)
+        return run(FieldProcess(config).run())
+    except FieldtwinError as e:
+        print(e, file=sys.stderr)
+        return e.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

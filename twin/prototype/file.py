@@ -1,0 +1,268 @@
+"""The prototype file: what is emulated, with what, and where. Read by the field side and by whoever starts it; never by
+the plant, and never by gateway or PLC."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from fieldtwin.emulators.replay.can_log import SUFFIX
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, load_profile
+from fieldtwin.gateway.core.recording import shown
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.twin.prototype.simulations import check_plays, check_simulations
+from fieldtwin.twin.site.data_files import find, find_recording
+from fieldtwin.twin.site.schema import EmulatedForm, PrototypeForm
+from fieldtwin.twin.site.system import System
+
+
+@dataclass(frozen=True)
+class EmulatedBus:
+    """Where the emulators of a bus listen; None: this bus is the plant's own."""
+
+    name: str
+    listen: Endpoint | None
+    pace: bool
+
+
+@dataclass(frozen=True)
+class EmulatedDevice:
+    """What stands in for a device: its own profile, and a recording or a model."""
+
+    name: str
+    profile: DeviceProfile
+    form: EmulatedForm
+    recording: Path | None
+
+    @property
+    def plays(self) -> str:
+        """What stands in for the device, as a person reads it: what is synthetic is never shown as measured."""
+        if self.form.simulation is not None:
+            return f"the simulation {self.form.simulation}"
+        if self.recording is None:
+            return f"the model {self.form.model}"
+        return f"{self.recording.name} (log of a CAN bus)" if self.recording.suffix == SUFFIX else shown(self.recording)
+
+
+@dataclass(frozen=True)
+class Prototype:
+    """A prototype file, resolved against its system."""
+
+    path: Path
+    seed: int
+    buses: dict[str, EmulatedBus]
+    devices: dict[str, EmulatedDevice]
+    file: YamlFile
+    form: PrototypeForm
+
+    def with_listen(self, system: System, bus: str, listen: Endpoint) -> Prototype:
+        """The same, with the emulators of `bus` of `system` listening elsewhere. Raises `UsageError` where others are there."""
+        buses = {**self.buses, bus: replace(self.buses[bus], listen=listen)}
+        if (clash := _clash(system, buses)) is not None:
+            raise UsageError(clash.message, expected=clash.expected, got=f"{bus}={listen}")
+        return replace(self, buses=buses)
+
+    def with_recording(self, device: str, path: Path, speed: float | None = None) -> Prototype:
+        """The same, with `device` playing another recording."""
+        old = self.devices[device]
+        form = old.form.model_copy(
+            update={"recording": str(path), "simulation": None, "plays": {}, **({"speed": speed} if speed else {})}
+        )
+        return replace(self, devices={**self.devices, device: replace(old, form=form, recording=path)})
+
+    def with_speed(self, speed: float) -> Prototype:
+        """The same, with every recording played `speed` times as fast."""
+        devices = {
+            n: replace(d, form=d.form.model_copy(update={"speed": speed})) if d.recording else d
+            for n, d in self.devices.items()
+        }
+        return replace(self, devices=devices)
+
+
+def prototype_path(system: System) -> Path:
+    """Where a system's prototype file is by default: beside it, ``NAME.prototype.yaml``."""
+    return system.path.with_name(f"{system.path.stem}.prototype.yaml")
+
+
+def load_prototype(system: System, path: Path | None = None) -> Prototype:
+    """Read the prototype file of `system`. Raises `FileInvalid` or `UsageError`."""
+    if path is None and not prototype_path(system).exists():
+        raise FileInvalid(
+            f"there is no prototype file of {system.path.name}",
+            path=str(prototype_path(system)),
+            expected="what is emulated, with what and where",
+            hint="copy one of profiles/systems/, or name one with --prototype-file",
+        )
+    path = path or prototype_path(system)
+    file = load(path)
+    form = validate(file, PrototypeForm)
+    if Path(form.prototype_of).name != system.path.name:
+        raise file.error(
+            ("prototype_of",),
+            "`prototype_of` names a different system file",
+            expected=system.path.name,
+            got=form.prototype_of,
+        )
+    for name in form.buses:
+        if name not in system.buses:
+            raise file.error(("buses", name), f"the system has no bus {name!r}", expected=", ".join(system.buses))
+    for name in form.devices:
+        if name not in system.devices:
+            raise file.error(
+                ("devices", name), f"the system has no device {name!r}", expected=", ".join(system.devices)
+            )
+    check_simulations(file, form, system)
+    buses = {name: _bus(file, system, form, name) for name in system.buses}
+    _check_wires(file, system, buses)
+    devices = {
+        name: _device(file, system, name, form)
+        for name in system.devices
+        if name in form.devices and buses[system.devices[name].bus].listen is not None
+    }
+    missing = [n for n, d in system.devices.items() if buses[d.bus].listen is not None and n not in devices]
+    if missing:
+        raise file.error(("devices",), f"nothing stands in for {', '.join(missing)}", expected="an entry each")
+    return Prototype(path, form.seed, buses, devices, file, form)
+
+
+def _bus(file: YamlFile, system: System, form: PrototypeForm, name: str) -> EmulatedBus:
+    entry = form.buses.get(name)
+    if entry is None:
+        raise file.error(
+            ("buses",), f"the bus {name!r} is not mapped", expected=f"`{name}: {{listen: ...}}`, or `{name}: plant`"
+        )
+    if entry == "plant":
+        return EmulatedBus(name, None, False)
+    assert not isinstance(entry, str)
+    try:
+        listen = Endpoint.parse(entry.listen)
+    except UsageError as e:
+        raise file.error(("buses", name, "listen"), e.message, expected=e.expected, got=e.got) from e
+    plant = system.buses[name].endpoint
+    kinds = ("can",) if plant.is_can else ("pty", "tcp") if plant.is_serial else (plant.scheme,)
+    if listen.scheme not in kinds:
+        raise file.error(
+            ("buses", name, "listen"),
+            f"nothing that stands in for {plant}",
+            expected=" or ".join(kinds),
+            got=listen.scheme,
+        )
+    return EmulatedBus(name, listen, entry.pace)
+
+
+def _anywhere(listen: Endpoint) -> bool:
+    """Whether it is on a port that is free then, which nobody else has."""
+    if listen.is_can:
+        return listen.path.endswith(":0")
+    return listen.scheme != "pty" and listen.port == 0
+
+
+class _Clash(NamedTuple):
+    """Two buses of one wire that cannot be there at once: the second and the first, and the nodes that have one id, if any."""
+
+    buses: tuple[str, str]
+    nodes: tuple[str, str] | None
+    message: str
+    expected: str
+
+
+def _clash(system: System, buses: Mapping[str, EmulatedBus]) -> _Clash | None:
+    """Several CAN buses may be one wire here, and then all nodes of it have ids of their own: two with one id are a fault, and
+    to be put in as one (`duplicate-node`). A port or a socket is of one bus."""
+    wires: dict[Endpoint, str] = {}
+    nodes: dict[tuple[Endpoint, int], str] = {}
+    for name, bus in buses.items():
+        if bus.listen is None or _anywhere(bus.listen):
+            continue  # the plant's, or on a port of its own
+        wire = replace(bus.listen, params=())
+        other = wires.setdefault(wire, name)
+        if other != name and not wire.is_can:
+            said = f"{name!r} listens at {wire}, and so does {other!r}"
+            return _Clash((name, other), None, said, "a place of its own for each bus")
+        for device in system.devices_on(name) if wire.is_can else ():
+            first = nodes.setdefault((wire, device.address), device.name)
+            if first != device.name:
+                other = system.devices[first].bus
+                said = f"{device.name!r} of {name!r} has node id {device.address} at {wire}, and so has {first!r} of {other!r}"
+                return _Clash(
+                    (name, other), (device.name, first), said, "a wire of its own for each bus, or other node ids"
+                )
+    return None
+
+
+def _check_wires(file: YamlFile, system: System, buses: Mapping[str, EmulatedBus]) -> None:
+    clash = _clash(system, buses)
+    if clash is None:
+        return
+    hint = f"{clash.buses[1]!r} is in line {file.line(('buses', clash.buses[1]))}"
+    if clash.nodes is not None:
+        lines = [f"{node!r} in line {system.file.line(('devices', node))}" for node in clash.nodes]
+        hint += f"; of {system.path.name}: {' and '.join(lines)}. Two nodes with one id on purpose: the fault duplicate-node"
+    raise file.error(("buses", clash.buses[0], "listen"), clash.message, expected=clash.expected, hint=hint)
+
+
+def _device(file: YamlFile, system: System, name: str, whole: PrototypeForm) -> EmulatedDevice:
+    config, form = system.devices[name], whole.devices[name]
+    loc = ("devices", name)
+    profile = config.profile
+    if form.profile is not None:
+        try:
+            profile = load_profile(find("devices", form.profile, beside=file_path(file)))
+        except UsageError as e:
+            raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
+    if [form.recording, form.model, form.simulation].count(None) != 2:
+        raise file.error(
+            loc,
+            f"what stands in for {name!r}",
+            expected="one of `recording: FILE`, `simulation: NAME` and `model: NAME`",
+        )
+    check_plays(file, whole, name, profile)
+    if form.model == "mailbox" and (profile.inbox is None or form.far is None):
+        raise file.error(
+            loc, f"the mailbox model for {name!r}", expected="a profile with a mailbox, and `far: ENDPOINT`"
+        )
+    if form.model == "profile" and (profile.sampled is not None or profile.inbox is not None):
+        expected = "`recording: FILE`, of its signals" if profile.sampled is not None else "`model: mailbox`"
+        raise file.error((*loc, "model"), f"{name!r} does more than its registers say", expected=expected)
+    _check_stated(file, loc, form, profile)
+    recording = None
+    if form.recording is not None:
+        try:
+            recording = find_recording(form.recording, beside=file_path(file))
+        except UsageError as e:
+            raise file.error((*loc, "recording"), e.message, expected=e.expected) from e
+        if recording.suffix == SUFFIX and profile.protocol != "canopen":
+            raise file.error(
+                (*loc, "recording"), "a log of a CAN bus", expected="a recording (JSON Lines)", got=recording.name
+            )
+    for tag in form.identity:
+        if tag not in profile.tags:
+            raise FileInvalid(f"{profile.name} has no tag {tag!r}", path=file.path, expected=", ".join(profile.tags))
+    return EmulatedDevice(name, profile, form, recording)
+
+
+def _check_stated(file: YamlFile, loc: tuple[Key, ...], form: EmulatedForm, profile: DeviceProfile) -> None:
+    """What is said of being busy is said of a Modbus device, and what of registers, of one without a recording; what is said of
+    a data sheet, of a CANopen device."""
+    for key, said in (("cia", form.cia is not None), ("parameter_values", not form.parameter_values)):
+        if said and profile.protocol != "canopen":
+            raise file.error((*loc, key), f"`{key}` is about a data sheet (EDS)", expected="a CANopen device")
+    if form.busy is not None and profile.protocol != "modbus":
+        raise file.error((*loc, "busy"), "nothing of this protocol", expected="a Modbus device")
+    if form.values and ((form.model != "profile" and form.simulation is None) or profile.protocol != "modbus"):
+        expected = "`model: profile` or a simulation, of a Modbus device"
+        raise file.error((*loc, "values"), "values of registers", expected=expected)
+    for tag in form.values:
+        if tag not in profile.tags:
+            raise file.error(
+                (*loc, "values", tag), f"{profile.name} has no tag {tag!r}", expected=", ".join(profile.tags)
+            )
+
+
+def file_path(file: YamlFile) -> Path:
+    """The path that a parsed file came from."""
+    return Path(file.path)

@@ -1,0 +1,50 @@
+"""The digital twin prototype: the physical twin's own software and configuration, with every device emulated.
+
+Here the two sides of the wire are put together and nowhere else: which emulator answers which driver is checked, and the field
+side is made. What runs left of the wire is `fieldtwin.twin.plant.physical`, unchanged and unaware.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from fieldtwin.emulators.emulator import EmulatedCommunication
+from fieldtwin.emulators.endpoints.ports import Ports
+from fieldtwin.emulators.models.packet_link import ModemEnd
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.twin.model.model import DigitalModel
+from fieldtwin.twin.plant.declared import declared_variables
+from fieldtwin.twin.plant.physical import EmbeddedControlSystem
+from fieldtwin.twin.prototype.field import FieldSide
+from fieldtwin.twin.prototype.file import Prototype
+from fieldtwin.twin.site.system import System
+
+
+class DigitalTwinPrototype:
+    """SPEC row DigitalTwinPrototype. Raises `CommandListMismatch` where an emulator and its driver differ (ruling 12).
+
+    `ecs` is the physical twin's class, made from the same system file; `model` is an instance of its own. `real` names the
+    devices that are not emulated, on buses that the prototype file calls `plant`; a whole prototype has none.
+    """
+
+    def __init__(self, system: System, prototype: Prototype, clock: Clock) -> None:
+        self.ecs = EmbeddedControlSystem(system)
+        self.model = DigitalModel(declared_variables(system))
+        self.prototype = prototype
+        self.real = tuple(name for name in system.devices if name not in prototype.devices)
+        self._clock = clock
+        driver_commands = self.ecs.command_lists(clock)
+        self.communications = {
+            name: EmulatedCommunication(name, driver_commands[name], emulated.profile.command_list)
+            for name, emulated in prototype.devices.items()
+        }
+        for communication in self.communications.values():
+            communication.check()
+
+    def field(
+        self, run_dir: Path, ports: Ports | None = None, water: Mapping[str, ModemEnd] | None = None
+    ) -> FieldSide:
+        """The emulators on their wires, not opened yet: those of the operating system unless other `ports` are given.
+        Virtual serial ports get their links in `run_dir`. `water`: the ends of transmitters that are in a network's."""
+        return FieldSide(self.ecs.system, self.prototype, run_dir, self._clock, ports, water)

@@ -1,0 +1,156 @@
+"""The simulations of a prototype: made of its file, played by its devices, fed with what these are written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from random import Random
+
+from fieldtwin.emulators.journal import HeldJournal
+from fieldtwin.emulators.simulation.formula import STEP, TIME, Formula
+from fieldtwin.emulators.simulation.inputs import number_of
+from fieldtwin.emulators.simulation.python_model import PythonModel
+from fieldtwin.emulators.simulation.signals import SimulatedSignals
+from fieldtwin.emulators.simulation.simulation import Simulation, by_formulas, by_model
+from fieldtwin.gateway.core.clock import NS_PER_MS
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag
+from fieldtwin.gateway.core.yaml_file import YamlFile
+from fieldtwin.twin.site.schema import EmulatedForm, PrototypeForm, SimulationForm
+from fieldtwin.twin.site.system import System
+
+
+def check_simulations(file: YamlFile, form: PrototypeForm, system: System) -> None:
+    """What can be known of a prototype's simulations before they run; no Python of the file is run. Raises `FileInvalid`."""
+    for name, simulation in form.simulations.items():
+        loc = ("simulations", name)
+        if (simulation.python is None) == (not simulation.formulas):
+            raise file.error(loc, f"what computes {name!r}", expected="either `formulas:` or `python: FILE.py:CLASS`")
+        if simulation.python is not None and not _python(file, simulation.python)[0].is_file():
+            raise file.error((*loc, "python"), "no such file", expected="FILE.py:CLASS", got=simulation.python)
+        for key, known in simulation.inputs.items():
+            _check_input(file, form, system, (*loc, "inputs", key), known)
+        _check_formulas(file, simulation, name)
+    for name, device in form.devices.items():
+        if device.simulation is not None and device.simulation not in form.simulations:
+            raise file.error(
+                ("devices", name, "simulation"),
+                f"no simulation {device.simulation!r}",
+                expected=", ".join(form.simulations) or "one under `simulations:`",
+            )
+
+
+def check_plays(file: YamlFile, form: PrototypeForm, name: str, profile: DeviceProfile) -> None:
+    """That what a device plays of a simulation are tags of its own, and names of the simulation where those are known."""
+    device = form.devices[name]
+    if device.plays and device.simulation is None:
+        raise file.error(("devices", name, "plays"), "nothing to play", expected="`simulation: NAME` beside it")
+    for tag, value in device.plays.items():
+        if tag not in profile.tags or profile.tags[tag].is_text:
+            expected = ", ".join(t.name for t in profile.tags.values() if not t.is_text)
+            raise file.error(
+                ("devices", name, "plays", tag), f"{profile.name} has no number {tag!r}", expected=expected
+            )
+        formulas = form.simulations[device.simulation or ""].formulas
+        if formulas and value not in formulas:
+            raise file.error(
+                ("devices", name, "plays", tag), f"nothing computes {value!r}", expected=", ".join(formulas)
+            )
+
+
+def _check_formulas(file: YamlFile, simulation: SimulationForm, name: str) -> None:
+    known = (*simulation.formulas, *simulation.inputs)
+    for key, text in simulation.formulas.items():
+        if key in (TIME, STEP) or key in simulation.inputs:
+            loc = ("simulations", name, "formulas", key)
+            raise file.error(loc, f"{key!r} means something already", expected="a name that is not taken")
+        try:
+            Formula(text, known, Random(0))
+        except UsageError as e:
+            loc = ("simulations", name, "formulas", key)
+            raise file.error(loc, e.message, expected=e.expected, got=e.got, hint=e.hint) from e
+    for key in simulation.start:
+        if simulation.formulas and key not in simulation.formulas:
+            raise file.error(
+                ("simulations", name, "start", key),
+                f"nothing computes {key!r}",
+                expected=", ".join(simulation.formulas),
+            )
+
+
+def _check_input(file: YamlFile, form: PrototypeForm, system: System, loc: tuple[str, ...], text: str) -> None:
+    device, _, tag = text.partition(".")
+    if device not in form.devices or device not in system.devices:
+        raise file.error(loc, f"no emulated device {device!r}", expected=", ".join(form.devices))
+    tags = system.devices[device].profile.tags
+    if tag not in tags or tags[tag].is_text:
+        numbers = ", ".join(t.name for t in tags.values() if not t.is_text)
+        raise file.error(loc, f"{device} has no number {tag!r}", expected=numbers)
+
+
+def _python(file: YamlFile, text: str) -> tuple[Path, str]:
+    """The file and the class of ``FILE.py:CLASS``, beside the prototype file."""
+    path, _, name = text.rpartition(":")
+    return Path(file.path).parent / path, name
+
+
+class Simulations:
+    """Those of one prototype. All begin at `start_ns`. Raises `FileInvalid` for a Python model that fails."""
+
+    def __init__(self, file: YamlFile, form: PrototypeForm, system: System, start_ns: int) -> None:
+        self._file, self._form, self._system = file, form, system
+        self._made = {name: self._make(name, simulation, start_ns) for name, simulation in form.simulations.items()}
+
+    def _make(self, name: str, form: SimulationForm, start_ns: int) -> Simulation:
+        inputs = tuple(form.inputs)
+        if form.python is None:
+            step, start = by_formulas(form.formulas, form.start, inputs, f"{self._form.seed}:{name}")
+        else:
+            step, start = by_model(PythonModel(*_python(self._file, form.python), form.start), inputs)
+        return Simulation(step, start, inputs, start_ns, round(form.step_ms * NS_PER_MS))
+
+    def signals_of(self, device: str, form: EmulatedForm, profile: DeviceProfile) -> SimulatedSignals:
+        """What `device` plays: what its entry says, else every value of the simulation that has the name of one of its tags."""
+        assert form.simulation is not None
+        simulation = self._made[form.simulation]
+        plays = form.plays or {n: n for n in simulation.names if n in profile.tags and not profile.tags[n].is_text}
+        for tag, name in plays.items():
+            if name not in simulation.names:
+                raise self._file.error(
+                    ("devices", device, "plays", tag),
+                    f"nothing computes {name!r}",
+                    expected=", ".join(simulation.names),
+                )
+        if not plays:
+            raise self._file.error(
+                ("devices", device, "simulation"),
+                f"{form.simulation!r} computes nothing that {device} has",
+                expected="`plays: {TAG: NAME}`",
+                got=", ".join(simulation.names),
+            )
+        return SimulatedSignals(simulation, plays, self._file.path)
+
+    def connect(self, journals: Mapping[str, HeldJournal]) -> None:
+        """From now on what devices are written comes in."""
+        watchers: dict[tuple[str, str], list[Callable[[float, int], None]]] = {}
+        for name, form in self._form.simulations.items():
+            for input_name, text in form.inputs.items():
+                device, _, tag = text.partition(".")
+                watchers.setdefault((device, tag), []).append(_putter(self._made[name], input_name))
+        for (device, tag_name), putters in watchers.items():
+            if device in journals:
+                held = self._system.devices[device].profile.tags[tag_name]
+                journals[device].watch(tag_name, _to_all(held, putters))
+
+
+def _putter(simulation: Simulation, name: str) -> Callable[[float, int], None]:
+    return lambda value, now_ns: simulation.put(name, value, now_ns)
+
+
+def _to_all(tag: Tag, putters: list[Callable[[float, int], None]]) -> Callable[[bytes, int], None]:
+    def changed(raw: bytes, now_ns: int) -> None:
+        value = number_of(tag, raw)
+        for put in putters:
+            put(value, now_ns)
+
+    return changed

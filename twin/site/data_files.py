@@ -1,0 +1,102 @@
+"""Where shipped data lies: the wheel's copy, then the checkout (DESIGN.md decision 14).
+
+The user's search order for profiles and systems: what a flag says, FIELDTWIN_PROFILES, ./profiles, shipped. Before all of that,
+a file in a template finds what the template brings: it is complete, and means its own files.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+from fieldtwin.gateway.core.errors import FileInvalid, UsageError
+from fieldtwin.gateway.core.input_file import read_input
+
+MAX_BYTES = 8 * 1024 * 1024
+_HERE = Path(__file__).absolute().parents[3].resolve()  # not resolved at once: in a checkout fieldtwin/twin is a link
+"""site-packages where a wheel is installed, the checkout otherwise."""
+
+
+def data_root(base: Path = _HERE) -> Path:
+    """The folder that holds `profiles` and `recordings`."""
+    for candidate in (base / "fieldtwin" / "_data", base):
+        if (candidate / "profiles").is_dir() and (candidate / "recordings").is_dir():
+            return candidate
+    raise UsageError("the shipped profiles are missing", where=str(base), hint="reinstall fieldtwin")
+
+
+TEMPLATE = "template.json"
+"""The manifest at the top of a template's folder (`fieldtwin.twin.template.template`)."""
+
+
+def template_of(file: Path | None) -> list[Path]:
+    """The folder of the template that `file` is in, as a list of one; empty when it is in none."""
+    above = list(file.parents)[1:2] if file is not None else []
+    return [folder for folder in above if (folder / TEMPLATE).is_file()]
+
+
+def search_path(extra: Iterable[Path] = ()) -> list[Path]:
+    """Folders that may hold `devices`, `systems` and `recordings`, best first."""
+    folders = [Path(p) for p in extra]
+    folders += [Path(p) for p in os.environ.get("FIELDTWIN_PROFILES", "").split(os.pathsep) if p]
+    folders += [Path("profiles"), data_root() / "profiles"]
+    return [f for f in folders if f.is_dir()]
+
+
+def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path] = ()) -> Path:
+    """The file that `name` means: a path, or a bare name in the search path (`kind` is ``systems`` or ``devices``).
+
+    `beside` is the file that names it: a relative path is tried there first. Raises `UsageError` listing what there is.
+    """
+    direct = Path(name)
+    places = [beside.parent / direct] if beside else []
+    if direct.name == name:
+        places += [folder / kind / file for folder in template_of(beside) for file in (f"{name}.yaml", name)]
+    for candidate in (*places, direct):
+        if candidate.is_file():
+            return candidate
+    folders = search_path(extra)
+    if direct.name == name:
+        for folder in folders:
+            for sub in (folder / kind, folder):
+                for candidate in (sub / f"{name}.yaml", sub / name):
+                    if candidate.is_file():
+                        return candidate
+    known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if "." not in p.stem})
+    if direct.name != name or direct.suffix in (".yaml", ".yml"):
+        raise UsageError(f"there is no file {name!r}", expected=f"a {kind[:-1]}'s file, or one of " + ", ".join(known))
+    files = [f.name for f in (Path(f"{name}.yaml"), Path(f"{name}.yml")) if f.is_file()]
+    near = files or difflib.get_close_matches(direct.name, known, n=1)
+    raise UsageError(
+        f"no {kind[:-1]} {name!r}",
+        expected="a file, or one of " + ", ".join(known),
+        hint=f"did you mean {near[0]!r}?" if near else "",
+    )
+
+
+def network_file(name: str, profiles: Iterable[Path] = ()) -> Path | None:
+    """The file that `name` means, if that is a network's; None for anything else, also for what is not there."""
+    try:
+        path = find("systems", name, extra=profiles)
+    except UsageError:
+        return None
+    if path.suffix not in (".yaml", ".yml"):
+        return None
+    try:
+        lines = read_input(path, MAX_BYTES).decode("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError, FileInvalid):
+        return None
+    return path if any(line.startswith("network:") for line in lines) else None
+
+
+def find_recording(name: str, beside: Path | None = None) -> Path:
+    """A recording by path, beside the file that names it, in ./recordings or shipped."""
+    folders = [beside.parent] if beside else []
+    folders += [folder / "recordings" for folder in template_of(beside)]
+    folders += [Path(), Path("recordings"), data_root() / "recordings"]
+    for folder in folders:
+        if (folder / name).is_file():
+            return folder / name
+    raise UsageError(f"no recording {name!r}", expected="a file; looked in " + ", ".join(str(f) for f in folders))

@@ -1,0 +1,303 @@
+"""The system: what a system file says, resolved and checked as a whole. The plant and its prototype both start from it.
+
+Everything that can be found wrong without a wire is found here, with file, line and column: unknown buses and profiles, two
+devices on one address, tags that no profile has, programs bound to nothing. Nothing here knows what is emulated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.gateway.core.errors import UsageError
+from fieldtwin.gateway.core.nearest import did_you_mean
+from fieldtwin.gateway.core.profile import DeviceProfile, Tag, load_profile
+from fieldtwin.gateway.core.yaml_file import Key, YamlFile, load, validate
+from fieldtwin.gateway.devices.config import BusConfig, DeviceConfig, Heartbeat, Tpdo
+from fieldtwin.twin.site.canopen_keys import canopen_bus, canopen_node, check_rpdo1
+from fieldtwin.twin.site.data_files import find
+from fieldtwin.twin.site.modbus_keys import connect_pauses, device_pace, modbus_bus
+from fieldtwin.twin.site.read_back_warnings import never_read_back
+from fieldtwin.twin.site.schema import BusForm, CommandsForm, DeviceForm, InvariantsForm, PlcForm, SystemForm
+from fieldtwin.twin.site.serving import Serving, resolve_serving
+from fieldtwin.twin.site.start_warnings import waits_for_its_command
+
+SCHEMES = ("rtu", "ascii", "tcp", "rtu+tcp", "udp", "tls", "can")
+"""What the gateway can talk over so far."""
+
+
+@dataclass(frozen=True)
+class System:
+    """A system, resolved. Dictionaries keep the file's order. `hash` tells one version of the file from another. `warnings` are
+    for the file's author, each with its place in the file."""
+
+    name: str
+    path: Path
+    hash: str
+    buses: dict[str, BusConfig]
+    devices: dict[str, DeviceConfig]
+    plc: PlcForm
+    remote: str
+    file: YamlFile
+    serving: Serving = field(default_factory=Serving)
+    commands: CommandsForm = field(default_factory=CommandsForm)
+    warnings: tuple[str, ...] = ()
+    invariants: InvariantsForm = field(default_factory=InvariantsForm)
+
+    def devices_on(self, bus: str) -> list[DeviceConfig]:
+        """The devices of a bus, in the file's order."""
+        return [d for d in self.devices.values() if d.bus == bus]
+
+
+def load_system(name: str, profiles: Iterable[Path] = ()) -> System:
+    """Read a system by path or bare name. Raises `FileInvalid` or `UsageError`."""
+    path = find("systems", name, extra=profiles)
+    file = load(path)
+    if "network" in file.data and "system" not in file.data:
+        systems = file.data.get("systems")
+        named = ", ".join(map(str, systems)) if isinstance(systems, dict) else ""
+        hint = "run --prototype and test take networks" + (f"; its systems are {named}" if named else "")
+        raise file.error(("network",), "a network, not a system", expected="a system file", hint=hint)
+    form = validate(file, SystemForm)
+    buses = {n: _bus(file, n, b) for n, b in form.buses.items()}
+    known: dict[Path, DeviceProfile] = {}  # a profile that a hundred devices have is read once
+    devices = {n: _device(file, n, d, buses, path, profiles, known) for n, d in form.devices.items()}
+    buses = connect_pauses(buses, form, devices)
+    _check_addresses(file, buses, devices)
+    system = System(
+        name=form.system,
+        path=path,
+        hash=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        buses=buses,
+        devices=devices,
+        plc=form.plc,
+        remote=form.remote,
+        file=file,
+        commands=form.commands,
+        invariants=form.invariants,
+        warnings=never_read_back(file, devices) + waits_for_its_command(file, form.plc, devices),
+        serving=resolve_serving(file, form.serve, form.bridge, buses, devices, _outputs(form.plc)),
+    )
+    _check_programs(system)
+    _check_write_groups(system)
+    return system
+
+
+def _outputs(plc: PlcForm) -> list[str]:
+    return [tag for program in plc.programs.values() for tag in program.outputs.values()]
+
+
+def _bus(file: YamlFile, name: str, form: BusForm) -> BusConfig:
+    try:
+        endpoint = Endpoint.parse(form.url)
+        if endpoint.scheme == "pty":
+            raise UsageError("a pty is made by an emulator", expected="the plant's endpoint, such as rtu:/dev/ttyS0")
+        if endpoint.scheme not in SCHEMES:
+            raise UsageError(f"this version does not speak {endpoint.scheme}", expected=", ".join(SCHEMES))
+    except UsageError as e:
+        raise file.error(("buses", name, "url"), e.message, expected=e.expected, got=e.got) from e
+    canopen = canopen_bus(file, name, form, is_can=endpoint.is_can)
+    return replace(modbus_bus(file, name, form, endpoint), canopen=canopen)
+
+
+def _device(
+    file: YamlFile,
+    name: str,
+    d: DeviceForm,
+    buses: dict[str, BusConfig],
+    path: Path,
+    profiles: Iterable[Path],
+    known: dict[Path, DeviceProfile],
+) -> DeviceConfig:
+    loc: tuple[Key, ...] = ("devices", name)
+    if d.bus not in buses:
+        raise file.error(
+            (*loc, "bus"), f"no bus {d.bus!r}", expected="one of " + ", ".join(buses), hint=did_you_mean(d.bus, buses)
+        )
+    try:
+        found = find("devices", d.profile, beside=path, extra=profiles)
+        profile = known[found] if found in known else known.setdefault(found, load_profile(found))
+    except UsageError as e:
+        raise file.error((*loc, "profile"), e.message, expected=e.expected) from e
+    is_can = buses[d.bus].endpoint.is_can
+    if is_can != (profile.protocol == "canopen"):
+        raise file.error((*loc, "bus"), f"a {profile.protocol} device on {buses[d.bus].endpoint}")
+    if profile.inbox is not None and buses[d.bus].endpoint.is_serial:
+        raise file.error((*loc, "bus"), f"a transmitter on {buses[d.bus].endpoint}", expected="a bus on TCP")
+    address, wanted = (d.node, "node") if is_can else (d.unit, "unit")
+    if address is None:
+        raise file.error(loc, f"the key {wanted!r} is missing", expected=f"the device's {wanted} id")
+    config = DeviceConfig(
+        name=name,
+        profile=profile,
+        bus=d.bus,
+        address=address,
+        poll={group: p.every_ms for group, p in d.poll.items()},
+        expect=dict(d.expect),
+        stale_after_ms=d.stale_after_ms,
+        writable=frozenset(d.writable),
+        safe=_safe_outputs(file, loc, d, profile),
+        write_groups={group: tuple(tags) for group, tags in d.write_groups.items()},
+        heartbeat=Heartbeat(d.heartbeat.producer_ms, d.heartbeat.consumer_ms) if d.heartbeat else None,
+        tpdo1=Tpdo(tuple(d.tpdo1.map), d.tpdo1.event_ms) if d.tpdo1 else None,
+        start=d.start,
+        canopen=canopen_node(file, loc, d, path, profiles, is_can=is_can),
+    )
+    _check_device(file, loc, d, config)
+    check_rpdo1(file, loc, d, profile, bool(buses[d.bus].canopen.sync_ms))
+    return device_pace(file, loc, d, config)
+
+
+def _check_device(file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, config: DeviceConfig) -> None:
+    """Every tag and poll group that the device's entry names must be in its profile, and fit its use."""
+    profile = config.profile
+    groups = [*profile.groups, *(["inbox"] if profile.inbox else [])]
+    for group in d.poll:
+        if group not in groups:
+            raise file.error(
+                (*loc, "poll", group),
+                f"no poll group {group!r}",
+                expected=", ".join(groups),
+                hint=did_you_mean(group, groups),
+            )
+    for tag in d.expect:
+        _known(file, (*loc, "expect", tag), profile, tag)
+    for i, tag in enumerate(d.tpdo1.map if d.tpdo1 else []):
+        _known(file, (*loc, "tpdo1", "map", i), profile, tag)
+
+
+def _safe_outputs(
+    file: YamlFile, loc: tuple[Key, ...], d: DeviceForm, profile: DeviceProfile
+) -> dict[str, int | float]:
+    """Check `writable` and `safe`. Return the safe value of each tag as a number; the file may give the name of a value."""
+    mailbox = {"outbox", "inbox_ack"} if profile.inbox else set()
+    for i, tag in enumerate(d.writable):
+        if tag not in mailbox:
+            _writable(file, (*loc, "writable", i), profile, tag)
+    numbers: dict[str, int | float] = {}
+    for tag, given in d.safe.items():
+        spot = (*loc, "safe", tag)
+        described = _writable(file, spot, profile, tag)
+        if tag not in d.writable:
+            raise file.error(spot, f"{tag!r} has a safe value and is not in `writable`")
+        value = described.number_of(given)
+        names = [name for _, name in described.values]
+        if isinstance(value, str) or (isinstance(given, bool) and not described.is_bit):
+            raise file.error(
+                spot,
+                f"the safe value of {tag!r}",
+                expected=" or ".join(["true or false" if described.is_bit else "a number", *names]),
+                got=str(given).lower() if isinstance(given, bool) else repr(given),
+                hint=did_you_mean(value, names) if isinstance(value, str) else "",
+            )
+        limits = described.limits
+        if limits and not limits[0] <= value <= limits[1]:
+            raise file.error(
+                spot, f"the safe value of {tag!r}", expected=f"{limits[0]:g} to {limits[1]:g}", got=f"{given}"
+            )
+        numbers[tag] = int(value) if isinstance(value, bool) else value
+    return numbers
+
+
+def _known(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, tag: str) -> Tag:
+    if tag not in profile.tags:
+        raise file.error(
+            loc,
+            f"{profile.name} has no tag {tag!r}",
+            expected=", ".join(profile.tags),
+            hint=did_you_mean(tag, profile.tags),
+        )
+    return profile.tags[tag]
+
+
+def _writable(file: YamlFile, loc: tuple[Key, ...], profile: DeviceProfile, name: str) -> Tag:
+    tag = _known(file, loc, profile, name)
+    if not tag.writable:
+        raise file.error(loc, f"the tag {name!r} of {profile.name} is read-only")
+    return tag
+
+
+def _check_addresses(file: YamlFile, buses: dict[str, BusConfig], devices: dict[str, DeviceConfig]) -> None:
+    """Each device of a wire has an address of its own. Two buses on one CAN interface are one wire."""
+    taken: dict[tuple[str, int], str] = {}
+    for name, device in devices.items():
+        endpoint = buses[device.bus].endpoint
+        key = (str(replace(endpoint, params=())) if endpoint.is_can else device.bus, device.address)
+        if key in taken:
+            what, other = "node" if device.profile.protocol == "canopen" else "unit", taken[key]
+            where = "" if devices[other].bus == device.bus else f" on {devices[other].bus!r}"
+            raise file.error(
+                ("devices", name, what),
+                f"{name!r} has {what} {device.address} on {device.bus!r}, and so has {other!r}{where}",
+                expected=f"a {what} id of its own",
+                hint=f"{other!r} is in line {file.line(('devices', other, what))}",
+            )
+        taken[key] = name
+
+
+def _check_programs(system: System) -> None:
+    """Inputs and outputs of programs are tags or messages of devices, and an output is written by one program only."""
+    written: dict[str, str] = {}
+    for name, program in system.plc.programs.items():
+        loc: tuple[Key, ...] = ("plc", "programs", name)
+        for variable, form in program.inputs.items():
+            if form.tag.partition(".")[0] in system.plc.programs:
+                continue  # another program's variable: checked where the programs are put together
+            device, local = _split(system, (*loc, "inputs", variable, "tag"), form.tag)
+            names = [t.name for t in device.profile.tags.values() if t.readable and not t.is_text]
+            names += [*device.profile.messages, *(["inbox"] if device.profile.inbox else [])]
+            _in(system.file, (*loc, "inputs", variable, "tag"), device, local, names)
+        for variable, tag in program.outputs.items():
+            spot = (*loc, "outputs", variable)
+            device, local = _split(system, spot, tag)
+            names = [t.name for t in device.profile.tags.values() if t.writable]
+            names += ["outbox"] if device.profile.outbox else []
+            _in(system.file, spot, device, local, names)
+            if local not in device.writable:
+                raise system.file.error(spot, f"{tag!r} is not in `writable` of {device.name!r}")
+            if tag in written:
+                raise system.file.error(spot, f"{tag!r} is written by {written[tag]!r} already")
+            written[tag] = name
+
+
+def _check_write_groups(system: System) -> None:
+    """Members are outputs of programs, and in one group only: nothing else may write a member alone."""
+    written = set(_outputs(system.plc))
+    for name, device in system.devices.items():
+        seen: dict[str, str] = {}
+        for group, tags in device.write_groups.items():
+            for n, tag in enumerate(tags):
+                at = ("devices", name, "write_groups", group, n)
+                if f"{name}.{tag}" not in written or device.profile.inbox is not None:
+                    outputs = [t.partition(".")[2] for t in sorted(written) if t.partition(".")[0] == name]
+                    raise system.file.error(
+                        at,
+                        f"{tag!r} is no output of a program, so it cannot be in a group",
+                        expected=", ".join(outputs) or "outputs of programs; this device has none",
+                        hint=did_you_mean(tag, outputs),
+                    )
+                if tag in seen:
+                    raise system.file.error(at, f"{tag!r} is in the group {seen[tag]!r} already")
+                seen[tag] = group
+
+
+def _split(system: System, loc: tuple[Key, ...], tag: str) -> tuple[DeviceConfig, str]:
+    device, _, local = tag.partition(".")
+    if device not in system.devices:
+        raise system.file.error(
+            loc, f"no device {device!r}", expected=", ".join(system.devices), hint=did_you_mean(device, system.devices)
+        )
+    return system.devices[device], local
+
+
+def _in(file: YamlFile, loc: tuple[Key, ...], device: DeviceConfig, local: str, names: list[str]) -> None:
+    if local not in names:
+        raise file.error(
+            loc,
+            f"{device.name!r} has no {local!r} for this use",
+            expected=", ".join(names) or "none",
+            hint=did_you_mean(local, names),
+        )

@@ -1,0 +1,1 @@
+"""The digital template: a system, and all that it needs, as one file."""

@@ -1,0 +1,126 @@
+"""Whether a template is what it should be: complete, of one piece, and able to run by itself. And how two of them differ.
+
+Looks at a folder whose hashes were verified. It reads system file, profiles and prototype; it imports control logic only where
+it was told that it may.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from fieldtwin.gateway.core.clock import Clock
+from fieldtwin.gateway.core.errors import FileInvalid
+from fieldtwin.twin.site.system import System, load_system
+from fieldtwin.twin.template.pack import MODEL, collect
+from fieldtwin.twin.template.package import Content, Package
+from fieldtwin.twin.template.software import wheel_hash
+from fieldtwin.twin.template.template import DigitalTemplate, Manifest, Software, describe_model
+
+TEXT = (".yaml", ".yml", ".st", ".xml", ".py", ".eds", ".dcf", ".json", ".md", ".txt", ".csv")
+MAX_SHOWN_BYTES = 256 * 1024
+
+
+def examine(folder: Path, manifest: Manifest, *, plant: bool = False, shown: Path | None = None) -> System:
+    """Load the template's system and see that nothing it names is missing from the template. Runs no control logic.
+
+    With `plant` the prototype's file and what it names are not looked at: they take emulators, which a plant need not have.
+    `shown` is the template as its user knows it, where that is not `folder`. Raises `FileInvalid` for the first thing wrong.
+    """
+    where = str(shown or folder)
+    system = load_system(str(folder / manifest.system_file))
+    if system.name != manifest.system:
+        raise FileInvalid(
+            "the manifest and the system file differ", path=where, expected=manifest.system, got=system.name
+        )
+    prototype = folder / manifest.prototype_file if manifest.prototype_file and not plant else None
+    needed = collect(system, prototype=prototype)
+    files = manifest.by_path()
+    top = folder.resolve()
+    for path, item in needed.items.items():
+        if path not in files or (item.source is not None and not item.source.resolve().is_relative_to(top)):
+            raise FileInvalid(f"{path} is not in the template", path=where, expected="everything that its system names")
+    if (folder / MODEL).read_bytes() != describe_model(system):
+        raise FileInvalid(
+            f"{MODEL} is not the digital model of its system",
+            path=where,
+            hint="pack the template again with this version",
+        )
+    if manifest.software.wheel:
+        _check_wheel(folder, manifest, where)
+    return system
+
+
+def _check_wheel(folder: Path, manifest: Manifest, where: str) -> None:
+    """The wheel holds the software that the manifest names. Nothing of it is run."""
+    said, (version, modules) = manifest.software, wheel_hash(folder / manifest.software.wheel)
+    if (version, modules) != (said.version, said.modules_sha256):
+        raise FileInvalid(
+            f"{said.wheel} is other software than the manifest says", path=where,
+            expected=f"{said.version}, modules {said.modules_sha256[:12]}", got=f"{version}, modules {modules[:12]}",
+        )  # fmt: skip
+
+
+def put_together(manifest: Manifest, system: System, folder: Path, clock: Clock) -> DigitalTemplate:
+    """Make the template's control system, and its prototype where it has one: what a run would do first.
+
+    This imports control logic in Python. Raises `FileInvalid`.
+    """
+    template = DigitalTemplate(manifest, system)
+    if manifest.prototype_file:
+        from fieldtwin.twin.prototype.file import load_prototype
+        from fieldtwin.twin.prototype.prototype import DigitalTwinPrototype  # a plant has no emulators installed
+
+        DigitalTwinPrototype(system, load_prototype(system, folder / manifest.prototype_file), clock)
+    return template
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A file that two templates do not have in common: `before` and `after` are hashes, empty where there is none."""
+
+    path: str
+    kind: str
+    before: str
+    after: str
+
+    @property
+    def what(self) -> str:
+        return "added" if not self.before else "removed" if not self.after else "changed"
+
+
+def differences(old: Mapping[str, Content], new: Mapping[str, Content]) -> list[Difference]:
+    """Return the files that differ, by path."""
+    found = []
+    for path in sorted({*old, *new}):
+        before, after = (side[path].sha256 if path in side else "" for side in (old, new))
+        if before != after:
+            kind = (new[path].kind if path in new else "") or (old[path].kind if path in old else "")
+            found.append(Difference(path, kind, before, after))
+    return found
+
+
+def software_difference(before: Software, after: Software) -> list[Difference]:
+    """Return the difference between the control software of two templates; an empty list if the modules are the same."""
+    if before.modules_sha256 == after.modules_sha256:
+        return []
+    sides = (f"{software.version} {software.modules_sha256}" for software in (before, after))
+    return [Difference("fieldtwin", "software", *sides)]
+
+
+def unified(path: str, *sides: tuple[Package, Content | None]) -> Iterator[str]:
+    """Yield the lines of a unified diff of one text file: nothing for other files, and those of more than `MAX_SHOWN_BYTES`.
+
+    `sides` are the two templates, each with what it holds under `path`.
+    """
+    texts: list[list[str]] = []
+    for package, content in sides:
+        if content is not None and (not path.lower().endswith(TEXT) or content.bytes > MAX_SHOWN_BYTES):
+            return
+        try:
+            texts.append(package.text(path).decode().splitlines() if content is not None else [])
+        except UnicodeDecodeError:
+            return
+    yield from difflib.unified_diff(texts[0], texts[1], f"a/{path}", f"b/{path}", lineterm="")

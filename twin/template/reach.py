@@ -1,0 +1,63 @@
+"""What a prototype would use of the computer that it runs on, beyond its own run directory and this computer's loopback.
+
+A stranger's prototype file may say that a bus is the plant's own, name a CAN interface of the kernel, or listen to the network.
+Whoever runs it is told before. Nothing is opened here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import PurePosixPath
+
+from fieldtwin.gateway.core.endpoint import Endpoint
+from fieldtwin.twin.prototype.file import Prototype
+from fieldtwin.twin.site.system import System
+
+OUR_BUS = "fieldtwin"
+"""The software CAN bus; every other interface may be a real one."""
+
+
+def reach(system: System, prototype: Prototype) -> tuple[str, ...]:
+    """One sentence for each thing that somebody has to agree to; none where everything stays inside. In the files' order."""
+    return tuple(dict.fromkeys(_reach(system, prototype)))
+
+
+def _reach(system: System, prototype: Prototype) -> Iterator[str]:
+    for name, bus in prototype.buses.items():
+        if bus.listen is None:
+            yield f"it opens {system.buses[name].endpoint}, as the plant does (bus {name})"
+        else:
+            yield from _listening(bus.listen, f"bus {name}")
+    for device in prototype.devices.values():
+        if device.form.far is not None:
+            yield from _listening(Endpoint.parse(device.form.far), f"far end of {device.name}")
+    for section, servers in (("serve", system.serving.serve), ("bridge", system.serving.bridges)):
+        for server in servers:
+            yield from _listening(server.listen, f"{section} {server.name}")
+
+
+def _listening(at: Endpoint, what: str) -> Iterator[str]:
+    if at.is_can:
+        if at.interface != OUR_BUS:
+            yield f"it sends on {at}, an interface of this computer ({what})"
+            return
+        host = at.path.rpartition(":")[0]
+    elif at.scheme == "pty":
+        path = PurePosixPath(at.path)
+        if path.is_absolute() or ".." in path.parts:
+            yield f"it makes a link at {at.path}, outside of its run directory ({what})"
+        return
+    elif at.is_serial:
+        return  # opened where the prototype maps it to, or refused
+    else:
+        host = at.host
+    if not _is_loopback(host):
+        yield f"it listens on {host}, where others can reach it ({what})"
+
+
+def _is_loopback(host: str) -> bool:
+    """A name is none but for one: what it means is elsewhere's to say."""
+    bare = host.strip("[]")
+    return bare in ("localhost", "::1") or (
+        bare.startswith("127.") and bare.count(".") == 3 and bare.replace(".", "").isdigit()
+    )

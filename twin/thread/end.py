@@ -1,0 +1,261 @@
+"""One side of a thread: a store, a carrier, and the core between them, for as long as the twin runs.
+
+It opens links again and again, moves events from the store to the other side and from there into the store, and tells what is
+new in order. It holds what can send; a shadow is given only what arrives (SPEC ruling 16).
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from typing import Any
+
+from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S, Clock
+from fieldtwin.gateway.core.errors import FieldtwinError, Unreachable
+from fieldtwin.gateway.core.nursery import Nursery
+from fieldtwin.gateway.store.event import Event, KnowledgeStore, without
+from fieldtwin.twin.thread.core import Effect, Incoming, Keep, NoteLost, Open, Outgoing
+from fieldtwin.twin.thread.frames import Ack, Ask, Data, Frame, Hello, Lost, Refused, Schema
+from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
+
+FIRST_RETRY_NS, LAST_RETRY_NS = 200 * NS_PER_MS, 10 * NS_PER_S
+PROVEN_NS = 5 * NS_PER_S
+"""A link that lasts so long was a good one. Two who want the same place take turns of that length."""
+READ_BLOCK = 1000
+STORE_PAUSE_NS = NS_PER_S
+
+OnEvents = Callable[[str, Sequence[Event]], Awaitable[None]]
+"""Told (origin, events) in the order of their numbers, each once as long as nobody dies between storing and telling."""
+
+
+class ThreadEnd:
+    """``ThreadEnd(store, carrier, schema, clock, origin=...)``; `run` until cancelled.
+
+    `origin` is the log that this side sends (`KnowledgeStore.own`), empty for a side that only receives. Call `appended` when the
+    log grew. Without `insists`, `run` ends when the other side does not want us and there never was a link.
+    """
+
+    def __init__(
+        self,
+        store: KnowledgeStore,
+        carrier: Carrier,
+        schema: Schema,
+        clock: Clock,
+        *,
+        origin: str = "",
+        prototype: bool = False,
+        on_events: OnEvents | None = None,
+        insists: bool = True,
+    ) -> None:
+        self.out: Outgoing | None = None
+        self.into = Incoming(self._knows, 0)
+        self.connected = False
+        self.links = 0
+        self.trouble = ""
+        """Why nothing gets through now, or what the other side complained of; empty when all is well."""
+        self._refused_by_store = ""
+        """Why our store did not do the last that was asked of it."""
+        self._store = store
+        self._carrier = carrier
+        self._schema = schema
+        self._clock = clock
+        self._origin = origin
+        self._prototype = prototype
+        self._on_events = on_events
+        self._insists = insists
+        self.silent = "there was no link"
+        """What it means that nothing ever came; empty when something did."""
+        self._link: Link | None = None
+        self._news = asyncio.Event()
+        self._told: dict[str, int] = {}
+
+    def _knows(self, schema: bytes) -> bool:
+        return self._link is not None and self._link.knows(schema)
+
+    def _fit(self, tag: bytes, events: Sequence[Event]) -> int:
+        return self._link.fit(tag, events) if self._link is not None else 1
+
+    @property
+    def waiting(self) -> int:
+        """Events of our log that the other side has not confirmed."""
+        return self.out.waiting if self.out is not None else 0
+
+    def appended(self, last: int) -> None:
+        """Our log has grown to number `last`."""
+        if self.out is not None:
+            self.out.appended(last)
+            self._news.set()
+
+    async def make_room(self) -> int:
+        """Forget the older half of what the other side has confirmed; how many events. For a store of this side that is full."""
+        if self.out is None:
+            return 0
+        first, _ = await self._store.span(self._origin)
+        if first > self.out.through:
+            return 0
+        return await self._store.forget(self._origin, first + (self.out.through - first) // 2)
+
+    async def run(self) -> None:
+        """Keep the thread up. Raises `FieldtwinError` only when the store cannot be read at the start, and `Unwelcome`."""
+        if self._origin:
+            first, last = await self._store.span(self._origin)
+            self.out = Outgoing(self._origin, self._schema.id, first, last, prototype=self._prototype, fit=self._fit)
+        retry_ns, opened_ns = FIRST_RETRY_NS, 0
+        while True:
+            try:
+                self._link = await self._carrier.open()
+                opened_ns = self._clock.monotonic_ns()
+                await self._converse(self._link)
+            except Unreachable as e:
+                self.trouble = str(e)
+                if isinstance(e, Unwelcome) and not self._insists and not self.links:
+                    raise
+            finally:
+                self.connected = False
+                if self._link is not None:
+                    self.trouble = self.trouble or self._link.trouble
+                    await self._link.aclose()
+                    self._link = None
+                    if self._clock.monotonic_ns() - opened_ns >= PROVEN_NS:
+                        retry_ns = FIRST_RETRY_NS
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + retry_ns)
+            retry_ns = min(2 * retry_ns, LAST_RETRY_NS)
+
+    async def _converse(self, link: Link) -> None:
+        self.connected = True
+        self.links += 1
+        self.trouble = ""
+        self.silent = self.silent and link.quiet
+        self.into.ack_delay_ns = link.ack_delay_ns
+        if self.out is not None:
+            self.out.linger_ns = link.linger_ns
+            self.out.connected(self._clock.monotonic_ns())
+        async with Nursery() as nursery:
+            nursery.start(self._listen(link), f"{self._carrier.name}: what comes")
+            nursery.start(self._talk(link), f"{self._carrier.name}: what goes")
+            await nursery.wait()
+
+    # -- what goes --------------------------------------------------------------------------------------------------------
+
+    async def _talk(self, link: Link) -> None:
+        while True:
+            self._news.clear()
+            if self.out is not None and (wanted := self.out.wanted()) is not None:
+                await self._load(self.out, *wanted)
+            now_ns = self._clock.monotonic_ns()
+            frame = self.into.next_frame(now_ns) or (self.out.next_frame(now_ns) if self.out is not None else None)
+            if frame is not None:
+                await link.send(frame)
+            else:
+                await self._wait(now_ns)
+
+    async def _load(self, out: Outgoing, first: int, count: int) -> None:
+        try:
+            out.load(first, await self._store.read(out.origin, first, count))
+            self._refused_by_store = ""
+        except Unreachable as e:
+            self._refused_by_store = str(e)
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
+
+    async def _wait(self, now_ns: int) -> None:
+        """Until something comes, or something is due."""
+        times = [self.into.wake_ns(now_ns), self.out.wake_ns(now_ns) if self.out is not None else None]
+        due = min((t for t in times if t is not None), default=None)
+        timeout_s = None if due is None else max(0.001, (due - now_ns) / NS_PER_S)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self._news.wait()
+
+    # -- what comes -------------------------------------------------------------------------------------------------------
+
+    async def _listen(self, link: Link) -> None:
+        while True:
+            frame = await link.receive()
+            self.silent = ""
+            try:
+                await self._take(frame)
+                self._refused_by_store = ""
+            except Unreachable as e:  # the store: what was not kept is not acknowledged, and comes again
+                self._refused_by_store = str(e)
+                await self._clock.sleep_until_ns(self._clock.monotonic_ns() + STORE_PAUSE_NS)
+            self._news.set()
+
+    async def _take(self, frame: Frame) -> None:
+        now_ns, out = self._clock.monotonic_ns(), self.out
+        if isinstance(frame, Hello | Data | Lost):
+            await self._do(self.into.receive(frame, now_ns))
+            if self.into.unknown_schema:
+                self.trouble = (
+                    f"the other side writes with a schema that this one does not have: {self.into.unknown_schema.hex()}"
+                    " (another system, or another version of its file)"
+                )
+        elif out is not None and frame.tag == out.tag:
+            if isinstance(frame, Ack):
+                out.on_ack(frame, now_ns)
+                if out.contradicted:
+                    self.trouble = f"the other side has more of {out.origin} than its own store: was a backup put back?"
+            elif isinstance(frame, Ask):
+                out.on_ask(now_ns)
+            elif isinstance(frame, Refused):
+                out.on_refused(now_ns)
+                self.trouble = (
+                    f"the other side does not have our schema {frame.schema.hex()} (another system, or another version of its"
+                    " file); nothing is lost meanwhile"
+                )
+
+    async def _do(self, effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Open):
+                await self._open(effect.origin)
+            elif isinstance(effect, Keep):
+                await self._keep(effect)
+            elif isinstance(effect, NoteLost):
+                await self._note_lost(effect)
+            await self._tell(effect.origin)
+
+    async def _open(self, origin: str) -> None:
+        _, last = await self._store.span(origin)
+        more = self.into.opened(origin, last, await self._store.gaps(origin), self._clock.monotonic_ns())
+        self._told.setdefault(origin, self.into.through(origin))
+        await self._do(more)
+
+    async def _keep(self, effect: Keep) -> None:
+        try:
+            await self._store.keep(effect.origin, effect.events, system=self._schema.system, prototype=effect.prototype)
+        except FieldtwinError:
+            self.into.not_kept(effect.origin, effect.events)
+            raise
+        self.into.kept(effect.origin, effect.events, self._clock.monotonic_ns())
+
+    async def _note_lost(self, effect: NoteLost) -> None:
+        gaps = await self._store.gaps(effect.origin)
+        last = (await self._store.span(effect.origin))[1]
+        missing = [*gaps, (last + 1, max(last + 1, effect.last))]
+        for first, end in without([(effect.first, effect.last)], without([(1, effect.last)], missing)):
+            await self._store.note_lost(effect.origin, first, end)
+        self.into.noted(effect.origin, effect.first, effect.last, self._clock.monotonic_ns())
+
+    async def _tell(self, origin: str) -> None:
+        """Pass on what follows what was passed on before, without holes but for what is lost."""
+        through = self.into.through(origin)
+        while self._on_events is not None and (told := self._told.get(origin, through)) < through:
+            block = [e for e in await self._store.read(origin, told + 1, READ_BLOCK) if e.sequence <= through]
+            self._told[origin] = block[-1].sequence if block else through
+            if block:
+                await self._on_events(origin, block)
+
+    def describe(self) -> dict[str, Any]:
+        """How the thread is, for a status or a summary."""
+        return {
+            "carrier": self._carrier.name,
+            "connected": self.connected,
+            "links": self.links,
+            "origin": self._origin,
+            "sent_through": self.out.through if self.out is not None else None,
+            "waiting": self.waiting,
+            "resent": self.out.resent if self.out is not None else 0,
+            "duplicates": self.into.duplicates,
+            "silent": self.silent,
+            "trouble": self._refused_by_store or self.trouble or (self._link.trouble if self._link is not None else ""),
+        }

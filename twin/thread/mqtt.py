@@ -1,0 +1,210 @@
+"""A thread over an MQTT broker, as Sparkplug B (the extra `mqtt`). The only file that knows aiomqtt."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import ssl
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import aiomqtt
+
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import ConnectionLost, Desync, Unreachable
+from fieldtwin.gateway.store.event import Event
+from fieldtwin.twin.thread.frames import Frame
+from fieldtwin.twin.thread.link import Carrier, Link, Unwelcome
+from fieldtwin.twin.thread.sparkplug import EdgeNode, HostApplication, Message
+from fieldtwin.twin.thread.sparkplug_payloads import MAX_PAYLOAD
+
+KEEPALIVE_S = 15
+TIMEOUT_S = 10.0
+QUEUED = 1000
+"""Messages that may wait to be read; what is too much is dropped by the client, and comes again."""
+ACK_DELAY_NS = 100 * NS_PER_MS
+GOODBYE_S = 1.0
+
+
+FAILURE = 0x80
+"""Codes of a SUBACK from here on are refusals (MQTT 3.9.3)."""
+ACCESS = "the user needs to read and write the topics of group and node, and STATE (docs/thread.md)"
+
+
+class _Socket(ssl.SSLSocket):
+    """One that is closed when the other side is not whom we trust: paho leaves it to the collector."""
+
+    def do_handshake(self, block: bool = False) -> None:
+        try:
+            super().do_handshake(block)
+        except OSError:
+            self.close()
+            raise
+
+
+class _Heard(logging.Handler):
+    """The last thing that paho had to say: why a connection broke is nowhere else."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.last = ""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.last = record.getMessage().rpartition("] ")[2].partition(" (_ssl")[0]
+
+
+def _refusal(e: aiomqtt.MqttError, heard: str, where: str) -> Unreachable:
+    """Why there is no session: who is not there may be later, who refuses will go on doing so."""
+    cause = e.__context__  # aiomqtt keeps the text of what paho raised
+    if isinstance(cause, ssl.SSLCertVerificationError):
+        hint = "ca= names who is trusted; the certificate is for the host in the URL"
+        return Unwelcome(f"the broker's certificate is refused: {cause.verify_message}", where=where, hint=hint)
+    if isinstance(cause, ssl.SSLError):
+        reason = (cause.reason or str(cause)).replace("_", " ").lower()
+        return Unwelcome(
+            f"no TLS with the broker: {reason}", where=where, hint="cert= and key= are ours, if it asks for them"
+        )
+    if isinstance(e, aiomqtt.MqttCodeError) and e.rc:
+        hint = "the user is in the URL, the password in FIELDTWIN_MQTT_PASSWORD or FIELDTWIN_MQTT_PASSWORD_FILE"
+        return Unwelcome(f"the broker refuses: {str(e).partition('] ')[2] or e}", where=where, hint=hint)
+    if heard:
+        hint = "does it want mqtts://, or a certificate of ours (cert= and key=)?"
+        return Unreachable(f"the broker ends the connection: {heard}", where=where, hint=hint)
+    why = cause.strerror if isinstance(cause, OSError) and cause.strerror else str(e)
+    hint = "TLS is asked for: does it speak that on this port?" if isinstance(cause, ConnectionResetError) else ""
+    return Unreachable(f"the broker is not there: {why}", where=where, hint=hint)
+
+
+@dataclass(frozen=True, slots=True)
+class Broker:
+    """Where the broker is and who we are there. The password is never shown."""
+
+    host: str
+    port: int = 1883
+    username: str | None = None
+    password: str | None = field(default=None, repr=False)
+    tls: ssl.SSLContext | None = None
+
+    def __str__(self) -> str:
+        return f"{'mqtts' if self.tls else 'mqtt'}://{self.host}:{self.port}"
+
+
+Side = EdgeNode | HostApplication
+
+
+class MqttLink(Link):
+    """A session with the broker."""
+
+    ack_delay_ns = ACK_DELAY_NS
+
+    def __init__(self, client: aiomqtt.Client, side: Side, clock: Clock, where: str) -> None:
+        self.side = side
+        self.garbled = 0
+        self._client = client
+        self._clock = clock
+        self._where = where
+        self.quiet = (
+            f"nothing came through {where}: nobody there, or our user may not read or write {side.subscriptions[0]}"
+        )
+        self._messages: AsyncIterator[aiomqtt.Message] = aiter(client.messages)
+
+    async def begin(self) -> None:
+        """Subscribe, and say that we are here."""
+        try:
+            for topic in self.side.subscriptions:
+                granted = await self._client.subscribe(topic, qos=1)
+                if any(getattr(code, "value", code) >= FAILURE for code in granted):
+                    raise Unwelcome(f"the broker does not let us hear {topic}", where=self._where, hint=ACCESS)
+        except aiomqtt.MqttError as e:
+            raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
+        for message in self.side.hello():
+            await self._publish(message)
+
+    async def _publish(self, message: Message) -> None:
+        try:
+            await self._client.publish(message.topic, message.payload, qos=message.qos, retain=message.retain)
+        except aiomqtt.MqttError as e:
+            raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
+
+    async def send(self, frame: Frame) -> None:
+        for message in self.side.messages(frame, self._clock.utc_ns() // NS_PER_MS):
+            await self._publish(message)
+
+    async def receive(self) -> Frame:
+        while True:
+            try:
+                message = await anext(self._messages)
+            except (aiomqtt.MqttError, StopAsyncIteration) as e:
+                raise ConnectionLost(f"the broker is gone: {e}", where=self._where) from e
+            payload = message.payload
+            if not isinstance(payload, bytes) or len(payload) > MAX_PAYLOAD:
+                self.garbled += 1
+                continue
+            try:
+                frame = self.side.frame(message.topic.value, payload)
+            except Desync:
+                self.garbled += 1
+                continue
+            if frame is not None:
+                return frame
+
+    def fit(self, tag: bytes, events: Sequence[Event]) -> int:
+        return self.side.fit(events)
+
+    def knows(self, schema: bytes) -> bool:
+        """Births announce every name: nobody needs to have the schema beforehand."""
+        return True
+
+    async def aclose(self) -> None:
+        with suppress(ConnectionLost, TimeoutError):
+            async with asyncio.timeout(GOODBYE_S):
+                await self._publish(self.side.will())
+        with suppress(aiomqtt.MqttError):
+            await self._client.__aexit__(None, None, None)
+
+
+class MqttCarrier(Carrier):
+    """Goes to the broker. `make_side` is called for each session with its number, since births and deaths are counted, and with
+    when it began (UTC, ms)."""
+
+    def __init__(self, broker: Broker, make_side: Callable[[int, int], Side], clock: Clock) -> None:
+        self.name = f"thread over {broker}"
+        self._broker = broker
+        self._make_side = make_side
+        self._clock = clock
+        self._sessions = 0
+        if broker.tls is not None:
+            broker.tls.sslsocket_class = _Socket
+
+    async def open(self) -> MqttLink:
+        b = self._broker
+        side = self._make_side(self._sessions, self._clock.utc_ns() // NS_PER_MS)
+        self._sessions += 1
+        will = side.will()
+        heard = _Heard()
+        logger = logging.Logger("mqtt", logging.WARNING)  # of this session; nothing of it goes to the screen
+        logger.addHandler(heard)
+        client = aiomqtt.Client(
+            b.host,
+            b.port,
+            username=b.username,
+            password=b.password,
+            tls_context=b.tls,
+            timeout=TIMEOUT_S,
+            keepalive=KEEPALIVE_S,
+            max_queued_incoming_messages=QUEUED,
+            logger=logger,
+            will=aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
+        )
+        try:
+            await client.__aenter__()
+        except aiomqtt.MqttError as e:
+            raise _refusal(e, heard.last, str(b)) from e
+        link = MqttLink(client, side, self._clock, str(b))
+        try:
+            await link.begin()
+        except BaseException:
+            await link.aclose()
+            raise
+        return link

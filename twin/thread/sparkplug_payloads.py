@@ -1,0 +1,253 @@
+"""Payloads and topics of Sparkplug B (Eclipse Sparkplug 3.0.0, chapters 4 and 6): what hosts of others understand.
+
+The protocol buffers of a payload are written and read here, as far as a thread uses them, without generated code. Fields of
+others are skipped. Pure: no MQTT, no time.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+from fieldtwin.gateway.core.errors import Desync, UsageError
+from fieldtwin.gateway.store.event import Value
+from fieldtwin.twin.thread.frames import Reader, varint
+
+NAMESPACE = "spBv1.0"
+MAX_PAYLOAD = 1 << 20
+MAX_METRICS = 10_000
+GOOD_QUALITY, BAD_QUALITY = 192, 0
+"""Property `Quality` (6.4.18)."""
+
+
+class DataType(IntEnum):
+    """Types of metrics (6.4.16) that a thread sends; it reads the other integers too."""
+
+    INT8, INT16, INT32, INT64 = 1, 2, 3, 4
+    UINT8, UINT16, UINT32, UINT64 = 5, 6, 7, 8
+    FLOAT, DOUBLE, BOOLEAN, STRING, DATETIME, TEXT = 9, 10, 11, 12, 13, 14
+    BYTES = 17
+
+
+_SIGNED = {DataType.INT8: 32, DataType.INT16: 32, DataType.INT32: 32, DataType.INT64: 64}
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A metric. In data it has a name or an alias; `datatype` 0 is that of the birth. `properties` are integers by name."""
+
+    name: str = ""
+    alias: int | None = None
+    t_ms: int = 0
+    datatype: int = 0
+    value: Value = None
+    historical: bool = False
+    properties: tuple[tuple[str, int], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """`seq` runs from 0 to 255 and round; None where a message has none (NDEATH, NCMD)."""
+
+    t_ms: int
+    metrics: tuple[Metric, ...]
+    seq: int | None = None
+
+
+def topic(group: str, message: str, node: str) -> str:
+    """``spBv1.0/GROUP/NDATA/NODE``. Raises `UsageError` for a name that MQTT takes for a pattern."""
+    for part in (group, node):
+        if not part or any(c in part for c in "+#/") or not part.isprintable():
+            raise UsageError("a name in Sparkplug", expected="a word without + # /", got=repr(part))
+    return f"{NAMESPACE}/{group}/{message}/{node}"
+
+
+def state_topic(host: str) -> str:
+    """Where a host application says that it is there."""
+    topic(host, "STATE", host)
+    return f"{NAMESPACE}/STATE/{host}"
+
+
+def type_of(value: Value) -> DataType:
+    """The type that holds a value exactly."""
+    if isinstance(value, int):
+        return DataType.INT64
+    if isinstance(value, float):
+        return DataType.DOUBLE
+    return DataType.BYTES if isinstance(value, bytes) else DataType.STRING
+
+
+# -- writing: field number << 3 | wire type (0 varint, 1 64 bits, 2 length and bytes, 5 32 bits) -----------------------------
+
+
+def _number(field: int, value: int) -> bytes:
+    return varint(field << 3) + varint(value)
+
+
+def _bytes(field: int, value: bytes) -> bytes:
+    return varint(field << 3 | 2) + varint(len(value)) + value
+
+
+def _value(value: Value) -> bytes:
+    if value is None:
+        return _number(7, 1)
+    if isinstance(value, int):
+        return _number(11, value & 0xFFFF_FFFF_FFFF_FFFF)
+    if isinstance(value, float):
+        return varint(13 << 3 | 1) + struct.pack("<d", value)
+    return _bytes(16, value) if isinstance(value, bytes) else _bytes(15, value.encode())
+
+
+def _properties(properties: tuple[tuple[str, int], ...]) -> bytes:
+    if not properties:
+        return b""
+    keys = b"".join(_bytes(1, name.encode()) for name, _ in properties)
+    values = b"".join(_bytes(2, _number(1, DataType.INT32) + _number(3, value)) for _, value in properties)
+    return _bytes(9, keys + values)
+
+
+def encode_metric(metric: Metric) -> bytes:
+    """One metric, without its frame in a payload."""
+    out = _bytes(1, metric.name.encode()) if metric.name else b""
+    if metric.alias is not None:
+        out += _number(2, metric.alias)
+    out += _number(3, metric.t_ms)
+    if metric.datatype:
+        out += _number(4, metric.datatype)
+    if metric.historical:
+        out += _number(5, 1)
+    if metric.datatype == DataType.BOOLEAN and metric.value is not None:
+        return out + _properties(metric.properties) + _number(14, int(bool(metric.value)))
+    return out + _properties(metric.properties) + _value(metric.value)
+
+
+def encode_payload(payload: Payload) -> bytes:
+    out = _number(1, payload.t_ms) + b"".join(_bytes(2, encode_metric(metric)) for metric in payload.metrics)
+    return out + (_number(3, payload.seq) if payload.seq is not None else b"")
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------------
+
+
+def _fields(data: bytes) -> list[tuple[int, int | bytes]]:
+    """Numbers and contents of the fields of a message, in order."""
+    reader, out = Reader(data), list[tuple[int, int | bytes]]()
+    while not reader.done:
+        key = _varint(reader)
+        kind = key & 7
+        if kind == 0:
+            out.append((key >> 3, _varint(reader)))
+        elif kind in (1, 5):
+            out.append((key >> 3, reader.take(8 if kind == 1 else 4)))
+        elif kind == 2:
+            out.append((key >> 3, reader.take(_varint(reader))))
+        else:
+            raise Desync("a protocol buffer", expected="wire type 0, 1, 2 or 5", got=str(kind))
+    return out
+
+
+def _varint(reader: Reader) -> int:
+    """Protocol buffers take up to ten bytes, of which 64 bits count."""
+    number = shift = 0
+    while True:
+        byte = reader.take(1)[0]
+        number |= (byte & 0x7F) << shift
+        shift += 7
+        if byte < 0x80:
+            return number & 0xFFFF_FFFF_FFFF_FFFF
+        if shift >= 70:
+            raise Desync("a number in a protocol buffer", expected="at most ten bytes")
+
+
+def _int(value: int | bytes) -> int:
+    if isinstance(value, bytes):
+        raise Desync("a number in a Sparkplug payload", got="bytes")
+    return value
+
+
+def _raw(value: int | bytes) -> bytes:
+    if isinstance(value, int):
+        raise Desync("bytes in a Sparkplug payload", got="a number")
+    return value
+
+
+def _text(value: int | bytes) -> str:
+    try:
+        return _raw(value).decode()
+    except UnicodeDecodeError as e:
+        raise Desync("a text in a Sparkplug payload", expected="UTF-8") from e
+
+
+def _decode_properties(data: bytes) -> tuple[tuple[str, int], ...]:
+    keys: list[str] = []
+    values: list[int] = []
+    for number, content in _fields(data):
+        if number == 1:
+            keys.append(_text(content))
+        elif number == 2:
+            inner = dict(_fields(_raw(content)))
+            held = inner.get(3, inner.get(4, 0))
+            values.append(held if isinstance(held, int) else 0)
+    return tuple(zip(keys, values, strict=False))
+
+
+def _decode_metric(data: bytes) -> Metric:
+    name, alias, t_ms, datatype, historical, null = "", None, 0, 0, False, False
+    value: Value = None
+    properties: tuple[tuple[str, int], ...] = ()
+    for number, content in _fields(data):
+        if number == 1:
+            name = _text(content)
+        elif number == 2:
+            alias = _int(content)
+        elif number == 3:
+            t_ms = _int(content)
+        elif number == 4:
+            datatype = _int(content)
+        elif number == 5:
+            historical = bool(content)
+        elif number == 7:
+            null = bool(content)
+        elif number == 9:
+            properties = _decode_properties(_raw(content))
+        elif 10 <= number <= 16:
+            value = _decode_value(number, content)
+    bits = _SIGNED.get(DataType(datatype)) if datatype in DataType._value2member_map_ else 64
+    if bits and isinstance(value, int) and value >> (bits - 1) == 1:
+        value -= 1 << bits
+    return Metric(name, alias, t_ms, datatype, None if null else value, historical, properties)
+
+
+def _decode_value(number: int, content: int | bytes) -> Value:
+    if number in (10, 11):
+        return _int(content)
+    if number == 12 and len(_raw(content)) == 4:
+        return float(struct.unpack("<f", _raw(content))[0])
+    if number == 13 and len(_raw(content)) == 8:
+        return float(struct.unpack("<d", _raw(content))[0])
+    if number == 14:
+        return int(bool(content))
+    if number == 15:
+        return _text(content)
+    if number == 16:
+        return _raw(content)
+    raise Desync("the value of a metric", expected="4 bytes of a float, or 8 of a double")
+
+
+def decode_payload(data: bytes) -> Payload:
+    """Raises `Desync` for what is no payload of Sparkplug B, or too large to be one of a thread."""
+    if len(data) > MAX_PAYLOAD:
+        raise Desync("a Sparkplug payload", expected=f"at most {MAX_PAYLOAD} bytes", got=str(len(data)))
+    t_ms, seq = 0, None
+    metrics: list[Metric] = []
+    for number, content in _fields(data):
+        if number == 1:
+            t_ms = _int(content)
+        elif number == 2:
+            metrics.append(_decode_metric(_raw(content)))
+            if len(metrics) > MAX_METRICS:
+                raise Desync("a Sparkplug payload", expected=f"at most {MAX_METRICS} metrics")
+        elif number == 3:
+            seq = _int(content)
+    return Payload(t_ms, tuple(metrics), seq)

@@ -1,0 +1,117 @@
+"""The digital thread: a connection each way between two twins, and the processes whose knowledge goes over it.
+
+A process shares events; a connection collects them from its processes into the log that its end sends. Here the paper's
+schemas have their names; what goes over the wire is `fieldtwin.twin.thread.end`, and the database is the store that it keeps
+both logs in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import ClassVar, Generic, TypeVar
+
+from fieldtwin.gateway.core.clock import NS_PER_MS, Clock
+from fieldtwin.gateway.core.errors import Bug
+from fieldtwin.gateway.core.statemachine import encode_period
+from fieldtwin.gateway.core.values import COMMAND
+from fieldtwin.gateway.store.event import Event, Kind
+from fieldtwin.twin.model.knowledge import KnowledgeWriter
+from fieldtwin.twin.model.thread_process import (
+    DigitalThreadProcess,
+    DTDigitalThreadProcess,
+    PTDigitalThreadProcess,
+    ReceivingEnd,
+)
+from fieldtwin.twin.site.system import System
+from fieldtwin.twin.thread.end import OnEvents, ThreadEnd
+from fieldtwin.twin.thread.frames import Schema
+
+COLLECT_MS = 50
+
+
+def schema_of(system: System) -> Schema:
+    """The names that a system's two twins have in common, in the system file's order: tags, then programs and devices. It is
+    of that system alone: a twin of another one that is built alike neither hears this plant nor commands it."""
+    names = [f"{d.name}.{t.name}" for d in system.devices.values() for t in d.profile.tags.values()]
+    return Schema((*names, *system.plc.programs, *system.devices), system.name)
+
+
+class Operator(DTDigitalThreadProcess):
+    """The process of a digital twin that decides which command is sent; a shadow has none."""
+
+    def command(self, command: COMMAND) -> None:
+        """Command the physical twin."""
+        self.share(Kind.COMMAND, command.name or self.name, command)
+
+    def command_period(self, period_s: int) -> None:
+        """Command a period in seconds. Raises `Desync` outside of 16 bits."""
+        self.command(encode_period(period_s))
+
+
+P = TypeVar("P", bound=DigitalThreadProcess)
+
+
+class ThreadConnection(Generic[P]):
+    """What both directions have in common: an end (the transmitter's side of it) and the processes that it collects from.
+
+    `pump` moves what the processes share into the writer of the log that the end sends.
+    """
+
+    collects: ClassVar[type[DigitalThreadProcess]]
+
+    def __init__(self, connection: ThreadEnd, collect_from: Iterable[P], writer: KnowledgeWriter, clock: Clock) -> None:
+        self.connection = connection
+        self.collect_from: tuple[P, ...] = tuple(collect_from)
+        for process in self.collect_from:
+            if not isinstance(process, self.collects):
+                raise Bug(f"a {type(self).__name__} collects from {process.name}", expected=self.collects.__name__)
+        self._writer = writer
+        self._clock = clock
+
+    def pump(self) -> int:
+        """Take what the processes share; how many events."""
+        count = 0
+        for process in self.collect_from:
+            for event in process.collect():
+                self._writer.observe(event)
+                count += 1
+        return count
+
+    async def run(self) -> None:
+        """Pump for good."""
+        while True:
+            self.pump()
+            await self._clock.sleep_until_ns(self._clock.monotonic_ns() + COLLECT_MS * NS_PER_MS)
+
+
+class PTtoDTConnection(ThreadConnection[PTDigitalThreadProcess]):
+    """SPEC row PTtoDTConnection: measurements and statuses, to the digital twin."""
+
+    collects = PTDigitalThreadProcess
+
+
+class DTtoPTConnection(ThreadConnection[DTDigitalThreadProcess]):
+    """SPEC row DTtoPTConnection: commands, to the physical twin."""
+
+    collects = DTDigitalThreadProcess
+
+
+class DigitalThread:
+    """SPEC row DigitalThread: one connection each way."""
+
+    def __init__(self, pt_data: PTtoDTConnection, dt_data: DTtoPTConnection) -> None:
+        if type(pt_data) is not PTtoDTConnection or type(dt_data) is not DTtoPTConnection:
+            raise Bug("a thread is one connection each way", expected="PTtoDTConnection and DTtoPTConnection")
+        self.pt_data = pt_data
+        self.dt_data = dt_data
+
+
+def to_receivers(*receivers: ReceivingEnd) -> OnEvents:
+    """What passes arriving events on to every receiving end, in order."""
+
+    async def pass_on(origin: str, events: Sequence[Event]) -> None:
+        for event in events:
+            for receiver in receivers:
+                receiver.observe(origin, event)
+
+    return pass_on

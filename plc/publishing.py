@@ -211,6 +211,8 @@ class OutputImage:
                 value = force.value
             before = values[output.index]
             if value is before or value == before:
+                if value is None and self._missing.pop(output.index, None) is not None:
+                    self._same = False  # the last value was not a number; this one is none, and that is another reason
                 continue
             if value != value:  # not a number must not reach a plant; the gateway reports it
                 value, broken = None, output.index not in self._missing

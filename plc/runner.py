@@ -70,6 +70,8 @@ class Runner:
         self.config = config
         self.forces = Forces()
         self.restarts = 0
+        self._stops = 0
+        self._last_stop = ""
         self.entries: list[Entry] = []
         self._triggered: list[Entry] = []
         """Those of them that are SINGLE."""
@@ -261,6 +263,7 @@ class Runner:
             other.task.stop()
         self._stopped = entry
         if entry.task.stop_reason in RESTARTABLE and self._in_a_row < self.config.max_restarts:
+            self._stops, self._last_stop = self._stops + 1, str(entry.task.error)
             self._restart_ns = self._now_ns() + round(self.config.restart_after_ms * NS_PER_MS)
         else:
             self._ended = entry.task.stop_reason
@@ -458,6 +461,7 @@ class Runner:
             **described,
             **self.starts.describe(now_ns),
             "restarts": self.restarts,
+            "stops": {"count": self._stops, "last": self._last_stop},
             "stepping": self.stepping,
             "restart_in_ms": max(0.0, (self._restart_ns - now_ns) / 1e6) if self._restart_ns < _NEVER_NS else None,
             "retain": self.retained.describe(),

@@ -336,6 +336,10 @@ def _plc_checks(plc: dict[str, Any]) -> list[str]:
         f"PLC: program {program} has not started: it waits for {start['reason']}"
         for program, start in plc.get("waiting", {}).items()
     ]
+    stops = plc.get("stops", {"count": 0})
+    if stops["count"]:
+        times = "once" if stops["count"] == 1 else f"{stops['count']} times"
+        failed.append(f"PLC: stopped by itself {times}, and began again after that; the last time: {stops['last']}")
     error = plc.get("error")
     told = failed and (plc.get("state") == "waiting" or plc.get("stop_reason") == StopReason.NOT_STARTED.value)
     return [f"PLC: {error}", *failed] if error and not told else failed

@@ -141,7 +141,8 @@ class OutputWriter:
             output.safe, output.refused = driver.config.safe.get(output.local), None
             if self.safe_active and output.safe is not None and output.by.startswith(SAFE):
                 output.wanted = output.safe
-            if output.tag in held and as_sent(output) not in (held[output.tag], b""):
+            # Also what may not be written any more: what is wanted is then refused, and on record.
+            if output.tag in held and as_sent(output) != held[output.tag]:
                 output.held = None
 
     def as_sent(self, driver: RegisterDriver | CanopenDriver) -> dict[str, bytes]:
@@ -301,8 +302,7 @@ class OutputWriter:
             or current.quality is Quality.BAD
         ):
             return
-        sent = output.driver.command(output.local, output.held).data
-        if int.from_bytes(current.raw) != int.from_bytes(sent):
+        if int.from_bytes(current.raw) != int.from_bytes(as_sent(output)):
             output.held = None
             self.rewrites += 1
         else:

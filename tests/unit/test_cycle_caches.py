@@ -194,7 +194,7 @@ SCANS = st.one_of(
     [("want", 1.0), ("scans", 2), ("force", 1.0), ("scans", 2), ("force", None)]
 )  # the value is the same all the time
 @example([("want", 1.0), ("scans", 2), ("stop",)])
-@example([("want", math.nan), ("scans", 1), ("want", None)])  # both are published without a value, for different reasons
+@example([("want", math.nan), ("scans", 1), ("want", None)])  # no value both times, for different reasons
 @example([("want", 1.0), ("scans", 2), ("arrive", 2), ("scans", 1), ("want", 0.0)])
 @example([("want", 1.0), ("scans", 2), ("hold",), ("send", 6), ("scans", 2), ("taken",)])
 def test_outputs_are_what_the_programs_hold(steps: list[Any]) -> None:

@@ -285,6 +285,8 @@ def test_a_scan_that_does_not_end_is_ended_with_outputs_safe_and_the_programs_be
             assert "the scan did not end: 50 ms" in status["error"]
             status = await got(client, lambda s: s["restarts"] == 1 and s["scans"] > 5)
             assert (status["state"], status["retain"]["start"]) == ("running", "warm start")
+            assert status["stops"]["count"] == 1
+            assert "the scan did not end: 50 ms" in status["stops"]["last"]
             assert status["variables"]["e.runs"] == 2
             assert not gateway.reader.snapshot().stopped
             await client.call("stop")

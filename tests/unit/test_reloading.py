@@ -309,6 +309,29 @@ def test_outputs_are_written_anew_as_the_new_scaling_has_them(plant: Path, loop:
     running(plant, loop, scenario)
 
 
+def test_a_value_that_the_new_limits_forbid_is_a_refused_output_and_the_gateway_goes_on(
+    plant: Path, loop: VirtualLoop
+) -> None:
+    """Observed: the comparison of the held value with the device raised `NotAllowed`, the gateway died, and the safe value was
+    never written."""
+
+    async def scenario(p: Running) -> None:
+        def held() -> int:
+            return p.run.field.devices["tank"].unit.bank.read("holding", 1, 1, loop.now_ns)[0]  # type: ignore[union-attr]
+
+        assert held() == 20
+        edit(plant.with_name("tank.yaml"), ("range: [0, 50]", "range: [0, 1.5]"))
+        await p.reload()
+        await asyncio.sleep(3)
+        entries = p.run.gateway.outputs.journal.describe()["entries"]
+        assert [(e["tag"], e["cause"], e["by"]) for e in entries] == [("tank.target", "limit", "plc")]
+        assert held() == 20
+        assert await p.run.stop_gateway()
+        assert held() == 10  # the safe value
+
+    running(plant, loop, scenario)
+
+
 def test_limits_hold_for_forces_and_for_writes(plant: Path, loop: VirtualLoop) -> None:
     async def scenario(p: Running) -> None:
         before = load_system(str(plant))

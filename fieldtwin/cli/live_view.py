@@ -356,7 +356,8 @@ def print_summary(summary: dict[str, Any]) -> None:
             checked += f"; {published['unknown']} from when the field side went, and nobody can say"
         data.print(f"  published      {checked}", soft_wrap=True)
     else:
-        data.print(f"  published      {published['values']} good values")
+        values = "not known" if published["values"] is None else f"{published['values']} good values"
+        data.print(f"  published      {values}")
     if (field := summary["field"]) and field["losses"]:
         data.print(f"  field side     lost {_times(field['losses'])}, away for {field['away_s']:.1f} s", soft_wrap=True)
     if far := summary["far_end"]:

@@ -109,6 +109,7 @@ class Run(Protocol):
         ...
 
 
+GATEWAY_GONE = "the gateway did not answer at the end: what it published and what its outputs hold is not known"
 NOT_CALM = "whether devices and outputs were good at the end, because faults were put in"
 """What a run says that had faults until its end, or until shortly before."""
 
@@ -119,6 +120,8 @@ def summarise(run: Run) -> dict[str, Any]:
     plc = run.plc_status or {}
     exchanges = _exchanges(run)
     checks = [*_plc_checks(plc), *_loss_checks(gateway)]
+    if run.gateway_status is None:
+        checks.append(GATEWAY_GONE)
     if run.calm:
         checks = [*_device_checks(gateway, run.options.prototype and run.disturbed), *_output_checks(gateway), *checks]
     if run.options.prototype:
@@ -143,7 +146,7 @@ def summarise(run: Run) -> dict[str, Any]:
         "transitions": {p: [[round(t, 3), s] for t, s in seen] for p, seen in run.states.transitions.items()},
         "exchanges": exchanges,
         "faults": (run.field_status or {}).get("struck", []),
-        "published": {"values": gateway.get("published", 0), **run.oracle.describe()},
+        "published": {"values": gateway.get("published"), **run.oracle.describe()},
         "mailboxes": gateway.get("mailboxes", {}),
         "far_end": run.shore.describe() if run.shore else None,
         "field": back.describe() if (back := getattr(run, "field_return", None)) else None,

@@ -5,9 +5,11 @@ Observed: three stops by the watchdog, each with "PLC LOST" in the live view, an
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 
-from procs import run_to_end
+from procs import every_device_online, fieldtwin, run_to_end
 
 PROFILE = """device: own/tank
 source: "this test"
@@ -51,3 +53,13 @@ def test_a_run_whose_plc_stopped_and_began_again_is_not_ok(tmp_path: Path) -> No
     done = run_to_end(tmp_path, "run", str(tmp_path / "shed.yaml"), "--prototype", "--for", "4s")
     assert done.process.returncode == 1, done.out + done.err
     assert "PLC: stopped by itself once, and began again after that; the last time: program once" in done.out
+
+
+def test_a_run_whose_gateway_is_gone_does_not_claim_to_know_its_outputs(tmp_path: Path) -> None:
+    with fieldtwin(tmp_path, "run", "observatory", "--prototype", "--for", "6s") as run:
+        gateway = run.control("observatory", "gateway")
+        every_device_online(gateway)
+        os.kill(run.pid_of("observatory", "gateway"), signal.SIGKILL)
+        run.wait(30)
+    assert run.process.returncode == 1
+    assert "what its outputs hold is not known" in run.out

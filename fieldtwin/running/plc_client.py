@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import socket
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
@@ -19,13 +20,25 @@ from fieldtwin.twin.plant.instance import runtime_root
 from fieldtwin.twin.site.system import System
 
 T = TypeVar("T")
+ACCEPTS_WITHIN_S = 1.0
+"""How long a process may take to accept a connection before it counts as gone."""
 LOOK_S = 0.02
 """Between two looks at whether all steps are done."""
 
 
 def running_instances() -> list[str]:
-    """The instances on this host whose PLC can be asked."""
-    return sorted(p.parent.name for p in runtime_root().glob("*/plc.sock"))
+    """Return the names of the instances on this host whose PLC accepts connections. A PLC that was killed leaves its socket."""
+    return sorted(p.parent.name for p in runtime_root().glob("*/plc.sock") if _accepts(p))
+
+
+def _accepts(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(ACCEPTS_WITHIN_S)
+        try:
+            probe.connect(str(path))
+        except OSError:
+            return False
+    return True
 
 
 def choose(instance: str) -> Path:

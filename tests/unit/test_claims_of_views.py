@@ -8,6 +8,8 @@ the draft of a profile because the dump beside it is no recording.
 from __future__ import annotations
 
 import json
+import socket
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,7 @@ from fieldtwin.cli.run_command import command as run_system
 from fieldtwin.cli.talk import data, talk
 from fieldtwin.gateway.core.recording import looks_like_another_file
 from fieldtwin.gateway.devices.config import Heartbeat
+from fieldtwin.running import plc_client
 
 SILENT = "faults: [{name: silence, device: ctd}]\n"
 VIRTUAL = ["observatory", "--prototype", "--virtual", "--for", "5s"]
@@ -77,3 +80,18 @@ def test_control_characters_of_a_name_are_shown_and_not_sent(console: Console) -
     assert "\x1b" not in seen.get()
     assert "\x07" not in seen.get()
     assert "two\nlines\n" in seen.get()
+
+
+def test_the_socket_of_a_killed_plc_is_not_an_instance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Observed: "several instances are running" after the PLC of an earlier one had been killed."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:  # short, because of the socket's path
+        monkeypatch.setattr(plc_client, "runtime_root", lambda: Path(folder))
+        for name in ("killed", "running"):
+            (Path(folder) / name).mkdir()
+            server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            server.bind(str(Path(folder) / name / "plc.sock"))
+            if name == "killed":
+                server.close()
+        server.listen()
+        with server:
+            assert plc_client.running_instances() == ["running"]

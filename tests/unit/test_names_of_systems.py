@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from fieldtwin.twin.site.system import load_system
     [
         ("plant.yaml", r"there is no file 'plant.yaml'; expected a system's file, or one of .*observatory"),
         ("sites/plant", "there is no file 'sites/plant'"),
+        ("pipe.yaml", "'pipe.yaml' is not a regular file; expected a system's file"),
         ("mysite", r"no system 'mysite'.*did you mean 'mysite.yaml'\?"),
         ("obsrvatory", r"no system 'obsrvatory'.*did you mean 'observatory'\?"),
     ],
@@ -27,6 +29,7 @@ from fieldtwin.twin.site.system import load_system
 def test_a_system_that_is_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, told: str) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mysite.yaml").write_text("fieldtwin: 1\n")
+    os.mkfifo(tmp_path / "pipe.yaml")
     with pytest.raises(UsageError, match=told):
         find("systems", name)
 

@@ -65,6 +65,8 @@ def find(kind: str, name: str, beside: Path | None = None, extra: Iterable[Path]
                     if candidate.is_file():
                         return candidate
     known = sorted({p.stem for f in folders for p in (f / kind).glob("*.yaml") if "." not in p.stem})
+    if direct.exists() and not direct.is_dir():
+        raise UsageError(f"{name!r} is not a regular file", expected=f"a {kind[:-1]}'s file")
     if direct.name != name or direct.suffix in (".yaml", ".yml"):
         raise UsageError(f"there is no file {name!r}", expected=f"a {kind[:-1]}'s file, or one of " + ", ".join(known))
     files = [f.name for f in (Path(f"{name}.yaml"), Path(f"{name}.yml")) if f.is_file()]

@@ -19,7 +19,7 @@ EXAMPLES = 10
 
 @dataclass
 class _Held:
-    """What a tag was: from `times_ns[i]` on, `raws[i]`."""
+    """The history of a tag's raw value: `raws[i]` was valid from `times_ns[i]` on."""
 
     times_ns: list[int] = field(default_factory=list)
     raws: list[bytes] = field(default_factory=list)
@@ -64,7 +64,7 @@ class AgeOracle:
         self._still_good.append((now_ns, tag, raw, value, source_ns))
 
     def judge(self, emulated: frozenset[str]) -> None:
-        """Compare what is waiting. Tags of devices that are not `emulated` are nobody's to judge."""
+        """Compare the waiting values with the device's history. Skip tags of devices that are not `emulated`."""
         judged: dict[str, bool] = {}
         for now_ns, tag, raw, value, source_ns in self._waiting:
             if tag not in judged:

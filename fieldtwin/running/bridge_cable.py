@@ -1,7 +1,8 @@
-"""The line on which a prototype's bridge is asked: two virtual serial ports with a cable between them.
+"""The serial line of a simulated bridge: two virtual serial ports joined by a cable.
 
-On a plant a master stands on the line that a bridge listens on. In a prototype the gateway opens one end here, and whoever
-plays that master opens the other. It belongs to neither, and must never know what is said on it.
+On a plant, a Modbus client is connected to the line on which a bridge listens. In a simulation (prototype) the gateway
+opens one end here, and the test or program that acts as that client opens the other. The cable belongs to neither side
+and must not depend on the protocol that is spoken over it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from fieldtwin.gateway.core.nursery import Nursery
 
 
 class BridgeCable:
-    """Stands in for the line `plant`, as slow as it. `gateway` is what the gateway opens, `master` the link for a master."""
+    """A replacement for the line `plant`, with its speed. The gateway opens `gateway`; a client opens the link `master`."""
 
     def __init__(self, plant: Endpoint, inside: PtyEnd, outside: PtyEnd) -> None:
         """Use `open`."""
@@ -24,7 +25,7 @@ class BridgeCable:
         self.gateway = plant.with_path(str(inside.link))
         self.master = outside.link
         self.lost_bytes = 0
-        """What an end did not take because it was closed."""
+        """Number of bytes that an end did not receive because it was closed."""
         self._inside = inside
         self._outside = outside
 

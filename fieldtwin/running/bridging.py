@@ -1,6 +1,6 @@
-"""A bridge of its own: one bus, one listening side, until it is told to stop. What `fieldtwin bridge` runs.
+"""A standalone bridge: one bus and one listening endpoint, until it is stopped. `fieldtwin bridge` runs it.
 
-The same parts as in a system's gateway, with no devices to poll and no PLC to serve first.
+It uses the same parts as a system's gateway, but it has no devices to poll and no PLC that takes precedence.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ WATCH_NS = NS_PER_S // 5
 
 @dataclass(frozen=True)
 class BridgeOptions:
-    """What the command line said. `units` maps a client's unit id to the target's; empty: every unit keeps its own.
-    `pause_s` is kept behind each exchange with the target. `echo`: the
-    target's serial adapter returns what is sent.
+    """The options of the command line.
+
+    `units` maps a client's unit ID to the target's; if it is empty, every unit ID is passed on unchanged. `pause_s` is
+    the pause in seconds after each exchange with the target. `echo`: the target's serial adapter returns the bytes that
+    are sent.
     """
 
     listen: Endpoint
@@ -89,9 +91,9 @@ def instance_name(options: BridgeOptions) -> str:
 
 
 async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict[str, Any]:
-    """Bridge until SIGINT or SIGTERM; `say` is told what happens. The counters at the end.
+    """Run the bridge until SIGINT or SIGTERM and return its counters. `say` is called with each status message.
 
-    Raises `UsageError` for endpoints that make no bridge, `EndpointBusy` or `Unreachable` when it cannot listen.
+    Raises `UsageError` for endpoints that cannot form a bridge, `EndpointBusy` or `Unreachable` when it cannot listen.
     """
     framing_of(options.target)
     if options.listen == options.target:
@@ -128,7 +130,7 @@ async def run_bridge(options: BridgeOptions, say: Callable[[str], None]) -> dict
 
 
 async def _report(bridge: Bridge, bus: ModbusBus, clock: WallClock, say: Callable[[str], None]) -> None:
-    """Say where it listens, and each time that one of the ends comes or goes; what is not there is tried again and again."""
+    """Report where the bridge listens, and each connection and disconnection of an end. A missing end is retried forever."""
     said: tuple[str, str] | None = None
     while True:
         bound = bridge.front.bound

@@ -1,7 +1,8 @@
-"""A scenario with many seeds, in virtual time, with or without faults that each seed chooses.
+"""Run a scenario with many seeds, in virtual time, with or without faults that each seed chooses.
 
-With random faults the steps only drive the system; what is judged is what holds all the time: the scenario's `always`, `never`
-and `within`, the invariants of the system file, that every part runs, and `judge: run`. A seed gives the same run each time.
+With random faults the steps only drive the system; the verdict depends on the rules that hold all the time: the
+scenario's `always`, `never` and `within`, the invariants of the system file, that every part runs, and `judge: run`.
+The same seed always gives the same run.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class Campaign:
     random_faults: RandomFaults | None = None
     duration_s: float = 0.0
     words: tuple[str, ...] = ()
-    """The options of the command line that make a seed's run, besides the seed."""
+    """The command-line options, apart from the seed, that reproduce a seed's run."""
 
     def check(self) -> Scenario:
         """Return the scenario. Raise `UsageError` where it has nothing that random faults could break, or cannot be struck."""

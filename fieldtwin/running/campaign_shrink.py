@@ -44,7 +44,7 @@ def shrink_seed(campaign: Campaign, found: ScenarioResult) -> ShrunkSeed:
 
 
 def scenario_of(campaign: Campaign, small: ShrunkSeed, folder: Path) -> str:
-    """Return a scenario file for `folder`: the faults, what the steps did at its time, and the rule that was broken."""
+    """Return a scenario file for `folder`: the faults, the effects of the steps at their times, and the broken rule."""
     scenario = campaign.check()
     form, raw = scenario.form, scenario.file.data
     keys: dict[str, Any] = {key: raw[key] for key in _KEPT if key in raw}
@@ -73,7 +73,7 @@ def _from(folder: Path, path: Path) -> str:
 
 
 def _rule(scenario: Scenario, result: ScenarioResult) -> dict[str, Any]:
-    """Return the broken rule as a key of a scenario file. An invariant stands in the system file already."""
+    """Return the broken rule as a key of a scenario file. An invariant needs no key: the system file already states it."""
     number = next((check.number for check in result.checks if check.verdict.bad), "")
     word, _, which = number.rpartition(" ")
     if word in ("always", "never", "within"):

@@ -1,4 +1,4 @@
-"""The CAN bus that an emulated node of its own stands on: one that is there, or else a software bus made for it."""
+"""The CAN bus of a single emulated node: an existing bus, or a software bus that is made for it."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ def only_bus(wires: Sequence[Endpoint]) -> Endpoint:
 async def stand_on_bus(
     wire: Endpoint, bitrate: int | None, name: str, closing: list[SoftBusServer | CanConnection]
 ) -> tuple[CanConnection, str]:
-    """Make the software bus at `wire` here, at `bitrate` bit/s; join it where it is there already, as any kernel's bus.
+    """Make the software bus at `wire` in this process, at `bitrate` bit/s.
 
-    What is opened goes to `closing`. Returns the connection and where it is, in words. Raises `Unreachable`, `EndpointBusy`,
-    or `UsageError` where a bus runs at another bit rate than the one asked for (None: any).
+    If it exists already, or is a kernel bus, join it. Everything that is opened is added to `closing`. Returns the
+    connection and a description of its place. Raises `Unreachable`, `EndpointBusy`, or `UsageError` where a bus runs at
+    a bit rate other than the requested one (None: any).
     """
     if wire.interface != "fieldtwin":
         connection = await open_can_end(wire, bitrate or DEFAULT_BIT_RATE)
@@ -38,7 +39,7 @@ async def stand_on_bus(
         return connection, str(wire)
     try:
         made = await SoftBusServer.open(wire, bitrate or DEFAULT_BIT_RATE)
-    except (EndpointBusy, Unreachable):  # somebody listens there, or the address is another computer's
+    except (EndpointBusy, Unreachable):  # another process listens there, or the address is another computer's
         connection = await open_can_end(wire, bitrate or 0)
         closing.append(connection)
         return connection, f"{wire}, with others"

@@ -1,4 +1,4 @@
-"""What was added to a capture file since the last look, as FRAME events of a trace."""
+"""Read the lines added to a capture file since the last read, as FRAME events of a trace."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ AT_ONCE = 4 << 20
 
 
 class CaptureTail:
-    """Follows what a `TapFile` writes, from now on; a line is read when it is whole. Raises `FileInvalid` for what is none."""
+    """A reader that follows a file written by `TapFile` from its current end and reads complete lines only.
+
+    Raises `FileInvalid` for a line that is not a capture line.
+    """
 
     def __init__(self, path: Path, system: System) -> None:
         self._system = system

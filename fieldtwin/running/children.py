@@ -1,4 +1,4 @@
-"""Processes that a run starts: each with a log of its own, asked through its control channel, ended in time."""
+"""The child processes of a run: each has its own log and control channel and is stopped within a time limit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ class ChildFailed(FieldtwinError):
 
 
 def spawn(argv: list[str], log: Path) -> subprocess.Popen[bytes]:
-    """Start a process that talks to `log`, in a session of its own: Ctrl-C reaches only us, and we end it in order."""
+    """Start a process that writes its output to `log`.
+
+    It gets a separate session, so that Ctrl-C reaches only this process, which then ends its children in order.
+    """
     with log.open("wb") as out:
         return subprocess.Popen(
             argv, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, start_new_session=True
@@ -32,9 +35,9 @@ def spawn(argv: list[str], log: Path) -> subprocess.Popen[bytes]:
 
 
 class Child:
-    """One process. In a session of its own, so that Ctrl-C reaches only us and we end it in order.
+    """One child process, in a separate session: Ctrl-C reaches only this process, which then ends its children in order.
 
-    Should we be killed, it ends by itself after `linger_s` seconds.
+    If this process is killed, the child ends by itself after `linger_s` seconds.
     """
 
     def __init__(self, name: str, module: str, config: Path, run_dir: Path, linger_s: float = 0.0) -> None:

@@ -1,11 +1,12 @@
-"""A system that runs in processes as a scenario's bench: asked over control channels, process image and capture file.
+"""The bench of a scenario for a system that runs in processes, reached by control channels, process image and capture file.
 
-A `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. What it can do is what can be reached: no field
-side, no faults; no capture, no wire. It starts nothing and ends nothing but its own connections. Where no gateway of ours runs, a
-scenario that is about probes only judges somebody else's controller, with the field side alone.
+This is a `fieldtwin.scenarios.bench.Bench` for the targets `local`, `compose` and `real`. Its abilities depend on the
+parts that it can reach: without field simulator it has no faults, without capture it cannot see frames. It starts and
+ends only its own connections. Where no fieldtwin gateway runs, a scenario that uses only probes tests a third-party
+controller with the field simulator alone.
 
-What a scenario puts into the simulated devices is under a lease (`FieldLease`): it is taken out when the bench is left, and also
-when this process is killed.
+Everything that a scenario puts into the simulated devices is under a lease (`FieldLease`): it is removed when the bench
+is left, and also when this process is killed.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ class Where:
     own: bool = False
     """The system was brought up for this scenario alone, so it is fresh."""
     foreign: bool = False
-    """The controller is a program of the user: no gateway of ours is asked."""
+    """The controller is a user's program: there is no fieldtwin gateway to query."""
     env: Mapping[str, str] = field(default_factory=dict)
     """What that program finds the devices by; endpoints of probes may name it."""
     allowed: Danger = Danger.DISRUPT
@@ -191,7 +192,7 @@ class ControlBench(Started):
         nursery.start(self.lease.run(), "lease")
 
     def _foreign(self) -> bool:
-        """No gateway of ours is here, and nothing is asked of one."""
+        """True where no fieldtwin gateway runs on this instance and the scenario queries none."""
         if self._where.foreign:
             return True
         probed = {name for probe in self._probe for name in probe.names}
@@ -337,7 +338,10 @@ class ControlBench(Started):
         self._note(Kind.FAULT, id, {"name": "", "on": False, "target": ""})
 
     async def held(self, name: str) -> list[tuple[float, bytes]]:
-        """Clocks are one on one host: `compose` is judged beside its containers."""
+        """Return the values that a device held.
+
+        All processes share the host's clock: `compose` is tested on the host of its containers.
+        """
         device = name.partition(".")[0]
         while True:
             answer = await self._to_field("held", since={device: self._held_since.get(device, 0)})

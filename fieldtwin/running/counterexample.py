@@ -1,8 +1,8 @@
-"""The shortest way to what does not hold, as a scenario: what can be brought about from outside, in the order of the scans.
+"""Write the shortest counterexample of a proof as a scenario: the inputs that can be caused from outside, in scan order.
 
-A proof's scans are closer together than a wire's messages, so a scenario keeps their order and what is between them at least. It
-ends with a look: what the broken program showed of itself must never be seen. What nothing outside can bring about (a mailbox
-that nobody empties, a payload of one's own) stands in it as a comment.
+A proof's scans are closer together than messages on a bus, so the scenario keeps their order and their minimum spacing.
+It ends with a check: the outputs that the broken program showed must never be seen. Inputs that cannot be caused from
+outside (a mailbox that is not emptied, a user-defined payload) appear in it as comments.
 """
 
 from __future__ import annotations
@@ -45,12 +45,15 @@ def scenario(system: System, program: str, proof: Proof, result: Result) -> str:
 
 
 def _text(text: str) -> str:
-    """A string of YAML, whatever is in it."""
+    """Return `text` as a YAML string, whatever characters it contains."""
     return json.dumps(text, ensure_ascii=False)
 
 
 def _seen(system: System, program: str, proof: Proof, result: Result) -> str:
-    """What the broken program shows under its own names; what is bound to a device stands for that device's."""
+    """Return the broken program's outputs under its own names.
+
+    An output that is bound to a device is covered by the device's tag.
+    """
     bound = system.plc.programs[program].outputs
     words = {v.name: dict(v.words) for v in proof.make().variables.values()}
     parts = []
@@ -62,7 +65,7 @@ def _seen(system: System, program: str, proof: Proof, result: Result) -> str:
 
 
 def _steps(system: System, program: str, made: Program, way: tuple[Given, ...]) -> Iterator[tuple[str, str]]:
-    """(word, what it says) of each step; ``#`` is a remark."""
+    """Yield (keyword, argument) for each step; the keyword ``#`` is a comment."""
     bindings = system.plc.programs[program].inputs
     before: dict[str, Any] = {}
     bad: set[str] = set()

@@ -1,4 +1,4 @@
-"""A CANopen node from nothing but its data sheet, or a log: what `fieldtwin emulate FILE.eds|FILE.log --on can:...` runs."""
+"""Emulate a CANopen node from its EDS or from a log alone: `fieldtwin emulate FILE.eds|FILE.log --on can:...`."""
 
 from __future__ import annotations
 
@@ -39,11 +39,12 @@ async def run_data_sheet(
     log: Path | None = None,
     options: NodeOptions | None = None,
 ) -> int:
-    """Serve until SIGINT or SIGTERM; raises what ends the serving before. What was mended in the file is said first.
+    """Serve until SIGINT or SIGTERM; raise the error that ended the serving. Repairs made to the file are reported first.
 
-    The node id is `node_id`, else what a DCF commissions, else 1; the bit rate of a bus that is made here `bitrate`, else that
-    of the DCF, else 125 kbit/s. `log` is what candump -L wrote of such a node, to be held again. Raises `FileInvalid` for a
-    file that cannot be used, `UsageError` for endpoints that are not one bus and for a log that holds nothing of the node.
+    The node ID is `node_id`, else the one that a DCF commissions, else 1. The bit rate of a bus that is made here is
+    `bitrate`, else that of the DCF, else 125 kbit/s. `log` is a candump -L log of such a node; the emulated node holds
+    the recorded values. Raises `FileInvalid` for a file that cannot be used, `UsageError` for endpoints that are not
+    one bus and for a log without frames of the node.
     """
     options = options or NodeOptions()
     dictionary = load_eds(path, parameter_values=options.parameter_values)

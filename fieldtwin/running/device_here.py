@@ -1,6 +1,6 @@
-"""One emulated device on wires of its own: what `fieldtwin emulate DEVICE|RECORDING --on ENDPOINT...` runs.
+"""One emulated device on its own endpoints: `fieldtwin emulate DEVICE|RECORDING --on ENDPOINT...`.
 
-The same device may listen on several wires at once; its registers are one and the same behind all of them.
+The same device may listen on several endpoints at once; all of them share its registers.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ DEFAULT_RECORDINGS = {"fieldtwin/ctd-reference": "cast.jsonl", "fieldtwin/inclin
 """Shipped reference devices whose recording has another name than their profile."""
 MAX_CLIENTS = 32
 LINE_PARAMS = ("mode", "echo")
-"""Parameters of an emulated line that are none of its serial settings."""
+"""Parameters of an emulated line, apart from its serial settings."""
 
 
 async def run_device(
@@ -80,10 +80,11 @@ async def run_device(
     options: NodeOptions | None = None,
     extras: Extras | None = None,
 ) -> int:
-    """Serve until SIGINT or SIGTERM; raises what ends the serving before. `bitrate` is for a CAN bus, None for the usual one.
+    """Serve until SIGINT or SIGTERM; raise the error that ended the serving.
 
-    `unknown` and `at_end` are for a recording without a profile: what is answered to a request that was never recorded, and
-    when what was recorded is used up. `options` are for a CANopen node, `extras` for a Modbus device.
+    `bitrate` is for a CAN bus, None for the default. `unknown` and `at_end` are for a recording without a profile: the
+    reply to a request that was never recorded, and the behaviour at the end of the recording. `options` are for a
+    CANopen node, `extras` for a Modbus device.
     """
     host = DeviceHost(speed, extras or Extras())
     try:
@@ -116,8 +117,11 @@ async def run_device(
 
 @dataclass(frozen=True)
 class Extras:
-    """What a Modbus device may be given: `values` of its tags at first (None: its recording, or zeros), `faults` as a file says
-    them with the `seed` of what is left to chance, and with `any_unit` the answer to every unit id on TCP."""
+    """Optional settings of a Modbus device.
+
+    `values` are the initial values of its tags (None: its recording, or zeros), `faults` the faults as a fault file
+    states them, `seed` the seed of random choices; with `any_unit` the device answers every unit ID on TCP.
+    """
 
     values: Mapping[str, float | str] | None = None
     faults: tuple[dict[str, Any], ...] = ()
@@ -163,7 +167,7 @@ class DeviceHost:
         return ProfiledReplay(profile, replay, recorded)
 
     def _stated(self, profile: DeviceProfile, values: Mapping[str, float | str]) -> ModbusUnit:
-        """A device of which nothing but its profile is known, and what its tags hold at first."""
+        """Return a device that is defined by its profile and the initial values of its tags alone."""
         bank = StatedRegisters(profile, values, self._clock.monotonic_ns())
         seen = DistortedRegisters(bank, bank.peek, profile, bank.journal)
         unit = ModbusUnit(seen, unit_limits(profile), name=profile.name, **parts_of(profile))
@@ -186,7 +190,7 @@ class DeviceHost:
     def replayed(
         self, path: Path, unit_id: int | None, unknown: NeverRecorded, at_end: WhenUsedUp
     ) -> dict[int, ModbusUnit]:
-        """The units of a recording of exchanges, or the one that is asked for; the only one answers under any id."""
+        """Return the units of a recording of exchanges, or only the requested one. A single unit answers any unit ID."""
         if header_of(path).kind != "exchanges":
             raise UsageError(
                 "a recording of signals needs a device to play it",
@@ -206,8 +210,10 @@ class DeviceHost:
 
     @staticmethod
     def _recording_of(profile: DeviceProfile) -> str | None:
-        """What a shipped device plays when nothing else is said: the recording under its profile's name. A dump that has this
-        name, from which `infer` drafted the profile, is no recording."""
+        """Return the recording that a shipped device replays by default: the one with its profile's name.
+
+        A dump of this name, from which `infer` drafted the profile, does not count as a recording.
+        """
         name = DEFAULT_RECORDINGS.get(profile.name, f"{Path(profile.path).stem}.jsonl")
         try:
             found = find_recording(name)
@@ -225,10 +231,10 @@ class DeviceHost:
         return SignalPlayer(track, self._clock.monotonic_ns(), speed=self._speed, at_end=WhenUsedUp.LOOP)
 
     async def serve(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
-        """Modbus units on a serial port (a virtual one, where there is none at that path), a socket that stands for one, or
-        Modbus TCP over TCP, UDP or TLS.
+        """Serve Modbus units on a serial port, real or virtual, a serial line over a socket, or Modbus over TCP, UDP or TLS.
 
-        A line takes ``mode=ascii``, and ``echo=1`` where the master is to hear itself.
+        A virtual port is made where there is no port at that path. A line accepts ``mode=ascii``, and ``echo=1`` if the
+        client is to receive its own bytes.
         """
         if wire.scheme in SERIAL_SCHEMES and Path(wire.path).is_char_device():
             await self._serve_port(nursery, units, wire)
@@ -255,7 +261,7 @@ class DeviceHost:
             )
 
     async def _serve_port(self, nursery: Nursery, units: dict[int, ModbusUnit], wire: Endpoint) -> None:
-        """A port that is there: this is a device on a real line."""
+        """Serve units on an existing port: this process acts as a device on a real line."""
         line: LineSlave = AsciiSlave(units) if wire.scheme == "ascii" else RtuSlave(units)
         end = self._behind_faults(await OsConnector().open_bytes(wire), line)
         self._closing.append(end)
@@ -330,7 +336,7 @@ class DeviceHost:
 
 
 def as_it_was_recorded(wire: Endpoint, recorded: str) -> Endpoint:
-    """What is not said of a serial port's settings is as it was where the device was recorded, if that was a line."""
+    """Return `wire`, with the recording's serial settings where it does not state them and the recording is of a line."""
     then = Endpoint.parse(recorded) if recorded.partition(":")[0] in SERIAL_SCHEMES else None
     if then is None or wire.scheme not in ("pty", *SERIAL_SCHEMES) or _is_ascii(wire) != (then.scheme == "ascii"):
         return wire
@@ -338,7 +344,10 @@ def as_it_was_recorded(wire: Endpoint, recorded: str) -> Endpoint:
 
 
 def _as_from_the_factory(wire: Endpoint, profile: DeviceProfile) -> Endpoint:
-    """What is not said of a virtual port's settings is as the device leaves the factory; ASCII has a frame of its own."""
+    """Return `wire` with the device's factory settings where a virtual port's settings are not stated.
+
+    ASCII keeps its own character frame.
+    """
     if wire.scheme not in ("pty", *SERIAL_SCHEMES):
         return wire
     factory = profile.form.factory

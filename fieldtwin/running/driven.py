@@ -28,7 +28,7 @@ MAX_ERRORS = 100
 
 
 class Timed(Protocol):
-    """What a run's time is asked of."""
+    """The clock of a run."""
 
     def now_s(self) -> float: ...
 
@@ -39,7 +39,7 @@ class DrivenRun(ABC):
     """One run, of whatever `_main` does. ``run()``, then `summary()`; errors are kept in `errors`."""
 
     faults: tuple[dict[str, Any], ...] = ()
-    """What is put in, the seed's choice included."""
+    """The injected faults, including those that the seed chose."""
 
     def __init__(self, seed: int, duration_s: float, trace: Path | None) -> None:
         self.seed = seed
@@ -49,7 +49,7 @@ class DrivenRun(ABC):
         self._duration_s = duration_s
         self._trace_file = trace
         self._judged = False
-        """Whether there is anything to judge: what is wrong before is somebody's mistake, and raised."""
+        """False while the run cannot be judged: an error before that is a user's mistake and is raised."""
 
     @abstractmethod
     async def _main(self, loop: VirtualLoop, folder: Path) -> None:
@@ -62,11 +62,14 @@ class DrivenRun(ABC):
     @property
     @abstractmethod
     def files(self) -> tuple[str, ...]:
-        """What was run: texts, or their hashes, that are others where a file is another."""
+        """Return the texts of the files that the run depends on, or their hashes; a changed file changes them."""
 
     def run(self, progress: Callable[[float], None] | None = None) -> None:
-        """Run it. `progress` is told the virtual seconds that are over, from time to time. Raises `FileInvalid` where the trace
-        cannot be written, or what was asked for makes no sense in this system (`UsageError`)."""
+        """Run the system. `progress` is called from time to time with the elapsed virtual seconds.
+
+        Raises `FileInvalid` where the trace cannot be written, and `UsageError` for options that make no sense in this
+        system.
+        """
         loop = VirtualLoop()
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ft-virtual-")))

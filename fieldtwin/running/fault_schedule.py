@@ -19,7 +19,7 @@ from fieldtwin.twin.prototype.fault_aims import target
 from fieldtwin.twin.site.system import System
 
 MEAN_S = 120.0
-"""One fault in so many seconds, on average."""
+"""Mean number of seconds between two faults."""
 SHORTEST_S, LONGEST_S = 0.5, 20.0
 CALM_S = 120.0
 """Without faults at the end."""
@@ -29,14 +29,18 @@ LONGEST_IN_WATER_S = 60.0
 NOT_BY_CHANCE = frozenset({"set", "late-frame"})
 """Nothing that goes wrong, and what no gateway could notice: no CAN frame says when its values were measured."""
 UNSEEN_ON_TCP = frozenset({"corrupt-bits", "collision", "wrong-baud", "wrong-parity", "noise", "echo"})
-"""Modbus TCP has no check sum of its own, and trusts TCP's: what no gateway could notice is no fault of a socket."""
+"""Serial faults that sockets do not get: Modbus TCP has no check sum of its own, so no gateway could detect them."""
 
 
 @dataclass(frozen=True, slots=True)
 class RandomFaults:
-    """What a seed may choose from. `mean_s`: seconds between two faults on average. `kinds`: names of faults; empty: all that a
-    gateway can notice, without faults of values. `aims`: DEVICE, BUS (each device on it) or DEVICE.TAG (the fault strikes that
-    register or object only); in a network behind the name of their system, and `water`. Empty: every device."""
+    """The choices of a seed.
+
+    `mean_s`: mean seconds between two faults. `kinds`: names of faults; empty: all that a gateway can detect, without
+    faults of values. `aims`: DEVICE, BUS (each device on it) or DEVICE.TAG (the fault affects that register or object
+    only); in a network they are prefixed by the name of their system, and `water` is the acoustic channel. Empty: every
+    device.
+    """
 
     mean_s: float = MEAN_S
     kinds: tuple[str, ...] = ()
@@ -102,7 +106,7 @@ def _fitting(system: System, wanted: RandomFaults, device: str, tag: str) -> Ite
     for name, kind in FAULTS.items():
         if name in NOT_BY_CHANCE or (wanted.kinds and name not in wanted.kinds):
             continue
-        if kind.kind is Kind.VALUE:  # the device says something wrong: only where that is asked for
+        if kind.kind is Kind.VALUE:  # the device reports a wrong value: only on request
             if wanted.kinds and (_struck(system, name, device) if not tag else tag in _struck(system, name, device)):
                 yield name
         elif kind.kind is (Kind.CAN if endpoint.is_can else Kind.BYTES) and _is_seen(name, endpoint):
@@ -135,7 +139,7 @@ def _can_aim(system: System, name: str, device: str, tag: str) -> bool:
 def random_network_schedule(
     network: Network, seed: int, duration_s: float, wanted: RandomFaults = ANY
 ) -> tuple[dict[str, Any], ...]:
-    """Those of each system as if it were alone with a seed of its own, under its name, and packets that the water loses."""
+    """Return the random faults of each system, drawn with its own seed, and packet losses of the acoustic channel."""
     found = []
     for member in network.members.values():
         chosen = random_schedule(member.system, f"{seed} {member.name}", duration_s, wanted.under(f"{member.name}."))

@@ -1,8 +1,8 @@
-"""Contact with a field side: here, as a process of ours, or elsewhere, started by hand or in another container.
+"""Contact with a field simulator: a child process on this host, or one that was started by hand or in another container.
 
-What comes out is the same: a control client, where to open each plant endpoint, and where the far modems listen. A pty
-does not cross hosts: a serial line of a field side elsewhere comes over TCP, and an emulated connection (`fieldtwin link`)
-is started here.
+The result is the same in both cases: a control client, the endpoint to open for each plant endpoint, and the endpoints
+of the remote modems. A pseudo-terminal cannot be used from another host: a serial line of a remote field simulator is
+carried over TCP, and an emulated connection (`fieldtwin link`) is started on this host.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class FieldContact:
         self.remarks: list[str] = []
         """What does not fit a node's data sheet, each with the device's name."""
         self.clients_before: dict[str, dict[str, dict[str, int]]] = {}
-        """By bus and client, what a field side counted before we came."""
+        """By bus and client: the counts of the field simulator before this run connected."""
         self.counted_before: dict[str, dict[str, int]] = {}
         """By device, what its counters said when we came: a field side may have served others before us."""
 
@@ -48,7 +48,7 @@ class FieldContact:
 
 
 async def contact_here(client: ControlClient, system: System, run_dir: Path) -> FieldContact:
-    """The field side is a process of ours."""
+    """Return the contact with a field simulator that is a child process of this run."""
     return await _contact(client, system, "localhost", run_dir)
 
 

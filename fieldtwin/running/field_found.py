@@ -40,7 +40,7 @@ async def find_field(system: System, run_dir: Path, environ: Mapping[str, str] =
 
 
 def _sockets(root: Path) -> list[Path]:
-    """Control channels of field sides without a gateway of ours beside them."""
+    """Return the control channels of field simulators whose instance has no gateway."""
     try:
         homes = sorted(root.iterdir())[:MOST_LOOKED_AT]
     except OSError:

@@ -15,7 +15,7 @@ from fieldtwin.twin.site.system import load_system
 
 @dataclass(frozen=True)
 class FieldOptions:
-    """What was asked for."""
+    """The options of a field simulator."""
 
     system: Path
     prototype_file: Path | None = None

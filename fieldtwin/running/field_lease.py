@@ -1,8 +1,7 @@
-"""A judge's lease on the simulated field devices, held on behalf of one scenario (`fieldtwin.twin.prototype.field_leases` is the
-other side).
+"""A scenario's lease on the simulated field devices.
 
-What the scenario puts in is taken out when the lease ends: at once at the end of the scenario, and `LEASE_S` seconds after the
-last renewal where the judge died.
+`fieldtwin.twin.prototype.field_leases` is the other side. Everything that the scenario puts in is removed when the
+lease ends: at the end of the scenario, or `LEASE_S` seconds after the last renewal if the testing process died.
 """
 
 from __future__ import annotations
@@ -27,17 +26,20 @@ FRESH_TIMEOUT_S = 30.0
 
 
 class LeaseLost(NothingKnown):
-    """The lease ended before its scenario: what the scenario had put in was taken out meanwhile, so nothing can be judged."""
+    """The lease ended before its scenario. Its faults and values were removed meanwhile, so no verdict is possible."""
 
 
 class FieldLease:
-    """``await open()``, then `run` it as a task, and ``await release()`` at the end. `client` is a connection of its own."""
+    """The client side of a lease: ``await open()``, then `run` it as a task, and ``await release()`` at the end.
+
+    `client` is a connection that only the lease uses.
+    """
 
     def __init__(self, client: ControlClient) -> None:
         self.id = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(4)}"
         self.lost: LeaseLost | None = None
         self.before = ""
-        """What was in when the lease was opened, in words: not by this scenario."""
+        """The faults and values in place when the lease was opened, in words; the scenario did not put them in."""
         self._client = client
         self._life = ""
 

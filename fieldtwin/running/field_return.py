@@ -1,7 +1,8 @@
-"""A field side elsewhere that goes and comes back: the run's own client of it is connected again, with back-off.
+"""Reconnect the run's control client to a remote field simulator, with back-off, after the simulator was lost.
 
-Gateway, far end and links have connections of their own and mend them by themselves; their values are bad meanwhile. What is
-here knows the control channel alone: when it was lost, when it is back, and whether who is back is still the same process.
+Gateway, remote client and links have their own connections and reconnect by themselves; their values are bad meanwhile.
+This module knows only the control channel: when it was lost, when it came back, and whether the simulator is still the
+same process.
 """
 
 from __future__ import annotations
@@ -22,10 +23,10 @@ CONNECT_S = 4.0
 
 
 class FieldReturn:
-    """Watches over `contact`, whose field side is at `where`. `run` it; tell it of a failed call by `lost`.
+    """A watcher of `contact`, whose field simulator is at `where`. `run` it, and report a failed call to it with `lost`.
 
-    `client` is None while nobody answers. `returned` is called when one does again, with True where it is another process than
-    before, which knows nothing of what the first one counted, held and was told.
+    `client` is None while the simulator does not answer. `returned` is called when one answers again, with True if it
+    is a different process, which does not know the counts, values and commands of the first one.
     """
 
     def __init__(
@@ -57,7 +58,7 @@ class FieldReturn:
 
     @property
     def trouble(self) -> str:
-        """What is wrong now, in words that stay the same while it is, or empty."""
+        """Return the current problem, in words that do not change while it lasts, or an empty string."""
         if not self._gone.is_set():
             return self.moved
         return self._reason or f"the field side at {self._where} was lost: nobody knows what its devices held"

@@ -31,7 +31,7 @@ async def make_fresh(lease: FieldLease, gateway: ControlClient, plc: ControlClie
         await plc.call("restart", cold=True, by=BY)
         made_ns = await lease.fresh()
         await _all_read(gateway, made_ns)
-        await plc.call("restart", cold=True, by=BY)  # what it was shown while it was paused is forgotten as well
+        await plc.call("restart", cold=True, by=BY)  # this also clears the inputs that it received while it was paused
     finally:
         await plc.call("go", by=BY)
     await programs_scan(plc)

@@ -1,4 +1,4 @@
-"""What this computer can do: each check says what it found and, where something is missing, what to change."""
+"""Check the abilities of this computer. Each check reports its finding and, where something is missing, the remedy."""
 
 from __future__ import annotations
 

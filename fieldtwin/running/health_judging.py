@@ -21,7 +21,7 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """One check: its name, the verdict, what was found and, where something is missing, what to change."""
+    """One check: its name, the verdict, the finding and, where something is missing, the remedy."""
 
     name: str
     verdict: Verdict
@@ -39,7 +39,10 @@ class ClockState:
 
 
 def judged_clock(state: ClockState | None) -> Check:
-    """Scans and polls go by the monotonic clock; a wrong time of day makes logs and recordings useless, and TLS fail."""
+    """Judge the clock.
+
+    Scans and polls use the monotonic clock; a wrong time of day spoils logs and recordings and makes TLS fail.
+    """
     if state is None:
         return Check("clock", Verdict.NOTE, "this system does not say whether it is synchronised", "use NTP or PTP")
     if state.year < 2024:
@@ -51,7 +54,10 @@ def judged_clock(state: ClockState | None) -> Check:
 
 
 def judged_can(interfaces: Mapping[str, bool]) -> Check:
-    """`interfaces`: each of the kernel's, and whether it is up. The bit rate is set before that, by whoever may."""
+    """Judge the kernel's CAN interfaces; `interfaces` maps each name to whether it is up.
+
+    The bit rate has to be set before an interface is brought up, by an authorised user.
+    """
     found = ", ".join(name if up else f"{name} (down)" for name, up in interfaces.items())
     down = [name for name, up in interfaces.items() if not up]
     if down:
@@ -61,7 +67,10 @@ def judged_can(interfaces: Mapping[str, bool]) -> Check:
 
 
 def judged_watches(instances: int | None) -> Check:
-    """Nothing of ours waits by inotify; udev, the journal and systemd do, by whom ports come back and services start."""
+    """Judge the inotify limit.
+
+    fieldtwin does not use inotify; udev, journald and systemd need it to announce ports and start services.
+    """
     if instances is None:
         return Check("inotify", Verdict.OK, "not on this system")
     if instances < MIN_INOTIFY:

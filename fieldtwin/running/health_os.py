@@ -1,4 +1,4 @@
-"""What this computer says of itself, for `fieldtwin doctor`: numbers, no verdicts. What cannot be asked is None."""
+"""Properties of this computer for `fieldtwin doctor`: numbers without verdicts. A property that cannot be read is None."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _IFF_UP = 0x1  # linux/if.h
 
 
 def may_realtime() -> tuple[bool, str]:
-    """Whether SCHED_FIFO may be used, by user and limits: nothing is tried. And what is to be said of it."""
+    """Return whether the user and its limits allow SCHED_FIFO, and the message for it. Nothing is tried."""
     try:
         import resource
     except ImportError:
@@ -107,7 +107,7 @@ class _Timex(ctypes.Structure):
 
 
 def clock_state() -> ClockState | None:
-    """What the kernel knows of its clock (adjtimex(2) with nothing to change); None where it cannot be asked."""
+    """Return the kernel's clock state (adjtimex(2) without a change); None where it cannot be read."""
     year = datetime.now(UTC).year
     if not sys.platform.startswith("linux"):
         return None

@@ -11,23 +11,23 @@ from collections import deque
 
 KEPT = 10_000
 SLACK_S = 0.005
-"""A sleep that ends so much later than asked for is what sleeps do: it is never counted."""
+"""Tolerance in seconds: a sleep that overshoots by less is normal and is not counted."""
 
 
 class HostLateness:
-    """What was late, the latest `KEPT` of it."""
+    """The latest `KEPT` delays of the host."""
 
     def __init__(self) -> None:
         self._own: deque[tuple[float, float]] = deque(maxlen=KEPT)
         self._any: deque[tuple[float, float]] = deque(maxlen=KEPT)
 
     def slept(self, t_s: float, late_s: float) -> None:
-        """A sleep of the judge ended at `t_s`, so much later than asked for."""
+        """Record that a sleep of the testing process ended at `t_s`, `late_s` seconds later than requested."""
         if late_s > SLACK_S:
             self._own.append((t_s, late_s - SLACK_S))
 
     def waited(self, t_s: float, late_s: float) -> None:
-        """A look of the judge ended at `t_s`, or a scan of the PLC began by then, so much later than asked for."""
+        """Record that a check ended at `t_s`, or a scan of the PLC began by then, `late_s` seconds late."""
         if late_s > SLACK_S:
             self._any.append((t_s, late_s))
 

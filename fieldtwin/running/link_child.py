@@ -1,4 +1,4 @@
-"""`fieldtwin link` as a process of ours: a virtual serial port here whose line is carried over TCP."""
+"""`fieldtwin link` as a child process: a virtual serial port on this host whose line is carried over TCP."""
 
 from __future__ import annotations
 

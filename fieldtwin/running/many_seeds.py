@@ -42,7 +42,7 @@ def fingerprint(*parts: str) -> str:
 
 
 def what_runs(options: Options) -> str:
-    """A name for what these options run, whatever the seed: of the files' contents and what the command line says."""
+    """Return a fingerprint of these options without the seed, from the contents of the files and the command-line options."""
     anyhow = replace(options, seed=None, trace=None, profiles=())
     if isinstance(anyhow, VirtualOptions):
         anyhow = replace(anyhow, prototype_file=None)
@@ -104,5 +104,8 @@ def shrunk(options: Options, found: SeedResult) -> Shrunk:
 def run_seeds(
     options: Options, seeds: Sequence[int], jobs: int, on_result: Callable[[SeedResult], None] | None = None
 ) -> list[SeedResult]:
-    """A run a seed, `jobs` at a time, in the order of the seeds. `on_result` is told of each as it ends."""
+    """Run each seed, `jobs` at a time, and return the results in the order of the seeds.
+
+    `on_result` is called with each result as its run ends.
+    """
     return each(jobs, run_seed, [replace(options, seed=seed) for seed in seeds], on_result)

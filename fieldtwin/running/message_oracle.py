@@ -10,9 +10,12 @@ MOST_KEPT = 100_000
 
 
 class MessageOracle:
-    """Compares the messages that arrived with those that were sent: `watch`, then `judge`; `wrong` says what differs.
+    """A comparison of the messages that arrived with those that were sent.
 
-    A command may be lost, because faults may lose it. It may not arrive twice, before an older one, or with different bytes.
+    Call `watch`, then `judge`; `wrong` lists the differences.
+
+    A command may be lost, because faults may lose it. It may not arrive twice, before an older one, or with different
+    bytes.
     """
 
     def __init__(self) -> None:

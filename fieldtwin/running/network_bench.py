@@ -1,7 +1,7 @@
-"""Several running systems and the water between them as one scenario's bench: names are ``SYSTEM.DEVICE.TAG``.
+"""A scenario's bench for several running systems and the acoustic channel between them. Names are ``SYSTEM.DEVICE.TAG``.
 
-Each system has a bench of its own and knows of no other; here they are asked by name, and what they note goes into one trace. It
-starts and ends nothing: that is for who makes it.
+Each system has its own bench, which does not know the other systems; this bench passes each query on by name and merges
+their events into one trace. It starts and ends nothing: its creator does that.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class NetworkBench:
         return next(iter(self.parts.values())).bench.now_s()
 
     async def sleep_until_s(self, t_s: float) -> None:
-        for part in self.parts.values():  # behind the first nobody waits any more, but looks
+        for part in self.parts.values():  # after the first, the others no longer wait but read at once
             await part.bench.sleep_until_s(t_s - part.trace.offset_ns / NS_PER_S)
 
     def names(self) -> list[str]:

@@ -1,6 +1,7 @@
-"""A network on this host: each system a run of its own, as processes on ptys and sockets; the water between them is here.
+"""A network on this host: each system runs separately, as processes on ptys and sockets; the acoustic channel runs here.
 
-Start order: the water, the ship, then the systems, all at once. A system that dies does not end the others.
+Start order: the acoustic channel, the topside modem, then all systems at the same time. The end of one system does not
+end the others.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ from fieldtwin.twin.plant.instance import Instance
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """What was asked for. `instance` is the network's; its systems' are INSTANCE-SYSTEM. `duration_s` 0: until stopped."""
+    """The options of a network run.
+
+    `instance` is the network's; its systems' instances are INSTANCE-SYSTEM. `duration_s` 0: until stopped.
+    """
 
     instance: str = ""
     duration_s: float = 0.0
@@ -36,7 +40,7 @@ class NetworkOptions:
     profiles: tuple[Path, ...] = ()
     cold: bool = False
     capture: bool = False
-    """What goes over each system's wires into ``capture.jsonl`` in its run directory."""
+    """Whether each system's bus traffic is written to ``capture.jsonl`` in its run directory."""
     commands: tuple[Scripted, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
     """Of the systems and of the water, under the network's names."""

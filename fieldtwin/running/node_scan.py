@@ -1,4 +1,4 @@
-"""Who is on a CAN bus of this computer: the public door to the CANopen master's node scan. It only reads."""
+"""Scan a CAN bus of this computer for nodes: the public interface of the CANopen master's node scan. It only reads."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ async def scan_can_bus(
     connector: Connector | None = None,
     clock: Clock | None = None,
 ) -> tuple[FoundNode, ...]:
-    """The nodes on the bus at `url` (``can:socketcan/can0``, ``can:fieldtwin/HOST:PORT``), by node id: state, identity, and
-    whether it answers SDOs.
+    """Return the nodes on the bus at `url` by node ID: state, identity, and whether they answer SDO requests.
 
-    Joins the bus at `bitrate` bit/s (0: whatever it runs at, where the medium knows), listens for `listen_s`, then asks
-    each of `nodes`, paced: 17 s for all of them. `on_progress` is told each node id before it is asked. Raises `UsageError`
-    for a url that is no CAN bus, and `Unreachable` or `ConnectionLost` where there is none.
+    `url` is ``can:socketcan/can0`` or ``can:fieldtwin/HOST:PORT``. Joins the bus at `bitrate` bit/s (0: the bus's
+    current rate, where the medium knows it), listens for `listen_s` seconds, then queries each of `nodes` at a limited
+    rate: 17 s for all of them. `on_progress` is called with each node ID before its query. Raises `UsageError` for a
+    URL that is not a CAN bus, and `Unreachable` or `ConnectionLost` where the bus cannot be reached.
     """
     endpoint = Endpoint.parse(url)
     if not endpoint.is_can:

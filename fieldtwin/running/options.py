@@ -1,4 +1,4 @@
-"""What a run was asked to do: the command line's options, checked for sense, before anything starts."""
+"""The command-line options of a run, checked for consistency before anything starts."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class RunOptions:
     thread: str = ""
     """Where the plant's side of a digital thread goes (`fieldtwin.twin.thread.place`), empty for none."""
     thread_store: str = ""
-    """What keeps its log; a file of the instance where nothing is said."""
+    """The store of its log; by default a file of the instance."""
     thread_every_s: float | None = None
     """A tag's new value goes into it at most so often. None: each one; over a modem, one a second."""
     seed: int | None = None

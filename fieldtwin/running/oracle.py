@@ -34,7 +34,10 @@ class Oracle:
         self._gap = False
 
     async def update(self, gateway: ControlClient, field: ControlClient) -> None:
-        """Fetch published first, then held: what was published before is held by then. Both come in pieces."""
+        """Fetch the published values first, then the held ones, so that the held ones cover the published ones.
+
+        Both come in pieces.
+        """
         while len(self._unjudged) < KEPT:  # the rest next time
             piece = (await gateway.call("published", since=self._published))["entries"]
             if not piece:
@@ -74,7 +77,7 @@ class Oracle:
 
     def _judge(self, tag: str, raw: str, value: Any) -> None:
         if tag.split(".", 1)[0] not in self._emulated:
-            return  # a real device in a mixed prototype: nobody knows what it held
+            return  # a real device in a mixed prototype: its register values are not known
         if raw not in self._held[tag] and self._gap:
             self.unknown += 1
             return

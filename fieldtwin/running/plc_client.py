@@ -1,4 +1,4 @@
-"""Reaching the PLC of a running instance, and what is proved and drawn of a system's programs. No output of its own."""
+"""Connect to the PLC of a running instance; run proofs and draw diagrams of a system's programs. It prints nothing."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def programs(system: System) -> dict[str, Program]:
 
 
 def chosen(system: System, name: str, has: Callable[[Program], Any], what: str) -> tuple[str, Any]:
-    """The program that is meant, and what `has` finds in it. Raises `UsageError` when there is none, or which is not clear."""
+    """Return the chosen program and the result of `has` for it. Raises `UsageError` when there is none, or more than one."""
     found = {n: thing for n, p in programs(system).items() if (thing := has(p)) is not None}
     if name and name not in system.plc.programs:
         raise UsageError(f"no program {name!r}", expected=", ".join(system.plc.programs))
@@ -125,7 +125,7 @@ def table_of(program: Program) -> StateTable | None:
 
 
 def proof_of(program: Program) -> Proof | None:
-    """The `PROOF` of a module beside the program's: ``mysite.pump`` has it in ``mysite.pump_proof``."""
+    """Return the `PROOF` of the module next to the program's: that of ``mysite.pump`` is in ``mysite.pump_proof``."""
     module = type(program).__module__
     name = f"{module}_proof"
     try:

@@ -42,7 +42,7 @@ class Probes:
         self._tags.on_put = self._put
         self._updates: dict[str, int] = {}
         self.on_change: Callable[[Kind, str, dict[str, Any]], None] | None = None
-        """Told of each change at once; else they are kept for `changes`."""
+        """Called with each change as it occurs; if None, changes are kept for `changes`."""
         self._events: deque[tuple[int, str, dict[str, Any]]] = deque(maxlen=MOST_EVENTS)
         self._buses = [self._bus(probe, served, connector or OsConnector()) for probe in probes]
 

@@ -1,6 +1,6 @@
-"""Telling a running instance to read its files again: the gateway judges and takes over, the PLC hears of new limits.
+"""Make a running instance read its files again: the gateway checks and applies them, and sends new limits to the PLC.
 
-The same for SIGHUP and for `fieldtwin reload`. No output of its own.
+SIGHUP and `fieldtwin reload` both use it. It prints nothing.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ PATIENCE_S = 120.0
 
 @dataclass(frozen=True)
 class Reloaded:
-    """`applied`: something changed, and all of it counts. Else nothing does; `restart` says what cannot change while it runs.
+    """The result of a reload.
 
-    `warnings` are those of the new file.
+    `applied`: something changed, and all changes took effect. Otherwise none did, and `restart` names the changes that
+    need a restart. `warnings` are those of the new file.
 
     Changes are ``{"where": "plant.yaml:12:5", "what": "devices.ctd...: 1000 -> 500", "live": true}``.
     """

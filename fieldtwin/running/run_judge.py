@@ -1,7 +1,7 @@
-"""`judge: run` of a scenario in virtual time: what `fieldtwin run --virtual` is judged by, besides what the scenario expects.
+"""`judge: run` of a scenario in virtual time: the checks of `fieldtwin run --virtual`, in addition to the scenario's own.
 
-Every value that was published as good is compared with what its device held inside its age; no exchange may be lost, no scan
-stopped; and where every fault was over for a minute, all must be well again.
+Every value published as good is compared with the values that its device held within its age; no exchange may be lost
+and no scan stopped; and once every fault has been over for a minute, everything must be well again.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ TITLE = "what a run in virtual time is judged by"
 
 class _Judged(VirtualRun):
     disturbed = True
-    """What a program should do, the scenario says."""
+    """The scenario decides what a program should do."""
     may_refuse: tuple[str, ...] = ()
     """The outputs whose refusal it expects."""
 
 
 class RunJudge:
-    """`attach`, then `watch` in a task of its own, and `finish` when the scenario is over."""
+    """The checker of a run: `attach`, then `watch` as a task, and `finish` at the end of the scenario."""
 
     def __init__(
         self, scenario: Scenario, prototype: Prototype | None, by_chance: tuple[dict[str, Any], ...] = ()
     ) -> None:
-        """`by_chance`: random faults, which are put in besides those of the steps."""
+        """Prepare the checks. `by_chance`: random faults, in addition to those of the steps."""
         steps = enumerate(scenario.form.steps, 1)
         faults = by_chance + tuple({"id": f"step {n}", **step.fault} for n, step in steps if step.fault is not None)
         if scenario.network is None:
@@ -75,7 +75,7 @@ class RunJudge:
             await first.sleep_until_s(first.now_s() + PIECE_S)
 
     async def finish(self, result: ScenarioResult) -> ScenarioResult:
-        """The scenario's result, failed where the run is no good."""
+        """Return the scenario's result, changed to failed if the run had errors."""
         errors = []
         for name, run in self._runs.items():
             await run.finish(self._benches[name])

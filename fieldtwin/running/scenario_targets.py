@@ -71,7 +71,10 @@ def run_scenario(
 
 
 def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> ScenarioResult:
-    """Run it once. What the target does not allow or cannot do is SKIPPED; a system that is gone is an ERROR with its reason."""
+    """Run the scenario once.
+
+    A scenario that the target does not allow or cannot run is SKIPPED; a lost system is an ERROR with its reason.
+    """
     if target.name == "virtual":
         return run_virtual(scenario, target.seed, trace_file)
     collector = Collector(scenario.system, machines_of(scenario.system))
@@ -114,7 +117,7 @@ def _attempt(scenario: Scenario, target: Target, trace_file: Path | None) -> Sce
 
 
 def _of_a_plant(scenario: Scenario, target: Target) -> str:
-    """What is clear before anything of a plant is touched."""
+    """Return the reason for which a plant cannot run the scenario, found before the plant is accessed, or an empty string."""
     can = {Can.PROBE}
     if target.far:
         can.add(Can.SEND_COMMAND)
@@ -217,13 +220,13 @@ async def _run(scenario: Scenario, target: Target, trace: Trace) -> ScenarioResu
 
 
 def _invariant_names(scenario: Scenario, where: Where) -> set[str]:
-    """The tags and variables of the system file's invariants, where a gateway of ours publishes them."""
+    """Return the tags and variables of the system file's invariants, if a fieldtwin gateway publishes them."""
     ours = not where.foreign and (where.run_dir / "gateway.sock").exists()
     return scenario.invariants.names if ours else set()
 
 
 def _with_what_was_in(result: ScenarioResult, bench: ControlBench) -> ScenarioResult:
-    """A scenario that did not pass says what somebody else had put into the simulated devices before it began."""
+    """Add to a result other than a pass the faults and values that were in the devices before the scenario began."""
     before = bench.lease.before if bench.lease is not None else ""
     if not before or result.verdict in (Verdict.PASSED, Verdict.SKIPPED):
         return result

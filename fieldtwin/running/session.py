@@ -1,8 +1,8 @@
-"""A run: the field side (of a prototype), the PLC and the gateway as processes, the far end, and what they all tell.
+"""A run: the field simulator (of a prototype), PLC, gateway and remote client, and all their results.
 
-Start order: process image, field side, PLC, gateway, far end. Stop order is the reverse, with safe outputs in between and
-the counters of both sides read when nothing is on the wire any more. A process that dies does not end the run: the others show
-what they make of it, and the run's verdict is no. The thread's, which only watches, is started again.
+Start order: process image, field simulator, PLC, gateway, remote client. Stop order is the reverse, with safe outputs
+in between; the counters of both sides are read when the buses are idle. The death of a process does not end the run:
+the other processes show its consequences, and the run fails. The thread's process, which only observes, is restarted.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class RunSession(Started):
                 resolve,  # here and below: a plant has no emulators installed
             )
 
-            resolve(self._field_config(Path()))  # what can be wrong in the files is wrong before anything starts
+            resolve(self._field_config(Path()))  # report errors in the files before anything starts
         self.instance = Instance(options.instance or self.system.name)
         self.mapping: dict[Endpoint, Endpoint] = {}
         self.far: dict[str, Endpoint] = {}
@@ -93,7 +93,7 @@ class RunSession(Started):
         self.oracle = Oracle()
         self.invariants: InvariantWatch | None = None
         if self.system.invariants != NONE_STATED:
-            # Here, because it loads emulators, which a plant does not need.
+            # Imported late because it loads emulators, which a plant does not need.
             from fieldtwin.running.invariant_watch import InvariantWatch
 
             self.invariants = InvariantWatch(self.system)
@@ -145,7 +145,7 @@ class RunSession(Started):
 
     @property
     def calm(self) -> bool:
-        """Whether there were no faults: how long recovery takes is a scenario's to say."""
+        """Return whether the run had no faults. How long recovery takes is for a scenario to check."""
         return not self.options.faults and not self.made_anew
 
     # -- starting -------------------------------------------------------------------------------------------------------
@@ -273,7 +273,7 @@ class RunSession(Started):
             talk.print(remark, soft_wrap=True, markup=False)
 
     async def _lay_cables(self, run_dir: Path) -> None:
-        """A line for each bridge that masters ask over a line: what the plant has there is not touched."""
+        """Make a cable for each bridge that listens on a serial line. The plant's own ports are not opened."""
         for bridge in self.system.serving.bridges:
             if bridge.listen.is_serial:
                 from fieldtwin.running.bridge_cable import BridgeCable  # of a prototype: a plant has no emulators
@@ -292,7 +292,7 @@ class RunSession(Started):
 
     @property
     def _field_client(self) -> ControlClient | None:
-        """The field side's, while it is there."""
+        """Return the control client of the field simulator while it is connected."""
         if self.field_return is not None:
             return self.field_return.client
         return self._field.client if self._field is not None else None
@@ -306,7 +306,8 @@ class RunSession(Started):
         self._nursery.start(self._ask(), "status")
         device = next(iter(self.far), None)
         if device is not None and self.options.prototype and self.options.commands:
-            # Without commands the far end belongs to somebody else (`fieldtwin shore`): two would share out the responses.
+            # Without commands another client uses the remote end (`fieldtwin shore`): two clients would divide the
+            # responses.
             self.shore = Shore(self.system, device, self.far[device], self.clock)
             commands = script(self.options.commands, self.options.duration_s or 20.0)
             self._nursery.start(self.shore.run(commands), "far end")
@@ -415,7 +416,7 @@ class RunSession(Started):
             self._maybe_lost(client, e)
             if isinstance(e, ReplyTimeout) and name and not self._stood_still():
                 self.note_error(f"{name}: the process did not answer within {ANSWERS_WITHIN_S:g} s")
-            return None  # it is dying or gone: _notice_deaths says so with its reason
+            return None  # it is ending or gone: _notice_deaths reports it with its reason
         return answer
 
     def _stood_still(self) -> bool:
@@ -439,13 +440,14 @@ class RunSession(Started):
         try:
             await self.oracle.update(gateway, field)
         except FieldtwinError:
-            pass  # as above; what was lost, the next question finds out
+            pass  # as above; the next query reports a loss
 
     async def reload(self, by: str) -> Reloaded:
         """The gateway reads its files again (`fieldtwin.running.reloading`); no poll is lost by that."""
         if "gateway" not in self._clients:
             raise Unreachable("the gateway is gone")
-        own = await ControlClient.connect_unix(self.instance.path("gateway.sock"))  # statuses are asked for meanwhile
+        # own connection: statuses are queried meanwhile
+        own = await ControlClient.connect_unix(self.instance.path("gateway.sock"))
         try:
             return await reload(own, self._clients.get("plc"), by)
         finally:
@@ -460,7 +462,7 @@ class RunSession(Started):
             await self._nursery.__aexit__(None, None, None)
 
     async def _end_judging(self) -> None:
-        """Look at invariants no more: what stopping does to the outputs is no violation."""
+        """Stop checking invariants: the outputs' change to safe values at the stop is not a violation."""
         if self._judging is not None:
             self._judging.cancel()
             await asyncio.wait([self._judging])

@@ -1,7 +1,7 @@
-"""A digital shadow at work: the thread that brings what the plant saw, the store that keeps it, and the shadow that is given it.
+"""A running digital shadow: the thread that delivers the plant's observations, the store that keeps them, and the shadow.
 
-Here the transmitter's side is assembled, outside of `fieldtwin.twin.model.shadow` (SPEC ruling 16): it acknowledges and asks for
-what is missing, and has no log of its own to send.
+The transmitter's side is assembled here, outside of `fieldtwin.twin.model.shadow` (SPEC ruling 16): it acknowledges
+events and requests missing ones, and has no log to send.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ def limits_of(system: System) -> dict[str, Limits]:
 
 
 class Shadowing:
-    """``await Shadowing(...).run(stop)``. `on_verdict` is told each verdict as it is reached.
+    """A digital shadow of a plant: ``await Shadowing(...).run(stop)``. `on_verdict` is called with each verdict.
 
-    While it runs it serves the verbs ready (something of the plant came, and the thread is there) and get, on `KIND.sock` in the
-    run directory: for health checks.
+    While it runs it serves two commands on `KIND.sock` in the run directory, for health checks: ready (an event of the
+    plant arrived and the thread is connected) and get.
     """
 
     kind = "shadow"
@@ -94,7 +94,7 @@ class Shadowing:
         return ThreadEnd(store, carrier, schema_of(self._system), self.clock, on_events=self._arrived, insists=False)
 
     async def run(self, stop: asyncio.Event, for_s: float = 0.0) -> None:
-        """Shadow the plant until `stop`, or for so many seconds. Raises `FieldtwinError` for a store that cannot be used."""
+        """Shadow the plant until `stop`, or for `for_s` seconds. Raises `FieldtwinError` for a store that cannot be used."""
         system, clock = self._system, self.clock
         store = await open_knowledge(self._store)
         server = ControlServer({"ready": self._ready, "get": self._get})
@@ -131,8 +131,7 @@ class Shadowing:
             await store.aclose()
 
     async def _recall(self, store: KnowledgeStore) -> None:
-        """Begin with what was known of this plant when the shadow ended, if it was there before: by the log that tells the
-        newest, and by no other."""
+        """Restore the knowledge of this plant from the shadow's last run, from the log with the newest event only."""
         newest_ms = 0
         last: dict[tuple[int, str], Event] = {}
         for origin in await store.origins(self._system.name):
@@ -161,10 +160,10 @@ class Shadowing:
         """What else works as long as the shadow does: nothing."""
 
     def _give_up(self) -> None:
-        """The end: what is still under way is not waited for. A shadow has nothing of the kind."""
+        """Stop without waiting for unfinished work. A shadow has none."""
 
     async def _flush(self) -> None:
-        """Nothing more comes: what is left to be written, beside the knowledge."""
+        """Write the remaining data other than the knowledge, after the last event. A shadow has none."""
         return
 
     async def _work(self, writer: KnowledgeWriter) -> None:
@@ -200,7 +199,7 @@ class Shadowing:
         """This is knowledge of our own, and is about to be kept."""
 
     def describe(self) -> dict[str, Any]:
-        """What the shadow knows, and how its thread is."""
+        """Return the shadow's knowledge and the status of its thread."""
         thread = self._end.describe() if self._end is not None else {}
         return {
             "system": self._system.name,

@@ -1,8 +1,7 @@
-"""The far end: a transmitter of its own at the other side of the modems' link, and a script of commands.
+"""The topside controller: a transmitter at the other end of the modems' link, and a script of commands.
 
-It is served by the same `TransmitterDriver` as the plant's side, over the same runtime; only what comes in and what goes
-out are the other way round. Commands are periods in seconds; the next is sent when its time has come and the transmitter
-took the last.
+The same `TransmitterDriver` as on the plant's side serves it, over the same runtime, with inputs and outputs exchanged.
+Commands are periods in seconds; the next is sent when it is due and the transmitter has accepted the last.
 """
 
 from __future__ import annotations
@@ -93,7 +92,7 @@ class Shore:
         self.responses: deque[bytes] = deque(maxlen=KEPT_RESPONSES)
         self.responses_received = 0
         self.on_send: Callable[[int], None] | None = None
-        """Told of each period at the moment when it is commanded."""
+        """Called with each period when it is commanded."""
 
     async def run(self, commands: list[Scripted]) -> None:
         """Serve the far end until cancelled, sending each command at its time."""
@@ -141,7 +140,7 @@ class Shore:
             self.on_send(period_s)
 
     def describe(self) -> dict[str, Any]:
-        """What the far end did and saw, for a summary."""
+        """Return the topside controller's commands, responses and connection state, for a summary."""
         return {
             "connected": self._bus.connected,
             "error": self._bus.error,

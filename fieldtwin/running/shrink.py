@@ -11,7 +11,7 @@ T = TypeVar("T")
 RESULT = TypeVar("RESULT")
 MOST_RUNS = 60
 BROKEN_AT = ": broken at "
-"""What stands in an error between the text of a rule and what was known when it was broken."""
+"""The separator in an error message between a rule's text and the values known when it was broken."""
 _PLAIN = re.compile(r"[A-Za-z_]\w*")
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 

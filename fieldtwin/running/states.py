@@ -1,4 +1,4 @@
-"""The states that a run's programs went through, read from the process image without disturbing anybody."""
+"""The states that a run's programs passed through, read from the process image without affecting any process."""
 
 from __future__ import annotations
 

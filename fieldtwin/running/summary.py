@@ -1,4 +1,4 @@
-"""The verdict on a run: what both sides counted, what was published, which states were seen, and whether all of it agrees."""
+"""The verdict on a run: whether both sides' counters, the published values and the observed states agree."""
 
 from __future__ import annotations
 
@@ -111,11 +111,11 @@ class Run(Protocol):
 
 GATEWAY_GONE = "the gateway did not answer at the end: what it published and what its outputs hold is not known"
 NOT_CALM = "whether devices and outputs were good at the end, because faults were put in"
-"""What a run says that had faults until its end, or until shortly before."""
+"""The message of a run that had faults until its end, or until shortly before."""
 
 
 def summarise(run: Run) -> dict[str, Any]:
-    """Plain data for `--json` and for people. `ok` is False when any check failed; `errors` says which and why."""
+    """Return plain data for `--json` and for printing. `ok` is False when any check failed; `errors` lists the reasons."""
     gateway = run.gateway_status or {}
     plc = run.plc_status or {}
     exchanges = _exchanges(run)
@@ -204,7 +204,7 @@ def _exchanges(run: Run) -> dict[str, Any]:
         row: dict[str, Any] = {
             "gateway": {
                 "requests": counters.get(f"{prefix}requests", 0),
-                # An exception is a reply to whoever sends it. The SDO counters have no such split.
+                # For a client, an exception is a reply. The SDO counters do not separate them.
                 "replies": counters.get(f"{prefix}replies", 0) + counters.get("sdo_aborts" if can else "exceptions", 0),
             },
             "timeouts": counters.get(f"{prefix}timeouts", 0),
@@ -226,8 +226,8 @@ def _exchanges(run: Run) -> dict[str, Any]:
             others = _others(bus, field.get("clients", {}).get(name, {}), run.clients_before.get(name, {}))
             if any(others.values()):
                 row["others"] = others
-                # The bus counts a request when it is sent and the node when it takes it: a third party, which nobody stops
-                # before the counts are read, may have one under way at each node.
+                # The bus counts a request when it is sent, the node when it receives it. A third party is not stopped
+                # before the counts are read, so it may have one request in progress at each node.
                 row["under_way"] = len(devices) if can else 0
                 row["emulators"] = {what: number - others[what] for what, number in row["emulators"].items()}
         if any(d.name == getattr(run, "lent", "") for d in devices):
@@ -248,10 +248,11 @@ def unanswered_at_stop(row: dict[str, Any], devices: int) -> int:
 def _others(
     bus: dict[str, Any], clients: dict[str, dict[str, int]], before: dict[str, dict[str, int]]
 ) -> dict[str, int]:
-    """What third parties asked the emulators of a bus: the traffic of clients whose address is none of the gateway's.
+    """Return the traffic of third parties with the emulators of a bus: that of clients whose address is not the gateway's.
 
-    On a bus of the kernel, where frames have no sender, it is the SDO requests that the gateway did not send itself. Where no
-    client has an address of the gateway's, something between the two translates addresses, and nothing can be told apart.
+    On a kernel CAN bus, where frames have no sender, these are the SDO requests that the gateway did not send itself.
+    If no client has an address of the gateway, addresses are translated on the way and the clients cannot be
+    distinguished.
     """
     ours = set(bus.get("local", ()))
     if not clients:
@@ -293,7 +294,7 @@ def exchange_checks(exchanges: dict[str, Any]) -> list[str]:
 def _device_checks(gateway: dict[str, Any], disturbed: bool) -> list[str]:
     """Return the errors of devices.
 
-    A fault that doubles frames looks like two nodes with one ID, so this is no error when the run is `disturbed`.
+    A fault that doubles frames looks like two nodes with one ID, so this is not an error when the run is `disturbed`.
     """
     return [
         f"{name}: {d['error']}"
@@ -316,8 +317,11 @@ def _output_checks(gateway: dict[str, Any]) -> list[str]:
 
 
 def _refusal_checks(refusals: dict[str, Any], expected: Collection[str], *, disturbed: bool) -> list[str]:
-    """Outputs of programs that were refused: always where the program or the configuration is wrong; where the device refused,
-    unless faults were put in. What is refused by design, tried again or asked by a client fails no run."""
+    """Return the errors of refused outputs of programs.
+
+    A refusal counts if the program or the configuration is wrong, and, in a run without faults, if the device refused.
+    A refusal by design, one that is retried, and one of a client's request do not fail a run.
+    """
     found: dict[tuple[str, str, str], str] = {}
     faults = ("program",) if disturbed else ("program", "device")
     for entry in refusals.get("entries", []):

@@ -17,8 +17,11 @@ from fieldtwin.twin.template.template import MANIFEST, MAX_MANIFEST_BYTES, is_co
 
 @dataclass(frozen=True, slots=True)
 class Stranger:
-    """What a template brings that somebody has to agree to: `code` are files that Python would run, `reach` says what its
-    prototype uses of this computer (`fieldtwin.twin.template.reach`)."""
+    """The parts of a template that need the user's consent.
+
+    `code` are files that Python would run, `reach` lists the resources of this computer that its prototype uses
+    (`fieldtwin.twin.template.reach`).
+    """
 
     path: Path
     code: tuple[str, ...] = ()
@@ -26,7 +29,7 @@ class Stranger:
 
 
 Ask = Callable[[Stranger], bool]
-"""Asks somebody whether it may be run; says what came."""
+"""Asks the user whether it may be run, showing the template's contents."""
 
 
 def system_file(
@@ -50,7 +53,7 @@ def system_file(
         try:
             found = find("systems", name, extra=profiles)
         except UsageError:
-            return name  # whoever reads it says what is wrong with it
+            return name  # its later reader reports the error in it
         if _templates_above(found, prototype_file):
             agree(ask, path, [(load_system(name, profiles), prototype_file)], plant=plant, virtual=virtual)
         return name
@@ -77,11 +80,12 @@ def agree(
     plant: bool = False,
     virtual: bool = False,
 ) -> None:
-    """The one place where a stranger's files are agreed to: `ask` once about everything that is inside of unpacked templates.
+    """Ask the user once about everything in unpacked templates.
 
-    Each of `systems` is with its prototype file, None: the one beside it. `beside` is a file that names them, a scenario's or a
-    network's, and `opens` what it opens itself, if it is a stranger's. Nothing is asked where all of it is one's own. Call it
-    before anything of them is run: putting a process image together imports programs. Raises `NotAllowed`.
+    This is the only place where consent to foreign files is given. Each of `systems` is with its prototype file; None:
+    the one next to it. `beside` is a file that names them, a scenario's or a network's, and `opens` lists the endpoints
+    that it opens itself, if it is from a template. Nothing is asked if all files are the user's own. Call it before any
+    of them is run: assembling a process image imports programs. Raises `NotAllowed`.
     """
     code: dict[str, None] = {}
     reaches: dict[str, None] = {}
@@ -121,8 +125,10 @@ def _is_unpacked(folder: Path) -> bool:
 
 
 def _elsewhere(system: System) -> tuple[str, ...]:
-    """Programs in Python that are neither ours nor in the template: what of this computer they are, nobody looked at. A template
-    as it was packed has none."""
+    """Return the Python programs that are neither fieldtwin's nor in the template.
+
+    Their use of this computer was not checked. A template has none of them when it is packed.
+    """
     sources = [form.source.partition(":") for form in system.plc.programs.values()]
     modules = [rest.strip().partition(":")[0].strip() for kind, _, rest in sources if kind.strip() == "python"]
     return tuple(
@@ -154,7 +160,10 @@ def _of_prototype(system: System, file: Path, folders: Iterable[Path]) -> tuple[
 
 
 def _unpacked(package: Package) -> Path:
-    """The folder with the contents of a zip. What is unpacked already does not excuse a zip that was damaged since."""
+    """Return the folder with the contents of a zip file.
+
+    An existing folder does not hide later damage to the zip: it is verified.
+    """
     folder = runtime_root() / "templates" / package.manifest.id[:32]
     if folder.exists():
         package.verify()

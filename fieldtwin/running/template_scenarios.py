@@ -20,10 +20,10 @@ from fieldtwin.twin.site.system import System, load_system
 def agree_to_scenario(
     ask: Ask, path: Path, profiles: Iterable[Path] = (), *, plant: bool = False, virtual: bool = False
 ) -> None:
-    """Ask about the system or network of the scenario in `path`, and its probes, where they are inside of a template.
+    """Ask about the system or network of the scenario in `path`, and its probes, if they are inside a template.
 
-    `plant`: the run has no prototype; `virtual`: it opens nothing. What cannot be read is left to whoever reads it next. Raises
-    `NotAllowed`.
+    `plant`: the run has no prototype; `virtual`: it opens no endpoint. A file that cannot be read is left to its next
+    reader. Raises `NotAllowed`.
     """
     profiles = tuple(profiles)
     try:
@@ -35,7 +35,10 @@ def agree_to_scenario(
 
 
 def _systems(path: Path, said: Mapping[str, Any], profiles: tuple[Path, ...]) -> list[tuple[System, Path | None]]:
-    """As `fieldtwin.scenarios.form` finds them: beside it, or shipped. A network's are all of its members'."""
+    """Find the systems as `fieldtwin.scenarios.form` does: next to the scenario, or shipped.
+
+    A network yields all its members' systems.
+    """
     name, prototype = str(said.get("system", "")), said.get("prototype")
     beside = path.parent / name
     named = str(beside) if beside.exists() else name.removesuffix(".yaml")

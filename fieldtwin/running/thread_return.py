@@ -1,7 +1,7 @@
-"""The thread's process of a run, kept: started again when it dies. It watches; nothing that controls anything depends on it, so a
-plant goes on without, and what nobody watched is in no log. The shorter that is, the better.
+"""Keep the thread's process of a run alive: restart it when it dies.
 
-It must never know what a thread is, nor where it goes.
+The thread only observes, and no control function depends on it, so a plant continues without it; events during the gap
+are in no log, so the gap is kept short. This module must not depend on what a thread is, nor on its destination.
 """
 
 from __future__ import annotations
@@ -21,8 +21,11 @@ LOOK_S = 0.1
 
 
 class ThreadReturn:
-    """Watches over `child`. `start` makes another one, `came` is given its control channel; `failed` is told why one did not come
-    up. `deaths` counts. `end` ends the child that there is, when this does not run any more."""
+    """A watcher of `child`.
+
+    `start` makes a new one, `came` is called with its control channel; `failed` is called with the reason why one did
+    not start. `deaths` counts them. After `run` has ended, `end` ends the current child.
+    """
 
     def __init__(
         self,

@@ -39,7 +39,7 @@ Expression = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 class QuestionForm(Strict):
-    """What a prototype is asked before a command is sent. At least one expression must be required."""
+    """The query to a prototype before a command is sent. At least one expression must be required."""
 
     model_config = ConfigDict(validate_by_name=False)
 
@@ -71,7 +71,7 @@ class RulesForm(Strict):
 
 
 class Plans(NamedTuple):
-    """A planner; what is asked of a prototype before each command for which no rule says more; the limits that it is told of."""
+    """A planner, the default query to a prototype before each command, and the limits that the planner receives."""
 
     planner: Planner
     question: Question | None = None
@@ -79,7 +79,10 @@ class Plans(NamedTuple):
 
 
 def load_planner(source: str, system: System) -> Plans:
-    """``FILE.yaml``, or ``python: module:Class``, beside the system file or here. Raises `FileInvalid`."""
+    """Load ``FILE.yaml``, or ``python: module:Class`` from the system file's folder or the current one.
+
+    Raises `FileInvalid`.
+    """
     language, _, rest = source.partition(":")
     if language.strip() == "python":
         made = PythonPlanner(source, rest.strip(), system)
@@ -129,7 +132,7 @@ def _question(file: YamlFile, loc: tuple[Key, ...], form: QuestionForm) -> Quest
 
 
 class PythonPlanner:
-    """A planner that somebody wrote: whatever it raises is a `FileInvalid` that names it. `limits` are its own, if any."""
+    """A planner in user code. Any exception in it becomes a `FileInvalid` that names it. `limits` are its own, if any."""
 
     def __init__(self, source: str, name: str, system: System) -> None:
         self._source = source

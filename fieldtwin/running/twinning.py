@@ -1,6 +1,6 @@
-"""A digital twin at work: the shadow, and the way back. Its commands are a log that the thread brings to the plant.
+"""A running digital twin: the shadow, and the way back. Its commands form a log that the thread delivers to the plant.
 
-Where it was told to, it asks a prototype first, in a process beside it (`fieldtwin.whatif.asking`).
+If configured, it first queries a prototype in a separate process (`fieldtwin.whatif.asking`).
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from fieldtwin.whatif.asking import Asking
 
 
 class Twinning(Shadowing):
-    """As `Shadowing`, with a planner. `on_command` is told each command that is sent, `on_refusal` why one is not, here or
-    at the plant.
+    """A `Shadowing` with a planner.
 
-    `limits` are held against values instead of those of the profiles. With `asking` a prototype is asked `question` before each
-    command, or what the planner says of it.
+    `on_command` is called with each command that is sent, `on_refusal` with the reason why one is refused, here or at
+    the plant. `limits` replace those of the profiles. With `asking`, a prototype is queried before each command, with
+    `question` or the planner's own.
     """
 
     kind = "twin"
@@ -91,7 +91,7 @@ class Twinning(Shadowing):
         return end
 
     def plan(self, command: COMMAND) -> None:
-        """Somebody's plan, by hand: it goes the way of every other, as soon as the plant was heard of."""
+        """Add a user's plan by hand. It is handled like any other, after the first event of the plant."""
         self._by_hand.append(command)
 
     async def _arrived(self, origin: str, events: Sequence[Event]) -> None:
@@ -135,7 +135,7 @@ class Twinning(Shadowing):
             self._on_command(command)
         if self._way_back is not None and self._commands is not None:
             self._way_back.pump()
-            await self._commands.try_to_flush()  # what is not on record is not sent
+            await self._commands.try_to_flush()  # a command that is not on record is not sent
 
     def _store_trouble(self, writer: KnowledgeWriter) -> str:
         return writer.trouble or (self._commands.trouble if self._commands is not None else "")

@@ -9,7 +9,10 @@ from fieldtwin.gateway.core.nursery import Nursery
 
 
 async def until_stopped(nursery: Nursery) -> None:
-    """Return at SIGINT or SIGTERM. Raises what a child of `nursery` failed with, at once: nobody serves silently no more."""
+    """Return at SIGINT or SIGTERM.
+
+    Raises the error of a failed child of `nursery` at once, so that no server stops silently.
+    """
     stop = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):

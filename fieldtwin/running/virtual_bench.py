@@ -1,6 +1,6 @@
-"""A prototype in virtual time as a scenario's bench: what happens is traced, and whoever judges asks here.
+"""A scenario's bench for a prototype in virtual time: events are traced here, and checks query it.
 
-A `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `VirtualLoop`.
+This is a `fieldtwin.scenarios.bench.Bench` for the target `virtual`, inside one `VirtualLoop`.
 """
 
 from __future__ import annotations

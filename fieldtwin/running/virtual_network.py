@@ -1,6 +1,6 @@
-"""A network in virtual time: the prototypes of all its systems in one loop, with the water between their modems and one seed.
+"""A network in virtual time: the prototypes of all its systems in one loop, with the acoustic channel and one seed.
 
-Each system is as it is alone (`VirtualBench`); what they hear of each other comes through their modems.
+Each system behaves as it does alone (`VirtualBench`); the systems affect each other only through their modems.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """A run of a network in virtual time: ``fieldtwin run NETWORK --prototype --virtual --for 1h``.
 
-Each system is judged as it is alone (`VirtualRun`): what was published against what its devices held, what both sides counted.
+Each system is checked as it is alone (`VirtualRun`): published values against those that its devices held, and the
+counters of both sides.
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from fieldtwin.twin.network.network import load_network
 
 @dataclass(frozen=True)
 class VirtualNetworkOptions:
-    """What to run, and for how long. `system` is the network's file; `faults` is put in besides; `trace` is a file for every
-    event."""
+    """The system to run and the duration of the run.
+
+    `system` is the network's file; `faults` are injected in addition; `trace` is a file for every event.
+    """
 
     system: str
     duration_s: float
@@ -33,7 +36,7 @@ class VirtualNetworkOptions:
     commands: tuple[Scripted, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
     random_faults: RandomFaults | None = None
-    """What the seed chooses faults from, besides `faults`."""
+    """The random faults that the seed chooses, in addition to `faults`."""
     trace: Path | None = None
 
     def make(self) -> VirtualNetworkRun:

@@ -1,7 +1,7 @@
 """A run in virtual time: ``fieldtwin run SYSTEM --prototype --virtual --seed N --for 24h``.
 
-Everything happens in this thread, sealed off from clocks, sockets and threads; between two pieces of the run the world is
-looked at again, to show how far it is. What is the same from run to run is traced and hashed.
+Everything happens in this thread, without access to clocks, sockets and threads; between two pieces of the run that
+access is allowed, to report progress. Everything that is the same from run to run is traced and hashed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LAST_REPLIES_S = 0.5
 CALM_S = 60.0
 """How long after the last fault all must be well again."""
 CAN_WIRE_NS = 10 * NS_PER_MS
-"""What a frame may need on a CAN bus: several attempts, behind others."""
+"""The time that a frame may need on a CAN bus: several attempts, after other frames."""
 STALE_CHECK_NS = 100 * NS_PER_MS
 """How often, at most, the oracle looks for values that are still good although they are older than they may be."""
 _GOOD = Quality.GOOD  # an Enum's members are slow to look up
@@ -50,7 +50,7 @@ _GOOD = Quality.GOOD  # an Enum's members are slow to look up
 
 @dataclass(frozen=True)
 class VirtualOptions:
-    """What to run, and for how long. `faults` is put in besides; `trace` is a file for every event."""
+    """The system to run and the duration of the run. `faults` are injected in addition; `trace` is a file for every event."""
 
     system: str
     duration_s: float
@@ -62,7 +62,7 @@ class VirtualOptions:
     commands: tuple[int, ...] = ()
     faults: tuple[dict[str, Any], ...] = ()
     random_faults: RandomFaults | None = None
-    """What the seed chooses faults from, besides `faults`."""
+    """The random faults that the seed chooses, in addition to `faults`."""
     trace: Path | None = None
 
     prototype: bool = True
@@ -89,7 +89,7 @@ class VirtualRun(DrivenRun):
             recordings=options.recordings,
             speed=options.speed,
         )
-        twin = resolve(config)  # what can be wrong in the files is wrong before anything starts
+        twin = resolve(config)  # report errors in the files before anything starts
         self.options = options
         self.system = twin.ecs.system
         self.prototype = twin.prototype
@@ -188,7 +188,7 @@ class VirtualRun(DrivenRun):
             self.states.note(program, state, bench.loop.now_ns)
 
     def judge(self, bench: VirtualBench) -> None:
-        """What was published since the last time; often enough that no journal forgets."""
+        """Check the values published since the last call. Call it often enough that no journal overflows."""
         self.elapsed_s = bench.now_s()
         self._judge(bench.run.field)
 
@@ -231,8 +231,8 @@ class VirtualRun(DrivenRun):
                 told(name, value)
             check_ages()
             if value.quality is _GOOD:
-                # A value is of the moment in which its reply was complete; the device answered after it was asked. What a node
-                # sends unasked was on the wire for a while, longer where it had to be sent again.
+                # A value is timed at the moment when its reply was complete; the device answered after the request. A
+                # node's unrequested message was on the bus for some time, longer if it had to be sent again.
                 try:
                     asked = asked_of[name]
                 except KeyError:

@@ -84,7 +84,7 @@ def run_virtual(
 async def _judged(
     scenario: Scenario, runner: Runner, judge: RunJudge | None, benches: Mapping[str, VirtualBench]
 ) -> ScenarioResult:
-    """The scenario, and besides it what a run is judged by, if it says so."""
+    """Run the scenario, with the checks of a run in addition if it requests them."""
     if judge is None:
         return await runner.run()
     judge.attach(benches)

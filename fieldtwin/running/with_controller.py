@@ -47,7 +47,7 @@ class WithController(Started):
         super().__init__()
         self.instance = Instance(name)
         self.env: dict[str, str] = {}
-        """What the program finds the devices by."""
+        """The environment variables that tell the program where the devices are."""
         self._system = system
         self._config = config
         self._argv = list(argv)

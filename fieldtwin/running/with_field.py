@@ -1,6 +1,6 @@
-"""Somebody else's program against the emulated field: started with the ports in its environment, waited for, its status kept.
+"""Run a third-party program against the emulated field: start it with the ports in its environment, return its exit status.
 
-What the program does is its own affair: it has the terminal, its output is not touched, and Ctrl-C is for it.
+The program keeps the terminal: its output is not changed, and Ctrl-C goes to it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Tell = Callable[[dict[str, str]], None]
 
 
 def environment(contact: FieldContact, system: System, control: Path) -> dict[str, str]:
-    """What the program finds the field by (docs/scenarios.md has the table)."""
+    """Return the environment variables that tell the program where the field is (docs/scenarios.md has the table)."""
     env = _of_system(system, control)
     for name, bus in system.buses.items():
         endpoint = contact.mapping.get(bus.endpoint)
@@ -51,7 +51,7 @@ def environment(contact: FieldContact, system: System, control: Path) -> dict[st
 
 
 def environment_from(status: Mapping[str, Any], system: System, host: str, control: Path) -> dict[str, str]:
-    """The same, from what a field side on `host` answers to `get`. What cannot be reached from here is left out."""
+    """Return the same from the answer of a field simulator on `host` to `get`. Ports that cannot be reached are omitted."""
     env: dict[str, str] = {}
     for bus, url in status["listening"].items():
         with suppress(UsageError):  # a virtual serial port on another host
@@ -101,17 +101,18 @@ async def run_with(
     tell: Tell,
     tell_struck: Callable[[list[dict[str, Any]]], None] = lambda struck: None,
 ) -> int:
-    """Bring the field side of `config` up (its `run_dir` is chosen here), run `argv`, take all down; the exit status of `argv`,
-    128 and the signal's number where a signal ended it. `tell` is given the environment before `argv` starts, `tell_struck` how
-    often each fault struck after it ended.
+    """Start the field simulator of `config`, run `argv`, and stop both. Return the exit status of `argv`.
 
-    Raises `UsageError` for a program that there is not, before anything starts; `ChildFailed` when the field side ended
-    meanwhile and the program had nothing to object.
+    The status is 128 and the signal's number if a signal ended it. The `run_dir` of `config` is chosen here. `tell` is
+    called with the environment before `argv` starts, `tell_struck` after its end with how often each fault took effect.
+
+    Raises `UsageError` for a missing program, before anything starts; `ChildFailed` when the field simulator ended
+    during the run and the program exited with success.
     """
     program = shutil.which(argv[0])
     if program is None:
         raise UsageError(f"cannot start {argv[0]!r}: no such program", hint="is it on the PATH, and executable?")
-    resolve(config)  # what can be wrong in the files is wrong before anything starts
+    resolve(config)  # report errors in the files before anything starts
     system = load_system(config.system, [Path(p) for p in config.profiles])
     name = instance or f"with-{os.getpid()}"
     with Instance(name) as home:
@@ -126,7 +127,7 @@ async def run_with(
                 tell_struck,
             )
         finally:
-            if not instance:  # nobody else knows its name
+            if not instance:  # no other process knows its name
                 shutil.rmtree(home.dir, ignore_errors=True)
 
 
@@ -185,7 +186,8 @@ async def _run_program(argv: list[str], env: Mapping[str, str]) -> int:
         pass_on(signal.SIGTERM)
         terminated.set()
 
-    loop.add_signal_handler(signal.SIGINT, interrupted)  # before there is a program that could be told past us
+    # before a program exists that could receive the signal without us
+    loop.add_signal_handler(signal.SIGINT, interrupted)
     loop.add_signal_handler(signal.SIGTERM, to_end)
     try:
         try:

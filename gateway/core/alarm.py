@@ -1,7 +1,8 @@
-"""Waiting for something, and no longer than so long: the future that is awaited, and the timer that ends it.
+"""Wait for an event with a time limit: the future that is awaited, and the timer that ends the wait.
 
-An event loop for simulated time may offer `alarm(delay_s)`: a future that is done then, or before by whoever sets it. That takes
-half the steps of a future and a timer; on any other loop it is those two.
+An event loop for simulated time may offer `alarm(delay_s)`, which returns a future that is done after the delay, or
+earlier if the caller sets its result. That takes half the steps of a future and a timer; any other loop gets a future
+and a timer.
 """
 
 from __future__ import annotations
@@ -11,8 +12,10 @@ from collections.abc import Callable
 
 
 def alarm(loop: asyncio.AbstractEventLoop, delay_s: float) -> tuple[asyncio.Future[None], Callable[[], None] | None]:
-    """A future that is done after `delay_s` seconds, or before by whoever sets its result; and what to call once it was awaited,
-    if anything."""
+    """Return a future that is done after `delay_s` seconds, or earlier if the caller sets its result.
+
+    The second value is a function to call after the future was awaited, or None if there is nothing to call.
+    """
     made = getattr(loop, "alarm", None)
     if made is not None:
         return made(delay_s), None
@@ -21,6 +24,6 @@ def alarm(loop: asyncio.AbstractEventLoop, delay_s: float) -> tuple[asyncio.Futu
 
 
 def ring(waiter: asyncio.Future[None]) -> None:
-    """End the wait, unless it has ended."""
+    """End the wait, unless it has already ended."""
     if not waiter.done():
         waiter.set_result(None)

@@ -1,9 +1,9 @@
-"""What a CAN controller tells of itself, and the error frame that carries it, as Linux lays it out (linux/can/error.h).
+"""The error frames in which a CAN controller reports its state, in the layout of Linux (linux/can/error.h).
 
-An error frame in this sense never was on a wire: it is a message of the controller to its own node. Its identifier has class
-bits, its 8 bytes say more: byte 1 what the controller is, byte 2 which violation, bytes 6 and 7 the transmit and receive error
-counters. python-can, candump and the kernel's interfaces speak the same, so that a node needs no second language for the
-software bus. What a node does about it is not known here.
+Such an error frame is never sent on the bus: the controller passes it to its own node. The identifier holds class bits.
+Of the 8 data bytes, byte 1 holds the controller's state, byte 2 the kind of violation, and bytes 6 and 7 the transmit
+and receive error counters. python-can, candump and the kernel's interfaces use the same layout, so a node needs no
+second format for the software bus. How a node reacts to an error frame is decided elsewhere.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _VIOLATIONS = {"bit": 0x01, "form": 0x02, "stuff": 0x04}
 
 
 class CanErrorState(Enum):
-    """Fault confinement (ISO 11898-1, 12.1.4), and the warning level of 96 that controllers tell besides."""
+    """The states of fault confinement (ISO 11898-1, 12.1.4), and the warning level (96) that controllers also report."""
 
     ACTIVE = "error-active"
     WARNING = "error-warning"
@@ -37,7 +37,10 @@ class CanErrorState(Enum):
 
 
 def state_frame(state: CanErrorState, tec: int, rec: int, *, restarted: bool = False, t_ns: int = 0) -> CanFrame:
-    """The controller has come to `state` with these error counters; `restarted`: by recovering from bus-off."""
+    """Return the frame for a controller that entered `state` with these error counters.
+
+    `restarted` is true if the controller entered the state by recovering from bus-off.
+    """
     data = bytearray(8)
     data[6], data[7] = min(tec, 255), min(rec, 255)
     if state is CanErrorState.BUS_OFF:
@@ -55,12 +58,15 @@ def state_frame(state: CanErrorState, tec: int, rec: int, *, restarted: bool = F
 
 
 def overrun_frame(t_ns: int = 0) -> CanFrame:
-    """Frames came and were lost, since nobody took them in time."""
+    """Return the frame for received frames that were lost because the node did not read them in time."""
     return CanFrame(CLASS_CONTROLLER, bytes((0, _OVERFLOW, 0, 0, 0, 0, 0, 0)), error=True, t_ns=t_ns)
 
 
 def violation_frame(kind: str, tec: int, rec: int, t_ns: int = 0) -> CanFrame:
-    """An error on the wire, as the controller saw it. `kind`: ``bit``, ``stuff``, ``form``, ``crc`` or ``ack``."""
+    """Return the frame for a bus error that the controller detected.
+
+    `kind` is ``bit``, ``stuff``, ``form``, ``crc`` or ``ack``.
+    """
     data = bytearray(8)
     data[2] = _VIOLATIONS.get(kind, 0)
     data[3] = 0x08 if kind == "crc" else 0  # location: CRC sequence
@@ -70,7 +76,10 @@ def violation_frame(kind: str, tec: int, rec: int, t_ns: int = 0) -> CanFrame:
 
 
 def told_state(frame: CanFrame) -> CanErrorState | None:
-    """The state that an error frame tells; None for a frame that tells none (an overrun, a violation, no error frame)."""
+    """Return the state that an error frame reports, or None if it reports none.
+
+    An overrun, a violation and a frame that is not an error frame report no state.
+    """
     if not frame.error:
         return None
     if frame.can_id & CLASS_BUS_OFF:
@@ -86,5 +95,5 @@ def told_state(frame: CanFrame) -> CanErrorState | None:
 
 
 def tells_overrun(frame: CanFrame) -> bool:
-    """Whether an error frame says that received frames were lost."""
+    """Return whether an error frame reports that received frames were lost."""
     return bool(frame.error and frame.can_id & CLASS_CONTROLLER and len(frame.data) > 1 and frame.data[1] & _OVERFLOW)

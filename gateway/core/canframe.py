@@ -1,9 +1,10 @@
 """One CAN frame, and the fixed-size record that carries it over the software CAN bus.
 
-The record is a carrier, not a protocol under test: both sides may share it. Its layout (network byte order, 24 bytes):
-flags u8, dlc u8, two spare bytes, identifier u32, time stamp u64 (ns), data 8 bytes padded with zeros. A connection that carries
-CAN FD has records of 80 bytes, which differ only in their 64 bytes of data; their dlc is the number of bytes.
-Fixed size, so that a reader can take exactly one from a socket and leave the rest readable (DESIGN.md decision 4).
+The record is a transport format, not a protocol under test, so the gateway and the emulators may share it. A record has
+24 bytes, in network byte order: flags u8, dlc u8, two spare bytes, identifier u32, time stamp u64 (ns), and 8 data
+bytes padded with zeros. On a connection that carries CAN FD, records have 80 bytes; they differ only in their 64 data
+bytes, and their dlc is the number of bytes. The size is fixed so that a reader can take exactly one record from a
+socket and leave the rest readable (DESIGN.md, decision 4).
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ _FD_RECORD = struct.Struct("!BBxxIQ64s")
 RECORD_SIZE = _RECORD.size
 FD_RECORD_SIZE = _FD_RECORD.size
 FD_LENGTHS = frozenset({*range(9), 12, 16, 20, 24, 32, 48, 64})
-"""Bytes that a CAN FD frame can carry (ISO 11898-1:2015, 10.4.2.4)."""
+"""The data lengths in bytes that a CAN FD frame can carry (ISO 11898-1:2015, 10.4.2.4)."""
 
 FLAG_EXTENDED = 0x01
 FLAG_REMOTE = 0x02
 FLAG_ERROR = 0x04
 FLAG_TX_CONFIRMED = 0x08
-"""The bus tells the sender that this very frame was on the wire (record only; never on a received frame)."""
+"""The bus confirms to the sender that this frame was sent on the bus. Only in records; never set on a received frame.
+"""
 FLAG_FD = 0x10
 FLAG_BIT_RATE_SWITCH = 0x20
 FLAG_ERROR_STATE = 0x40
@@ -36,13 +38,14 @@ _set = msgspec.structs.force_setattr
 
 
 class CanFrame(msgspec.Struct, frozen=True, gc=False):
-    """A classic CAN frame, or one of CAN FD. `can_id` is 11 bits, 29 with `extended`; `data` is 0 to 8 bytes.
+    """A classic CAN frame or a CAN FD frame.
 
-    With `fd` it carries up to 64 bytes (`FD_LENGTHS`) and `dlc` is their number; with `brs` its data phase is sent at the data
-    bit rate, and `esi` says that its sender was error-passive.
+    `can_id` has 11 bits, or 29 with `extended`; `data` has 0 to 8 bytes. With `fd`, `data` has up to 64 bytes
+    (`FD_LENGTHS`) and `dlc` is their number; with `brs`, the data phase is sent at the data bit rate; `esi` means that
+    the sender was error-passive.
 
-    A remote frame (`remote`) has no data and asks for `dlc` bytes. `t_ns` is when it was received (monotonic, 0 if
-    unknown) and does not count for equality of content: compare `key()`.
+    A remote frame (`remote`) has no data and requests `dlc` bytes. `t_ns` is the time of reception (monotonic, 0 if
+    unknown). It does not count when the contents of two frames are compared: compare `key()`.
     """
 
     can_id: int
@@ -64,7 +67,7 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
             self._check_fd()
             return
         if 0 <= self.can_id <= 0x7FF and length <= 8 and self.dlc <= 8:
-            return  # whatever its flags
+            return  # valid with any flags
         limit = 0x1FFFFFFF if self.extended or self.error else 0x7FF
         if not 0 <= self.can_id <= limit or len(self.data) > 8 or self.dlc > 8:
             raise Desync(
@@ -84,17 +87,19 @@ class CanFrame(msgspec.Struct, frozen=True, gc=False):
             )
 
     def at(self, t_ns: int) -> CanFrame:
-        """The same frame, received at `t_ns`."""
-        frame: CanFrame = self.__copy__()  # type: ignore[attr-defined]  # each Struct's: what is a frame is not checked again
+        """Return the same frame with the time of reception `t_ns`."""
+        frame: CanFrame = self.__copy__()  # type: ignore[attr-defined]  # of every Struct; a valid frame is not checked again
         _set(frame, "t_ns", t_ns)
         return frame
 
     def key(self) -> tuple[int, bytes, bool, bool, bool, int, bool, bool, bool]:
-        """All that is on the wire: equal for frames that look the same to a bus analyser."""
+        """Return everything that is sent on the bus: equal for frames that a bus analyser cannot tell apart."""
         return self.can_id, self.data, self.extended, self.remote, self.error, self.dlc, self.fd, self.brs, self.esi
 
     def __str__(self) -> str:
-        """As candump writes it: ``705#7F`` or ``605#R8``; ``123##1CAFE`` for CAN FD with bit-rate switch."""
+        """Return the frame in candump's notation: ``705#7F``, ``605#R8``, or ``123##1CAFE`` for CAN FD with bit-rate
+        switch.
+        """
         width = 8 if self.extended else 3
         if self.fd:
             return f"{self.can_id:0{width}X}##{self.brs + 2 * self.esi:X}{self.data.hex().upper()}"
@@ -126,9 +131,9 @@ def pack_record(frame: CanFrame, *, confirmed: bool = False, fd: bool = False) -
 
 
 def unpack_record(record: bytes) -> tuple[CanFrame, bool]:
-    """Return a frame and whether the record is a TX confirmation; its length says which kind of record it is.
+    """Return the frame of a record, and whether the record is a TX confirmation.
 
-    Raises `Desync` on a record that is none.
+    The length says whether it is a classic or a CAN FD record. Raises `Desync` if the bytes are not a valid record.
     """
     if len(record) not in (RECORD_SIZE, FD_RECORD_SIZE):
         raise Desync("a record of the software CAN bus", expected=f"{RECORD_SIZE} bytes", got=f"{len(record)} bytes")

@@ -1,7 +1,7 @@
-"""Time enters by this door.
+"""The interface through which all code reads the time and waits.
 
-Everything that needs to know what time it is, or to wait, is given a `Clock` or is passed ``now``. The wall
-implementation is in gateway/wallclock.py; a virtual one belongs to the prototype. No module of fieldtwin.gateway.core imports
+Code that needs the time, or has to wait, receives a `Clock` or is passed ``now``. The implementation for real time is
+in gateway/wallclock.py; the one for virtual time belongs to the simulation. No module of fieldtwin.gateway.core imports
 ``time``.
 """
 
@@ -14,16 +14,18 @@ NS_PER_MS = 1_000_000
 
 
 class Clock(Protocol):
-    """Monotonic nanoseconds for intervals, UTC nanoseconds for people, and waiting."""
+    """Monotonic nanoseconds for intervals, UTC nanoseconds for display, and waiting."""
 
     def monotonic_ns(self) -> int:
-        """Nanoseconds since an arbitrary start; never goes back. On one host the same for every process."""
+        """Return nanoseconds since an arbitrary start. They never go back, and all processes of a host see the same
+        time.
+        """
         ...
 
     def utc_ns(self) -> int:
-        """Nanoseconds since 1970-01-01T00:00:00Z; may jump when the host's clock is set."""
+        """Return nanoseconds since 1970-01-01T00:00:00Z. They may jump when the host's clock is set."""
         ...
 
     async def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Return at or after `deadline_ns` of `monotonic_ns`; at once when that has passed."""
+        """Return at or after `deadline_ns` of `monotonic_ns`, or immediately if it has passed."""
         ...

@@ -1,12 +1,13 @@
 """Connections: the paper's pure stream, and the asynchronous ends that wrap it.
 
-`Connection` is SPEC's schema to the letter: a protocol type and a FIFO of data that is empty after Init, appended to
-by `write` and read from its head. `ByteConnection` and `CanConnection` are what drivers and devices hold: one end of
-a duplex medium (SPEC ruling 4), whose inbound direction *is* such a stream. An operating-system end
-(fieldtwin.gateway.connections), an emulator's end (fieldtwin.emulators.endpoints) and an in-memory one differ only in who feeds
-it.
+`Connection` follows SPEC's schema exactly: a protocol type and a FIFO of data that is empty after Init, appended to by
+`write`, and read from its head. Drivers and devices hold a `ByteConnection` or a `CanConnection`: one end of a duplex
+medium (SPEC ruling 4), whose inbound direction is such a stream. An end of the operating system
+(fieldtwin.gateway.connections), an emulator's end (fieldtwin.emulators.endpoints) and an in-memory end differ only in
+what feeds them.
 
-Nobody but a `Connector` opens a wire: the runtime receives one, and no driver knows what stands behind it.
+Only a `Connector` opens a port, socket or bus. The runtime receives a `Connector`, and no driver knows which kind it
+uses.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from fieldtwin.gateway.core.errors import Bug, ConnectionLost, FieldtwinError
 
 
 class PROTOCOL(Enum):
-    """The paper's PROTOCOL type: what kind of wire it is. CAN is ours (SPEC ruling 13)."""
+    """The paper's PROTOCOL type: the kind of link. CAN is an addition of this project (SPEC ruling 13)."""
 
     RS232 = "RS232"
     TCP = "TCP"
@@ -36,7 +37,7 @@ T = TypeVar("T", bytes, CanFrame)
 
 
 class Connection(ABC, Generic[T]):
-    """SPEC row Connection: a typed FIFO. Nothing is lost, nothing is changed, nothing is invented.
+    """SPEC row Connection: a typed FIFO that neither loses, changes nor invents data.
 
     Abstract: a device or driver owns an RS232, TCP or CAN connection, never this class.
     """
@@ -78,39 +79,43 @@ class CANConnection(Connection[CanFrame]):
 
 
 class _End(Generic[T]):
-    """Inbound half of an asynchronous end: whoever receives calls `feed`, whoever consumes awaits `_next`.
+    """The inbound half of an asynchronous end: the receiver calls `feed`, the consumer awaits `_next`.
 
-    Bounded: at most `max_pending` items wait; `feed` returns False when the bound is reached, and the feeder then
-    stops reading from the operating system (`on_room` is called when there is room again).
+    At most `max_pending` items wait. `feed` returns False when that limit is reached, and the receiver then stops
+    reading from the operating system. `on_room` is called when there is room again.
     """
 
     def __init__(self, inbound: Connection[T], endpoint: Endpoint, max_pending: int) -> None:
         self.inbound: Connection[T] = inbound
-        self._stream: deque[T] = inbound.data_stream  # that very one: its `write` and `read` are append and popleft
+        self._stream: deque[T] = inbound.data_stream  # the same object: its `write` and `read` are append and popleft
         self.endpoint = endpoint
         self.max_pending = max_pending
         self.on_arrival: Callable[[T], None] | None = None
-        """Told of every item at the moment it arrives, read or not (a tap). It may not feed, read or raise."""
+        """Called with every item when it arrives, whether or not it is read later (a tap). It must not feed, read or
+        raise.
+        """
         self.intercept: Callable[[T], bool] | None = None
-        """Handed each item before anybody sees it; True: it took the item, and may pass it on with `feed_through`."""
+        """Called with each item before any other code sees it. It returns True if it took the item, and may then pass
+        it on with `feed_through`.
+        """
         self.local = ""
-        """The address of this end, ``HOST:PORT``, where the medium has such addresses."""
+        """The local address, ``HOST:PORT``, if the medium has such addresses."""
         self._lost: FieldtwinError | None = None
         self._waiter: asyncio.Future[None] | None = None
 
     @property
     def lost(self) -> FieldtwinError | None:
-        """Why the connection ended, or None while it is open."""
+        """Return why the connection ended, or None while it is open."""
         return self._lost
 
     def feed(self, item: T) -> bool:
-        """Something arrived. Returns False when nothing more should be taken from the medium for now."""
+        """Take an item that arrived. Return False if nothing more should be read from the medium for now."""
         if self.intercept is not None and self.intercept(item):
             return len(self._stream) < self.max_pending
         return self.feed_through(item)
 
     def feed_through(self, item: T) -> bool:
-        """As `feed`, past `intercept`."""
+        """Take an item like `feed`, but do not pass it to `intercept`."""
         self._stream.append(item)
         if self.on_arrival is not None:
             self.on_arrival(item)
@@ -120,7 +125,7 @@ class _End(Generic[T]):
         return len(self._stream) < self.max_pending
 
     def feed_lost(self, error: FieldtwinError) -> None:
-        """The medium is gone; what arrived before is still read first. The first reason is kept."""
+        """Record that the medium is gone. Items that arrived before are still read first. The first reason is kept."""
         if self._lost is None:
             self._lost = error
             self._wake()
@@ -129,7 +134,9 @@ class _End(Generic[T]):
         """Called after a consumer took an item; an end that paused its medium resumes here."""
 
     def _loss(self) -> FieldtwinError:
-        """The reason, anew for each `raise`: one that is raised again and again collects tracebacks and `at`s."""
+        """Return a new error with the reason for each `raise`: an error that is raised again collects tracebacks and
+        `at`s.
+        """
         kept = self._lost or closed_here(self.endpoint)
         fresh = type(kept).__new__(type(kept))
         fresh.args = kept.args
@@ -150,7 +157,7 @@ class _End(Generic[T]):
         return self._taken()
 
     async def _next_within(self, timeout_s: float, nothing: T) -> T:
-        """As `_next`; `nothing` when nothing came for `timeout_s`."""
+        """Return the next item like `_next`, or `nothing` if none arrives within `timeout_s`."""
         if not self._stream:
             waiter, end = alarm(asyncio.get_running_loop(), timeout_s)
             try:
@@ -173,7 +180,7 @@ class _End(Generic[T]):
         return item
 
     def _waits(self, waiter: asyncio.Future[None]) -> asyncio.Future[None]:
-        """From now on `waiter` is told when something arrives or the medium is gone. Raises when it is gone already."""
+        """Complete `waiter` when an item arrives or the medium is gone. Raises if the medium is already gone."""
         if self._lost is not None:
             raise self._loss()
         if self._waiter is not None:
@@ -185,7 +192,7 @@ class _End(Generic[T]):
 class ByteConnection(_End[bytes], ABC):
     """One end of a byte stream (serial line or socket). One reader at a time.
 
-    Chunks given to `feed` are as the medium delivered them: their borders mean nothing to a protocol.
+    The chunks given to `feed` are as the medium delivered them: their boundaries mean nothing to a protocol.
     """
 
     def __init__(self, inbound: Connection[bytes], endpoint: Endpoint, max_pending: int = 1024) -> None:
@@ -196,15 +203,20 @@ class ByteConnection(_End[bytes], ABC):
         return self.inbound.type
 
     def read(self) -> Coroutine[Any, Any, bytes]:
-        """The next chunk, never empty. Raises `ConnectionLost` once the peer is gone and all is read."""
+        """Return the next chunk, never empty. Raises `ConnectionLost` once the peer is gone and everything has been
+        read.
+        """
         return self._next()
 
     def read_within(self, timeout_s: float) -> Coroutine[Any, Any, bytes]:
-        """The next chunk, empty when nothing came for `timeout_s`. Raises as `read`. Costs less than a timeout around it."""
+        """Return the next chunk, or an empty one if none arrives within `timeout_s`.
+
+        Raises as `read`. It costs less than `read` with a timeout around it.
+        """
         return self._next_within(timeout_s, b"")
 
     def read_pending(self) -> bytes:
-        """All that arrived and was not read yet, possibly empty; never waits."""
+        """Return everything that arrived and was not read yet, possibly empty. Never waits."""
         if not self._stream:
             return b""
         chunks = []
@@ -215,7 +227,7 @@ class ByteConnection(_End[bytes], ABC):
 
     @abstractmethod
     async def write(self, data: bytes) -> None:
-        """Hand `data` to the medium, waiting while its buffer is full. Raises `ConnectionLost`."""
+        """Pass `data` to the medium, waiting while its buffer is full. Raises `ConnectionLost`."""
 
     @abstractmethod
     async def aclose(self) -> None:
@@ -223,7 +235,10 @@ class ByteConnection(_End[bytes], ABC):
 
 
 class Client(ByteConnection):
-    """One that came to us. `peer` is its address, `role` what its certificate names (MBTLS 8.4), empty without one."""
+    """The connection of a client that connected to a local listener.
+
+    `peer` is its address; `role` is the role that its certificate names (MBTLS 8.4), empty without one.
+    """
 
     peer: str
     peer_port: int
@@ -231,7 +246,7 @@ class Client(ByteConnection):
 
 
 class Clients(Protocol):
-    """A listener and who it let in, oldest first, with what became of the others."""
+    """A listener, the clients that it accepted, oldest first, and counts of the clients that it did not accept."""
 
     accepted: int
     evicted: int
@@ -241,7 +256,7 @@ class Clients(Protocol):
 
     @property
     def bound(self) -> Endpoint:
-        """The endpoint with the port that is really listened on."""
+        """Return the endpoint with the port that is actually listened on."""
         ...
 
     @property
@@ -264,9 +279,11 @@ class CanConnection(_End[CanFrame], ABC):
     def __init__(self, inbound: CANConnection, endpoint: Endpoint, max_pending: int = 4096) -> None:
         super().__init__(inbound, endpoint, max_pending)
         self.overruns = 0
-        """Frames dropped here because the reader was too slow. A bus waits for nobody."""
+        """Frames dropped because the reader was too slow: a bus does not wait for its readers."""
         self.accept: Callable[[CanFrame], bool] | None = None
-        """The reader's acceptance filter, where it has one: what it refuses never comes in, and was no overrun."""
+        """The reader's acceptance filter, if it has one. A frame that it rejects is not stored and does not count as an
+        overrun.
+        """
 
     def feed(self, item: CanFrame) -> bool:
         if self.accept is not None and not self.accept(item):
@@ -278,10 +295,10 @@ class CanConnection(_End[CanFrame], ABC):
         return super().feed(item)
 
     def on_overrun(self, item: CanFrame) -> None:
-        """Called with a frame that was dropped because the reader was too slow."""
+        """Handle a frame that was dropped because the reader was too slow."""
 
     def recv(self) -> Coroutine[Any, Any, CanFrame]:
-        """The next frame. Raises `ConnectionLost` once the bus is gone and all is read."""
+        """Return the next frame. Raises `ConnectionLost` once the bus is gone and everything has been read."""
         return self._next()
 
     @abstractmethod
@@ -294,10 +311,10 @@ class CanConnection(_End[CanFrame], ABC):
 
 
 class Connector(Protocol):
-    """Endpoint -> Connection. The only thing that opens a wire.
+    """Open a connection to an endpoint. Nothing else opens ports, sockets or buses.
 
-    Raises `Unreachable` (or `EndpointBusy`) when there is nobody, `UsageError` when the endpoint is of a kind that
-    this connector does not know.
+    Raises `Unreachable` (or `EndpointBusy`) if the endpoint does not answer, and `UsageError` if this connector does
+    not know its kind.
     """
 
     async def open_bytes(self, endpoint: Endpoint) -> ByteConnection:
@@ -305,21 +322,21 @@ class Connector(Protocol):
         ...
 
     async def open_can(self, endpoint: Endpoint, bitrate: int) -> CanConnection:
-        """Join a CAN bus that runs at `bitrate` bit/s; where the medium knows its bit rate, another one is refused."""
+        """Join a CAN bus that runs at `bitrate` bit/s. If the medium knows its bit rate, a different one is refused."""
         ...
 
 
 class Direction(Enum):
-    """Seen from the gateway."""
+    """The direction of a transfer, as seen from the gateway."""
 
     SENT = "sent"
     RECEIVED = "received"
 
 
 class Tap(Protocol):
-    """An observer on a Connector (recorder, capture). It may not change, delay or drop anything.
+    """An observer of the traffic of a Connector (recorder, capture). It must not change, delay or drop anything.
 
-    `t_ns` is monotonic. `endpoint` is the plant's endpoint, whatever it is mapped to.
+    `t_ns` is monotonic. `endpoint` is the endpoint in the plant, even if it is mapped to a different one.
     """
 
     def on_bytes(self, endpoint: Endpoint, direction: Direction, t_ns: int, data: bytes) -> None: ...
@@ -328,5 +345,5 @@ class Tap(Protocol):
 
 
 def closed_here(endpoint: Endpoint) -> ConnectionLost:
-    """The reason that `read` gives after one's own `aclose`."""
+    """Return the reason that `read` gives after a local `aclose`."""
     return ConnectionLost("the connection was closed on this side", where=str(endpoint))

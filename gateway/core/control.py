@@ -1,11 +1,11 @@
-"""The control channel: newline-delimited JSON between a running process and whoever watches or steers it.
+"""The control channel: newline-delimited JSON between a running process and the clients that watch or control it.
 
-A request is one line ``{"v": 1, "id": 7, "verb": "get", "args": {...}}``, its answer one line
-``{"v": 1, "id": 7, "ok": true, "result": ...}`` or ``{"v": 1, "id": 7, "ok": false, "error": {"kind", "message",
-"exit_code"}}``. Each process registers its own verbs: a plant's controller has no fault verb because nobody registered
-one. Over a Unix socket in the instance's run directory (owner only), or over TCP with a token where asked for.
+A request is one line ``{"v": 1, "id": 7, "verb": "get", "args": {...}}``, its answer one line ``{"v": 1, "id": 7, "ok":
+true, "result": ...}`` or ``{"v": 1, "id": 7, "ok": false, "error": {"kind", "message", "exit_code"}}``. Each process
+registers its own commands ("verbs"): a plant's controller has no fault command because it registers none. The channel
+uses a Unix socket in the instance's run directory (owner only), or TCP with a token if configured.
 
-A line is at most `MAX_LINE` bytes. Text and JSON come in and go out; no state of the process is known here.
+A line has at most `MAX_LINE` bytes. This module handles text and JSON only; it does not know the state of the process.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ VERSION = 1
 MAX_LINE = 4 * 1024 * 1024
 MAX_CLIENTS = 64
 LINE_WITHIN_S = 10.0
-"""A request that has begun is complete by then, and a client that needs a token has shown it; otherwise it is dropped. Without
-this limit, clients that send nothing, or one byte at a time, would take every place."""
+"""Time limit for a request that has begun to arrive, and for a client that has to send a token. After it, the client is
+dropped. Without this limit, clients that send nothing, or one byte at a time, would take every place.
+"""
 
 Verb = Callable[[dict[str, Any]], Awaitable[Any]]
 
 
 class ControlServer:
-    """Serves verbs on a Unix socket and, if asked, on TCP.
+    """A server for the registered commands on a Unix socket and, if configured, on TCP.
 
-    `verbs` maps a name to ``async (args) -> JSON-able result``. A `FieldtwinError` from a verb becomes an error answer;
-    any other exception too, as a bug of ours, and the connection stays open.
+    `verbs` maps a name to ``async (args) -> JSON-able result``. A `FieldtwinError` from a command becomes an error
+    answer. Any other exception also does, reported as a bug of fieldtwin, and the connection stays open.
     """
 
     def __init__(self, verbs: dict[str, Verb], token: str = "") -> None:
@@ -55,7 +56,7 @@ class ControlServer:
     async def listen_unix(self, path: Path) -> None:
         """Listen on `path`, replacing a stale socket; readable and writable for the owner only.
 
-        Raises `EndpointBusy` when a living process serves there, `Unreachable` when it is no place for a socket.
+        Raises `EndpointBusy` if a running process serves there, and `Unreachable` if a socket cannot be created there.
         """
         try:
             if path.is_socket():
@@ -69,7 +70,9 @@ class ControlServer:
         self._servers.append(server)
 
     async def listen_tcp(self, host: str, port: int) -> int:
-        """Listen on TCP and return the port. Off loopback a token is required: whoever connects may steer."""
+        """Listen on TCP and return the port. Beyond loopback a token is required, because every client may control the
+        process.
+        """
         if not self._token and host not in ("127.0.0.1", "::1", "localhost"):
             raise UsageError("a control channel off loopback needs a token", where=f"{host}:{port}")
         try:
@@ -82,7 +85,7 @@ class ControlServer:
         return int(server.sockets[0].getsockname()[1])
 
     async def aclose(self) -> None:
-        """Stop listening, drop every client and the verb that it waits for, remove the sockets."""
+        """Stop listening, drop every client and cancel the command that it waits for, and remove the sockets."""
         for server in self._servers:
             server.close()
         serving = [task for task in self._clients.values() if task is not None and task is not asyncio.current_task()]
@@ -96,8 +99,9 @@ class ControlServer:
             self._sockets.pop().unlink(missing_ok=True)
 
     async def serve_pipe(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve whoever started us, over our own input and output: trusted, and no socket is listened on. Returns when they
-        are gone."""
+        """Serve the parent process over stdin and stdout. It is trusted, and no socket is opened. Return when it is
+        gone.
+        """
         await self._serve(reader, writer, trusted=True)
 
     async def _serve_unix(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -138,7 +142,7 @@ class ControlServer:
             return _encode(request_id, {"ok": True, "result": await verb(request.get("args") or {})}), trusted
         except FieldtwinError as e:
             error = e
-        except Exception as e:  # a verb's bug must not take the channel down; it is reported to the caller
+        except Exception as e:  # a bug in a command must not end the channel; it is reported to the caller
             error = Bug(f"{type(e).__name__}: {e}")
         return _encode(request_id, {"ok": False, "error": _describe(error)}), trusted
 
@@ -156,7 +160,9 @@ async def _read_line(reader: asyncio.StreamReader, until_s: float | None) -> byt
 
 
 def _parse(line: bytes) -> dict[str, Any]:
-    """A request, or `UsageError`: what a stranger sends is never a bug of ours."""
+    """Return the parsed request. Raises `UsageError` for a malformed one: a client's input is never reported as a bug
+    of fieldtwin.
+    """
     try:
         request = json.loads(line)
     except (ValueError, RecursionError) as e:
@@ -177,7 +183,7 @@ async def _refuse_if_alive(path: Path) -> None:
     try:
         _, writer = await asyncio.open_unix_connection(str(path))
     except OSError:
-        return  # nobody behind it: left over from a process that was killed
+        return  # no process listens: the socket was left over from a process that was killed
     writer.close()
     raise EndpointBusy("another process serves control here", where=str(path), hint="is this instance running already?")
 
@@ -187,7 +193,7 @@ def _describe(e: FieldtwinError) -> dict[str, Any]:
 
 
 class RemoteError(FieldtwinError):
-    """The other process answered with an error; `kind` is its class there."""
+    """The other process answered with an error; `kind` is the class of that error in the other process."""
 
     def __init__(self, kind: str, message: str, exit_code: int) -> None:
         super().__init__(message)
@@ -196,7 +202,7 @@ class RemoteError(FieldtwinError):
 
 
 class ControlClient:
-    """One connection to a control channel; requests go one at a time."""
+    """One connection to a control channel. It sends one request at a time."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, where: str, token: str) -> None:
         self._reader = reader
@@ -208,7 +214,7 @@ class ControlClient:
 
     @classmethod
     async def connect_unix(cls, path: Path) -> ControlClient:
-        """Connect to a process of this host; raises `Unreachable` when it is not there."""
+        """Connect to a process on this host. Raises `Unreachable` if it does not run."""
         try:
             reader, writer = await asyncio.open_unix_connection(str(path), limit=MAX_LINE)
         except OSError as e:
@@ -217,7 +223,7 @@ class ControlClient:
 
     @classmethod
     async def connect_tcp(cls, host: str, port: int, token: str = "") -> ControlClient:
-        """Connect to a process elsewhere; raises `Unreachable` when it is not there."""
+        """Connect to a process on another host. Raises `Unreachable` if it does not answer."""
         try:
             reader, writer = await asyncio.open_connection(host, port, limit=MAX_LINE)
         except OSError as e:
@@ -225,7 +231,7 @@ class ControlClient:
         return cls(reader, writer, f"{host}:{port}", token)
 
     async def call(self, verb: str, timeout_s: float = 5.0, **args: Any) -> Any:
-        """Ask for `verb` and return its result. Raises `RemoteError`, `ConnectionLost` or `ReplyTimeout`."""
+        """Send the command `verb` and return its result. Raises `RemoteError`, `ConnectionLost` or `ReplyTimeout`."""
         async with self._turn:
             self._next_id += 1
             request = {"v": VERSION, "id": self._next_id, "verb": verb, "args": args}

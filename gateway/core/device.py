@@ -1,8 +1,8 @@
-"""The paper's Device: what stands at the far end of a connection, and the agreement between it and its driver.
+"""The paper's Device: the remote end of a connection, and the agreement between it and its driver.
 
-Pure. A device holds one end of a wire of a concrete kind, has a command list, and answers each command that it reads with one
-response. It knows no driver, no clock (it is passed `now_ns`) and no framing: an item of its connection is a whole message.
-A driver is a stranger to this module (fieldtwin.gateway.devices.driver).
+Pure. A device holds one end of a link of a concrete kind, has a command list, and answers each command that it reads
+with one response. It knows no driver, no clock (it is passed `now_ns`) and no framing: an item of its connection is a
+whole message. This module does not know drivers; they are in fieldtwin.gateway.devices.driver.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fieldtwin.gateway.core.values import COMMAND, RESPONSE
 
 
 class End(Generic[T]):
-    """One end of a duplex medium: what the other end wrote is read here, in order (SPEC ruling 4)."""
+    """One end of a duplex medium. Reading returns what the other end wrote, in order (SPEC ruling 4)."""
 
     __slots__ = ("inbound", "outbound", "read", "type", "write")
 
@@ -33,13 +33,13 @@ class End(Generic[T]):
 
 
 def wire(kind: type[Connection[T]]) -> tuple[End[T], End[T]]:
-    """Both ends of a new duplex wire: two streams of a concrete kind, each end reading what the other writes."""
+    """Return both ends of a new duplex link: two streams of a concrete kind, each end reading what the other writes."""
     there, back = kind(), kind()
     return End(there, back), End(back, there)
 
 
 class Device(ABC):
-    """SPEC row Device. Concrete ones name the kinds of wire they may hang on in `wire_types`.
+    """SPEC row Device. Concrete classes list in `wire_types` the kinds of link to which they may be connected.
 
     `command_list` holds names and is never empty. A message is recognised as one command of the list, or as none.
     """
@@ -59,7 +59,7 @@ class Device(ABC):
 
     @abstractmethod
     def recognise(self, data: bytes) -> COMMAND:
-        """The command that a message is; its name is empty where it is none that this device knows."""
+        """Return the command that a message is. Its name is empty if the device does not know the message."""
 
     @abstractmethod
     def _execute(self, command: COMMAND, now_ns: int) -> RESPONSE:
@@ -76,13 +76,14 @@ class Device(ABC):
         return self._execute(command, now_ns)
 
     def send(self, response: RESPONSE) -> None:
-        """Send: write."""
+        """Send: write the response."""
         self.connection.write(response.data)
 
     def receive(self, now_ns: int) -> RESPONSE:
-        """Receive: read ; execute ; send. One response per command; what is no command is read and not answered.
+        """Receive: read, execute, send. Each command gets one response; a message that is not a command is read and not
+        answered.
 
-        The connection must not be empty. Raises `UnknownCommand`: what follows then is the protocol's (SPEC ruling 11).
+        The connection must not be empty. Raises `UnknownCommand`; the protocol decides what follows (SPEC ruling 11).
         """
         command = self.recognise(self.connection.read())
         response = self.execute_command(command, now_ns)
@@ -104,14 +105,14 @@ class Transmitter(Device):
 
 @dataclass(frozen=True)
 class Communication:
-    """SPEC row Communication: a driver and what it talks to accept the same commands, both inclusions (ruling 12)."""
+    """SPEC row Communication: a driver and its device accept the same commands, inclusion both ways (ruling 12)."""
 
     name: str
     driver_commands: frozenset[str]
     device_commands: frozenset[str]
 
     def check(self) -> None:
-        """Raises `CommandListMismatch` that names what is missing on either side."""
+        """Raise `CommandListMismatch` with the names that are missing on either side."""
         if self.driver_commands == self.device_commands:
             return
         only_driver = ", ".join(sorted(self.driver_commands - self.device_commands)) or "nothing"

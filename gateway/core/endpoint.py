@@ -64,12 +64,12 @@ class SerialSettings:
 
     @property
     def bits_per_char(self) -> int:
-        """Bits a character takes on the wire: start, data, parity if any, stop."""
+        """Return the number of bits that a character takes on the line: start, data, parity if any, stop."""
         return 1 + self.data_bits + (self.parity != "N") + self.stop_bits
 
     @property
     def char_time_s(self) -> float:
-        """Seconds that one character takes on the wire."""
+        """Return the seconds that one character takes on the line."""
         return self.bits_per_char / self.baudrate
 
 
@@ -90,7 +90,7 @@ class Endpoint:
 
     @classmethod
     def parse(cls, url: str) -> Endpoint:
-        """Read a URL; raises `UsageError` that says which part is wrong."""
+        """Read a URL. Raises `UsageError` with the part that is wrong."""
         scheme, colon, rest = url.partition(":")
         scheme = scheme.lower()
         if not colon or scheme not in SCHEMES:
@@ -125,12 +125,14 @@ class Endpoint:
         return self.scheme == "can"
 
     def param(self, name: str, default: str = "") -> str:
-        """The value of a parameter, or `default`."""
+        """Return the value of a parameter, or `default`."""
         return dict(self.params).get(name, default)
 
     @property
     def serial(self) -> SerialSettings:
-        """Baud rate and frame of a serial endpoint; where not said, Modbus's: 19200 8E1, ASCII 7E1 (SL 2.5.1, 2.5.2)."""
+        """Return baud rate and frame of a serial endpoint. Defaults are those of Modbus: 19200 8E1, ASCII 7E1 (SL
+        2.5.1, 2.5.2).
+        """
         usual = "7E1" if self.scheme == "ascii" else "8E1"
         text, frame = self.param("baudrate", "19200"), self.param("frame", usual).upper()
         if not _NUMBER.match(text) or not 50 <= int(text) <= 4_000_000:
@@ -143,7 +145,7 @@ class Endpoint:
 
     @property
     def rs485(self) -> bool:
-        """Whether the driver of a serial port is to switch the direction of an RS485 transceiver."""
+        """Return whether the driver of a serial port is to switch the direction of an RS485 transceiver."""
         text = self.param("rs485", "0")
         if text not in ("0", "1"):
             raise UsageError(f"endpoint {self}: rs485", expected="0 or 1", got=repr(text))
@@ -151,9 +153,11 @@ class Endpoint:
 
     @property
     def silence_s(self) -> float | None:
-        """The silence that a Modbus RTU client keeps before a request, in seconds. None: the one that the standard recommends.
+        """Return the silence in seconds that a Modbus RTU client keeps before a request, or None for the recommended
+        one.
 
-        Above 19200 baud that is 1.75 ms (SL 2.5.1.1). A shorter one, of at least 3.5 characters, is for devices that take it.
+        Above 19200 baud the standard recommends 1.75 ms (SL 2.5.1.1). A shorter one, of at least 3.5 characters, is for
+        devices that accept it.
         """
         text = self.param("silence_us")
         if not text:
@@ -170,7 +174,7 @@ class Endpoint:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port of a socket endpoint, or of a software CAN bus."""
+        """Return host and port of a socket endpoint, or of a software CAN bus."""
         if self.is_can:
             host, _, port = self.path.rpartition(":")
             if not _HOST.match(host) or not _NUMBER.match(port) or int(port) > 65535:
@@ -179,11 +183,11 @@ class Endpoint:
         return self.host, self.port
 
     def with_path(self, path: str) -> Endpoint:
-        """The same endpoint, baud rate and frame included, on another serial port or channel."""
+        """Return the same endpoint, baud rate and frame included, on another serial port or channel."""
         return replace(self, path=path)
 
     def with_address(self, host: str, port: int) -> Endpoint:
-        """The same endpoint on another host and port."""
+        """Return the same endpoint on another host and port."""
         if self.is_can:
             return replace(self, path=f"{_bracketed(host)}:{port}")
         return replace(self, host=host, port=port)
@@ -202,7 +206,9 @@ def _bracketed(host: str) -> str:
 
 
 def _check_params(endpoint: Endpoint) -> None:
-    """Refuse here, and not when the port is opened: what is said twice, a bad setting, a misspelt one of a port."""
+    """Refuse a repeated parameter, an invalid setting, or a misspelt parameter of a port here, not when the port is
+    opened.
+    """
     names = [name for name, _ in endpoint.params]
     for name in names:
         if names.count(name) > 1:

@@ -1,8 +1,8 @@
-"""One tree of errors: whose fault it is, what was expected, what came, where, and what to do.
+"""The tree of errors. Each names who is to blame, what was expected, what was received, where, and what to do.
 
 Every error that leaves fieldtwin is a `FieldtwinError`. Foreign exceptions (``OSError``, pymodbus, python-can) are
-translated once, at the border where they arise; nothing above that border catches them. Bad *quality* is data and
-never an error (SPEC ruling 11): these classes say why a value has none.
+translated once, where they arise; code above that place does not catch them. Bad quality is data and never an error
+(SPEC ruling 11): these classes say why a value is missing.
 
 The class decides the exit code of the command line (DESIGN.md, command line contract).
 """
@@ -19,7 +19,7 @@ from fieldtwin.gateway.core.visible import visible
 
 
 class Blame(Enum):
-    """Who has to act for the error to go away."""
+    """The part of the system in which the cause of the error has to be removed."""
 
     USER = "the command line"
     FILE = "the file"
@@ -30,10 +30,13 @@ class Blame(Enum):
 
 
 class FieldtwinError(Exception):
-    """The root. `str()` is one line for a person, whatever a file or a device put into it; the parts stay as they are.
+    """The base class of all errors of fieldtwin.
 
-    `expected`, `got`, `where` and `hint` are plain text, empty where they do not apply. `where` names bus, unit,
-    address, file and line: whatever leads to the spot.
+    `str()` is one line that is safe to print, even if a file or a device supplied control characters; the parts are not
+    changed.
+
+    `expected`, `got`, `where` and `hint` are plain text, empty if they do not apply. `where` names bus, unit ID,
+    address, file and line: everything that locates the error.
     """
 
     exit_code: ClassVar[int] = 70
@@ -56,37 +59,37 @@ class FieldtwinError(Exception):
         return visible(f"{text} ({self.hint})" if self.hint else text)
 
     def at(self, where: str) -> FieldtwinError:
-        """The same error with `where` put in front of what it already knows; returns itself, for ``raise e.at(...)``."""
+        """Put `where` in front of the location that is already known. Return the error itself, for ``raise e.at(...)``."""
         self.where = f"{where}: {self.where}" if self.where else where
         return self
 
 
-# -- ours and the user's ------------------------------------------------------------------------------------------
+# -- errors of fieldtwin and of the user -------------------------------------------------------------------------------
 
 
 class CheckFailed(FieldtwinError):
-    """A check ran and its verdict is no."""
+    """A check ran and failed."""
 
     exit_code = 1
     blame = Blame.DEVICE
 
 
 class UsageError(FieldtwinError):
-    """What was asked for makes no sense or was not allowed."""
+    """The request makes no sense or is not permitted."""
 
     exit_code = 2
     blame = Blame.USER
 
 
 class NotAllowed(UsageError):
-    """The request is well formed and the configuration forbids it (read-only plant, unmarked tag, limits, rate)."""
+    """The request is well formed, but the configuration forbids it (read-only plant, unmarked tag, limits, rate)."""
 
 
 class FileInvalid(FieldtwinError):
     """A file that a user wrote or recorded cannot be used as it is.
 
-    `line` and `column` count from 1; 0 where the file has none. `others` are the further errors that the same check found (at
-    most `MAX_OTHERS`); the command line prints each on a line of its own.
+    `line` and `column` count from 1; they are 0 if the file has none. `others` are the further errors that the same
+    check found (at most `MAX_OTHERS`); the command line prints each on a separate line.
     """
 
     exit_code = 3
@@ -120,10 +123,10 @@ class CommandListMismatch(FileInvalid):
 
 
 class Bug(FieldtwinError):
-    """An invariant of ours broke."""
+    """An internal invariant of fieldtwin is broken."""
 
 
-# -- the wire -----------------------------------------------------------------------------------------------------
+# -- the bus or link ---------------------------------------------------------------------------------------------------
 
 
 class Unreachable(FieldtwinError):
@@ -134,47 +137,49 @@ class Unreachable(FieldtwinError):
 
 
 class EndpointBusy(Unreachable):
-    """The port, socket or bus exists and somebody else holds it."""
+    """The port, socket or bus exists, but another process uses it."""
 
     blame = Blame.HOST
 
 
 class ConnectionLost(Unreachable):
-    """A connection that was open ended: peer gone, cable pulled, bus-off."""
+    """An open connection ended: peer gone, cable pulled, bus-off."""
 
 
 class WireError(FieldtwinError):
-    """What came over the wire is not what the protocol allows. The request may be repeated."""
+    """The received data violates the protocol. The request may be repeated."""
 
     exit_code = 4
     blame = Blame.WIRE
 
 
 class ReplyTimeout(WireError):
-    """Nothing that could be the reply arrived in time."""
+    """No possible reply arrived in time."""
 
 
 class CrcError(WireError):
-    """A reply arrived whole and its check sum is wrong."""
+    """A complete reply arrived, but its check sum is wrong."""
 
 
 class Desync(WireError):
-    """A frame arrived that is no answer to the request: another unit, function, size, transaction or index."""
+    """A frame arrived that does not answer the request: its unit ID, function, size, transaction or index is different."""
 
 
 class WrongSize(Desync):
-    """A reply to this function arrived whole and carries `got_bytes` bytes of values, which is not the number asked for."""
+    """A complete reply to this function arrived, but it carries `got_bytes` bytes of values, which is not the number
+    requested.
+    """
 
     def __init__(self, message: str, *, expected: str = "", got: str = "", hint: str = "", got_bytes: int = 0) -> None:
         self.got_bytes = got_bytes
         super().__init__(message, expected=expected, got=got, hint=hint)
 
 
-# -- the device ---------------------------------------------------------------------------------------------------
+# -- the device --------------------------------------------------------------------------------------------------
 
 
 class DeviceRefused(FieldtwinError):
-    """The device understood and said no."""
+    """The device understood the request and refused it."""
 
     exit_code = 5
     blame = Blame.DEVICE
@@ -203,7 +208,7 @@ class ModbusExceptionReply(DeviceRefused):
 
 
 class SdoAborted(DeviceRefused):
-    """An SDO transfer was aborted by the node: `code` is the 32-bit abort code of CiA 301, 7.2.4.3.17."""
+    """The node aborted an SDO transfer. `code` is the 32-bit abort code of CiA 301, 7.2.4.3.17."""
 
     def __init__(self, index: int, subindex: int, code: int, meaning: str = "", *, where: str = "") -> None:
         self.index = index
@@ -218,27 +223,30 @@ class UnknownCommand(DeviceRefused):
 
 
 class VerifyFailed(DeviceRefused):
-    """The device acknowledged a write and holds another value."""
+    """The device acknowledged a write but holds another value."""
 
 
 class WrongDevice(DeviceRefused):
     """The device that answers is not the one that the system file expects; writes to it are blocked."""
 
 
-# -- what the system says -----------------------------------------------------------------------------------------
+# -- error texts of the operating system -------------------------------------------------------------------------------
 
 _NUMBER = re.compile(r"\[Errno (\d+)\]")
 _SAYS_LITTLE = (errno.EADDRNOTAVAIL, errno.EAFNOSUPPORT)
-"""What a host without IPv6 says of the address ::1 that ``localhost`` has too."""
+"""The errors of a host without IPv6 for the address ::1, to which ``localhost`` also resolves. They do not explain a
+failure.
+"""
 
 
 def os_reason(error: OSError) -> str:
-    """Why the system refused, in its own words and in one phrase, without addresses and numbers.
+    """Return why the operating system refused, in its own words and in one phrase, without addresses and numbers.
 
-    asyncio tries each address of a name and lists all that failed in one text: the one counts that somebody was asked at.
+    asyncio tries each address of a name and lists all failures in one text. The failure that counts is that of an
+    address to which a connection was actually attempted.
     """
     numbers = [error.errno] if error.errno is not None else [int(n) for n in _NUMBER.findall(str(error))]
-    if not numbers or numbers[0] < 0:  # getaddrinfo counts below zero and has words of its own
+    if not numbers or numbers[0] < 0:  # getaddrinfo has negative error numbers and its own texts
         silent = "no answer" if isinstance(error, TimeoutError) else type(error).__name__
         return error.strerror or str(error) or silent
     telling = [n for n in numbers if n not in _SAYS_LITTLE]

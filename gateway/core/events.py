@@ -1,7 +1,7 @@
 """The paper's event handlers: one Producer, many Consumers, each with its own bounded queue.
 
-A queue is a bounded FIFO, not a set (SPEC ruling 2): order is kept, duplicates survive, overflow drops the oldest and
-is counted. Synchronous and free of I/O: a Consumer is drained by whoever owns it.
+A queue is a bounded FIFO, not a set (SPEC ruling 2): it keeps the order and duplicates; when it overflows, it drops the
+oldest item and counts it. Everything is synchronous and free of I/O: the owner of a Consumer drains it.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ class EventHandler(ABC):  # noqa: B024  the schema has state and no operations; 
 
 
 class Consumer(EventHandler, Generic[D]):
-    """Observes one event and handles what occurred in order.
+    """Observes one event and handles the occurrences in order.
 
-    `dropped` counts what a full queue lost; it is reported, never hidden.
+    `dropped` counts the items that a full queue lost; it is always reported.
     """
 
     def __init__(self, event: str, capacity: int = 256) -> None:
@@ -50,13 +50,13 @@ class Consumer(EventHandler, Generic[D]):
         return self.queue.popleft()
 
     def put_back(self, item: D) -> None:
-        """Make `item`, consumed and not dealt with, the first again; a full queue drops its newest and counts it."""
+        """Make `item`, consumed but not handled, the first again. A full queue drops its newest item and counts it."""
         if len(self.queue) == self.queue.maxlen:
             self.dropped += 1
         self.queue.appendleft(item)
 
     def drain(self) -> Iterator[D]:
-        """Consume what is there now, one by one; what arrives meanwhile waits for the next drain."""
+        """Consume the items that are in the queue now, one by one. Items that arrive meanwhile wait for the next drain."""
         for _ in range(len(self.queue)):
             yield self.consume()
 
@@ -69,7 +69,9 @@ class Producer(EventHandler, Generic[D]):
         self._consumers: list[Consumer[D]] = []
 
     def subscribe(self, consumer: Consumer[D]) -> None:
-        """Let `consumer` observe from now on. It must be registered for the same event; twice is once."""
+        """Let `consumer` observe from now on. It must be registered for the same event; subscribing twice has no
+        further effect.
+        """
         if consumer.event != self.event:
             raise Bug("a consumer of another event", expected=self.event, got=consumer.event)
         if consumer not in self._consumers:
@@ -77,7 +79,7 @@ class Producer(EventHandler, Generic[D]):
 
     @property
     def observed(self) -> bool:
-        """Whether anybody would see an event; one that nobody sees need not be made."""
+        """Return whether any Consumer is subscribed; without one, the event need not be created."""
         return bool(self._consumers)
 
     def emit(self, occurred: D) -> None:

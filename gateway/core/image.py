@@ -1,12 +1,13 @@
-"""The process image: what gateway and PLC share, as a layout over a memory that somebody else made.
+"""The process image: the data that gateway and PLC share, as a layout over a memory that the caller provides.
 
-Two regions as a rule: `INPUTS`, written by the gateway, and `OUTPUTS`, written by the PLC. Each publication carries a
-counter and a time, which tell the other side that its writer is alive. The two ends of the memory are checked against
-each other by a hash of the layout. No mmap, no file, no clock here (DESIGN.md, "Who shares the process image").
+There are normally two regions: `INPUTS`, written by the gateway, and `OUTPUTS`, written by the PLC. Each publication
+carries a counter and a time, which show the other process that the writer is alive. Both ends of the memory compare a
+hash of the layout. This module has no mmap, no file and no clock (DESIGN.md, "Who shares the process image").
 
-Messages (a modem's mailbox) go through a region as rings. How far a message tag has been dealt with is said in the
-*other* region: the gateway publishes ``<tag>.taken`` for every message tag of OUTPUTS, the PLC ``<tag>.consumed`` for
-every message tag of INPUTS. So nobody overruns a ring, and a mailbox is acknowledged only for what was consumed.
+Messages (a modem's mailbox) go through a region as rings. The *other* region says up to which message a message tag has
+been handled: the gateway publishes ``<tag>.taken`` for every message tag of OUTPUTS, the PLC ``<tag>.consumed`` for
+every message tag of INPUTS. So neither process overruns a ring, and a mailbox is acknowledged only up to the messages
+that were consumed.
 """
 
 from __future__ import annotations
@@ -53,12 +54,12 @@ _MAGIC = b"ftimage\0"
 
 
 def taken_name(tag: str) -> str:
-    """The INT tag of INPUTS that says up to which sequence the gateway took messages of output `tag`."""
+    """Return the INT tag of INPUTS that says up to which sequence the gateway took messages of output `tag`."""
     return f"{tag}.taken"
 
 
 def consumed_name(tag: str) -> str:
-    """The INT tag of OUTPUTS that says up to which sequence the PLC consumed messages of input `tag`."""
+    """Return the INT tag of OUTPUTS that says up to which sequence the PLC consumed messages of input `tag`."""
     return f"{tag}.consumed"
 
 
@@ -75,35 +76,37 @@ class ImageLayout:
 
     @property
     def size(self) -> int:
-        """Bytes of memory that the image needs."""
+        """Return the number of bytes of memory that the image needs."""
         return LINE + sum(RegionShape(region).size for region in self.regions)
 
     @property
     def digest(self) -> bytes:
-        """32 bytes that differ for every other layout, names and units included."""
+        """Return 32 bytes that differ between layouts, even if only names or units differ."""
         text = json.dumps([FORMAT, self.describe()], sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).digest()
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able; the inverse of `from_description`."""
+        """Return a JSON-able description; the inverse of `from_description`."""
         return {"regions": [region.describe() for region in self.regions]}
 
     @classmethod
     def from_description(cls, text: Mapping[str, Any]) -> ImageLayout:
-        """Raises `FileInvalid` for a description that is none."""
+        """Return the layout of a description. Raises `FileInvalid` if the description is invalid."""
         try:
             return cls(tuple(RegionLayout.from_description(region) for region in text["regions"]))
         except (KeyError, TypeError) as e:
             raise FileInvalid("not the description of a process image", expected="regions") from e
 
     def format(self, memory: memoryview) -> None:
-        """Make an empty image in `memory` (writable bytes, at least `size` of them). Once, by whoever made the memory."""
+        """Make an empty image in `memory` (writable bytes, at least `size` of them). Call it once, when the memory is
+        created.
+        """
         self._check_size(memory)
         memory[: self.size] = bytes(self.size)
         memory[: _HEADER.size] = _HEADER.pack(_MAGIC, FORMAT, self.digest)
 
     def attach(self, memory: memoryview) -> Image:
-        """Use the image in `memory`. Raises `FileInvalid` if it is none, or one of another layout."""
+        """Use the image in `memory`. Raises `FileInvalid` if it holds no image, or one with a different layout."""
         self._check_size(memory)
         magic, version, digest = _HEADER.unpack_from(memory)
         if magic != _MAGIC or version != FORMAT:
@@ -125,7 +128,7 @@ class ImageLayout:
 
 
 class Image:
-    """An attached image: gives out writers and readers. `release` (or leaving ``with``) gives the memory back."""
+    """An attached image, which provides writers and readers. `release` (or leaving ``with``) gives the memory back."""
 
     def __init__(self, layout: ImageLayout, memory: memoryview) -> None:
         self.layout = layout
@@ -139,14 +142,14 @@ class Image:
             offset += shape.size
 
     def writer(self, region: str) -> RegionWriter:
-        """The region's writer. One a region in the whole system: that is the caller's word."""
+        """Return the region's writer. The caller guarantees that a region has only one writer in the whole system."""
         shape, view = self._region(region)
         writer = RegionWriter(view, shape)
         self._given.append(writer)
         return writer
 
     def reader(self, region: str) -> RegionReader:
-        """A new reader of the region."""
+        """Return a new reader of the region."""
         shape, view = self._region(region)
         reader = RegionReader(view, shape)
         self._given.append(reader)
@@ -158,7 +161,7 @@ class Image:
         return self._regions[name]
 
     def release(self) -> None:
-        """Let go of the memory, writers and readers included. Twice does nothing."""
+        """Let go of the memory, including all writers and readers. A second call does nothing."""
         for part in self._given:
             part.release()
         self._given.clear()
@@ -174,7 +177,9 @@ class Image:
 
 
 def process_image(inputs: Sequence[TagSpec], outputs: Sequence[TagSpec]) -> ImageLayout:
-    """The layout that gateway and PLC share: both regions, each with the other's `taken` and `consumed` tags added."""
+    """Return the layout that gateway and PLC share: both regions, each with the other's `taken` and `consumed` tags
+    added.
+    """
     taken = [TagSpec(taken_name(t.name), TagKind.INT) for t in outputs if t.kind is TagKind.MESSAGE]
     consumed = [TagSpec(consumed_name(t.name), TagKind.INT) for t in inputs if t.kind is TagKind.MESSAGE]
     return ImageLayout((RegionLayout(INPUTS, (*inputs, *taken)), RegionLayout(OUTPUTS, (*outputs, *consumed))))

@@ -1,6 +1,6 @@
-"""What a process image holds, and where: tags, regions, and the byte geometry that follows from them.
+"""The contents of a process image: tags, regions, and the positions in bytes that follow from them.
 
-Pure description. It must never know the memory itself, who maps it, or what a tag means to a plant.
+Description only. This module must not know the memory itself, who maps it, or what a tag means in a plant.
 
 A region (one writer, any number of readers) lies in memory as
 
@@ -8,8 +8,8 @@ A region (one writer, any number of readers) lies in memory as
     4 slots           check sum, counter, time, flags, then every tag's time, value, quality and reason
     a ring a MESSAGE  2 x depth records of sequence, time, length, check sum, payload
 
-All little endian. Twice the depth, because a writer that dies between writing new messages and publishing them has
-then overwritten none of the last `depth` that were published.
+All numbers are little endian. A ring has twice the depth because a writer that dies between writing new messages and
+publishing them has then overwritten none of the last `depth` published ones.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RECORD_HEAD = struct.Struct("<QqII")
 
 
 class TagKind(Enum):
-    """What a tag's eight bytes are. A MESSAGE's are the sequence of its last message."""
+    """The type of a tag's eight bytes. For a MESSAGE they hold the sequence of its last message."""
 
     REAL = "real"
     INT = "int"
@@ -47,11 +47,11 @@ class TagKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TagSpec:
-    """One tag: its name (``device.tag`` or ``program.variable``), kind, unit, the smallest and largest value that it is
-    meant to have (None: whatever its kind holds), and the words for its values where it has some (a state's names).
+    """One tag: name (``device.tag`` or ``program.variable``), kind, unit, limits, and names for its values.
 
-    A MESSAGE has payloads of at most `max_bytes` and keeps the last `depth` of them. Raises `FileInvalid` for a size
-    that makes no sense.
+    The limits are the smallest and largest value that the tag is meant to have (None: whatever its kind can hold).
+    Values have names if they are, for example, states. A MESSAGE has payloads of at most `max_bytes` and keeps the last
+    `depth` of them. Raises `FileInvalid` for a size that makes no sense.
     """
 
     name: str
@@ -78,19 +78,19 @@ class TagSpec:
             raise FileInvalid(f"tag {self.name} is no message and has no bytes or depth", got=self.kind.value)
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able; the inverse of `from_description`."""
+        """Return a JSON-able description; the inverse of `from_description`."""
         text: dict[str, Any] = {"name": self.name, "kind": self.kind.value, "unit": self.unit}
         if self.kind is TagKind.MESSAGE:
             text |= {"max_bytes": self.max_bytes, "depth": self.depth}
         if self.limits is not None:
-            text["limits"] = [float(limit) for limit in self.limits]  # 0 and 0.0 are one layout
+            text["limits"] = [float(limit) for limit in self.limits]  # 0 and 0.0 give the same layout
         if self.words:
             text["words"] = [list(word) for word in self.words]
         return text
 
     @classmethod
     def from_description(cls, text: Mapping[str, Any]) -> TagSpec:
-        """Raises `FileInvalid` for a description that is none."""
+        """Return the tag of a description. Raises `FileInvalid` if the description is invalid."""
         try:
             return cls(
                 str(text["name"]),
@@ -110,7 +110,7 @@ def _pair(low: float, high: float) -> tuple[float, float]:
 
 
 def message_tag(name: str, max_bytes: int, depth: int) -> TagSpec:
-    """A MESSAGE tag: payloads of up to `max_bytes`, the last `depth` of them kept."""
+    """Return a MESSAGE tag that keeps the last `depth` payloads of up to `max_bytes` each."""
     return TagSpec(name, TagKind.MESSAGE, max_bytes=max_bytes, depth=depth)
 
 
@@ -130,12 +130,12 @@ class RegionLayout:
             raise FileInvalid(f"too many tags in region {self.name}", expected=f"at most {MAX_TAGS}")
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able; the inverse of `from_description`."""
+        """Return a JSON-able description; the inverse of `from_description`."""
         return {"name": self.name, "tags": [tag.describe() for tag in self.tags]}
 
     @classmethod
     def from_description(cls, text: Mapping[str, Any]) -> RegionLayout:
-        """Raises `FileInvalid` for a description that is none."""
+        """Return the region of a description. Raises `FileInvalid` if the description is invalid."""
         try:
             return cls(str(text["name"]), tuple(TagSpec.from_description(tag) for tag in text["tags"]))
         except (KeyError, TypeError) as e:
@@ -144,7 +144,7 @@ class RegionLayout:
 
 @dataclass(frozen=True, slots=True)
 class RingShape:
-    """Where one MESSAGE tag's ring lies, in bytes from the start of its region."""
+    """The position of one MESSAGE tag's ring, in bytes from the start of its region."""
 
     spec: TagSpec
     index: int
@@ -156,12 +156,12 @@ class RingShape:
         return 2 * self.spec.depth
 
     def record_offset(self, sequence: int) -> int:
-        """Where message `sequence` lies."""
+        """Return the position of message `sequence`."""
         return self.offset + (sequence % self.records) * self.record_size
 
 
 class RegionShape:
-    """The geometry of a region: computed once, shared by its writer and readers in a process."""
+    """The geometry of a region, computed once and shared by its writer and readers in a process."""
 
     def __init__(self, layout: RegionLayout) -> None:
         count = len(layout.tags)
@@ -189,7 +189,7 @@ class RegionShape:
         self.size = _aligned(offset, LINE)
 
     def slot_offset(self, counter: int) -> int:
-        """Where publication `counter` lies."""
+        """Return the position of publication `counter`."""
         return LINE + (counter % SLOTS) * self.slot_size
 
 

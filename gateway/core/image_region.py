@@ -1,12 +1,12 @@
 """One region of the process image: its only writer, and a reader.
 
 The writer fills the slot that was published longest ago and then stores the counter: an aligned eight-byte store, so a
-reader sees the old number or the new one. A reader copies the slot that the counter names and believes it only if the
-check sum fits and the slot carries that very number; otherwise it looks again, a bounded number of times, and then
-answers with its last snapshot, counted. A writer killed at any instant leaves the last publication whole: it was
-writing into another slot. Nobody waits for anybody; there is no lock.
+reader sees the old number or the new one. A reader copies the slot that the counter names. It accepts the copy only if
+the check sum is right and the slot carries the same number; otherwise it tries again, a limited number of times, and
+then returns its last snapshot, which is counted. A writer that is killed at any instant leaves the last publication
+whole, because it was writing into another slot. There is no lock, and neither writer nor readers wait.
 
-It must never know who maps the memory, what time it is, or what is done with a value.
+This module must not know who maps the memory, what time it is, or what a value is used for.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from fieldtwin.gateway.core.image_snapshot import Message, RegionFlag, Snapshot
 from fieldtwin.gateway.core.values import Quality, Reason, Scalar, TagValue
 
 MAX_LOOKS = 16
-"""How often a reader looks before it gives up for now. Trying four slots gave 0.0015 retries a read (DESIGN.md)."""
+"""Number of attempts of a reader before it gives up for now. Trying four slots gave 0.0015 retries per read (DESIGN.md)."""
 
-_NO_VALUE = 0x80  # in the quality byte: the tag has a quality and no value
+_NO_VALUE = 0x80  # in the quality byte: the tag has a quality but no value
 _NO_MESSAGES: Mapping[str, tuple[Message, ...]] = MappingProxyType({})
 _UNFLAGGED = RegionFlag.NONE  # an Enum's members are slow to look up
 _QUALITY_OF = bytes(mark & ~_NO_VALUE for mark in range(256))
 
 
 class NotEncodable(Bug):
-    """A value that its tag cannot hold. `tag` names it."""
+    """A value does not fit its tag. `tag` names the tag."""
 
     def __init__(self, tag: str, message: str, *, expected: str = "", got: str = "") -> None:
         self.tag = tag
@@ -52,14 +52,16 @@ class _Region:
         self._slot_bytes = CHECK.size + shape.body.size
 
     def release(self) -> None:
-        """Let go of the memory, so that a map can be closed. Afterwards the object is of no use."""
+        """Let go of the memory, so that a map can be closed. The object cannot be used afterwards."""
         self._words.release()
         self._memory.release()
 
     def _slot(self, counter: int) -> bytes | None:
-        """Publication `counter`, verified, without its check sum; None if it is not, or no longer, there."""
+        """Return publication `counter`, verified, without its check sum; None if it is not, or no longer, in the memory."""
         at = self._slots[counter % SLOTS]
-        (check,) = CHECK.unpack_from(self._memory, at)  # overwritten between this line and the next, the two do not fit
+        (check,) = CHECK.unpack_from(
+            self._memory, at
+        )  # if overwritten between this line and the next, they do not match
         body = self._memory[at + CHECK.size : at + self._slot_bytes].tobytes()
         if zlib.crc32(body) != check or int.from_bytes(body[:8], "little") != counter:
             return None
@@ -67,15 +69,18 @@ class _Region:
 
 
 class RegionWriter(_Region):
-    """The one writer of a region. Attaching to a region that has been published before continues its counters, so a
-    restarted process never repeats a sequence. Raises `FileInvalid` when what is there is damaged."""
+    """The only writer of a region.
+
+    Attaching to a region that has been published before continues its counters, so a restarted process never repeats a
+    sequence. Raises `FileInvalid` if the region's content is damaged.
+    """
 
     def __init__(self, memory: memoryview, shape: RegionShape) -> None:
         super().__init__(memory, shape)
         self._copy = bytearray(CHECK.size + shape.body.size)
         self._body = memoryview(self._copy)[CHECK.size :]
         self._packed = False
-        """Whether `_body` has values, qualities and reasons as they were published last."""
+        """True if `_body` holds the values, qualities and reasons of the last publication."""
         self._last = {ring.spec.name: 0 for ring in shape.rings}
         self.counter = int(self._words[0])
         if self.counter:
@@ -87,7 +92,7 @@ class RegionWriter(_Region):
             self._last = {r.spec.name: int(fields[4 + shape.count + r.index]) for r in shape.rings}
 
     def last_sequence(self, tag: str) -> int:
-        """The sequence of the last message published on `tag`, 0 if none."""
+        """Return the sequence of the last message published on `tag`, or 0 if none was published."""
         return self._last[tag]
 
     def publish(
@@ -97,11 +102,11 @@ class RegionWriter(_Region):
         messages: Mapping[str, Sequence[tuple[int, bytes]]] | None = None,
         flags: RegionFlag = RegionFlag.NONE,
     ) -> int:
-        """Publish all tags at once; returns the publication's counter.
+        """Publish all tags together and return the publication's counter.
 
-        `values` has one entry a tag in the layout's order; of a MESSAGE's entry only quality, reason and time count.
+        `values` has one entry per tag in the layout's order; of a MESSAGE's entry only quality, reason and time count.
         `messages` maps a MESSAGE tag to its new messages as (source time in ns, payload), at most `depth` of them.
-        `now_ns` is the heartbeat. Raises `NotEncodable` and publishes nothing when something does not fit.
+        `now_ns` is the heartbeat. Raises `NotEncodable` and publishes nothing if a value or message does not fit.
         """
         return self._publish(
             [v.value for v in values],
@@ -124,10 +129,10 @@ class RegionWriter(_Region):
         *,
         same: bool = False,
     ) -> int:
-        """`publish` for a writer that keeps columns, one entry a tag in the layout's order.
+        """Publish from columns that have one entry per tag in the layout's order.
 
-        `same`: the caller has not touched values, qualities and reasons since it published them last, times aside. As a rule
-        a cycle brings nothing, and then they are not looked at.
+        `same` says that the caller has not changed values, qualities and reasons since it published them last; times
+        may have changed. Most cycles change nothing, and then those columns are not examined.
         """
         stamps = self._stamps(times_ns)
         if same and not messages and self._packed:
@@ -147,11 +152,11 @@ class RegionWriter(_Region):
         same: bool = False,
         missing: Mapping[int, Reason] | None = None,
     ) -> int:
-        """`publish` for a writer whose values are all of one quality and instant (a scan): no object a tag is made.
+        """Publish values that all have one quality and time (a scan), without creating an object per tag.
 
-        `but` has the quality of the few tags, by index, that differ. A None has no value and is BAD,
-        NEVER_READ, or for the reason that `missing` has for its index.
-        `same`: `values`, `quality`, `reason` and `but` are what the caller published last; then they are not looked at.
+        `but` has the quality of the few tags, by index, that differ. A None has no value and is BAD with reason
+        NEVER_READ, or with the reason that `missing` has for its index. `same` says that `values`, `quality`, `reason`
+        and `but` are those that the caller published last; then they are not examined.
         """
         count = len(values)
         if same and not messages and self._packed:
@@ -203,7 +208,7 @@ class RegionWriter(_Region):
                 where=f"region {shape.layout.name}",
             )
         last = self._check_messages(messages) if messages else self._last
-        self._packed = False  # should it fail
+        self._packed = False  # in case packing fails
         self._pack(values, last, marks, reasons)
         self._packed = True
         if messages:
@@ -212,7 +217,7 @@ class RegionWriter(_Region):
         return self._commit(stamps, now_ns, flags)
 
     def _commit(self, stamps: bytes, now_ns: int, flags: int) -> int:
-        """Publish the columns that are packed, with these times."""
+        """Publish the packed columns with these times."""
         shape, body, counter = self.shape, self._body, self.counter + 1
         body[shape.times_at : shape.columns_at] = stamps
         shape.head.pack_into(body, 0, counter, now_ns, flags)
@@ -230,7 +235,7 @@ class RegionWriter(_Region):
         marks: bytes | bytearray,
         reasons: bytes | bytearray,
     ) -> None:
-        """Put the columns into `_body`, with `last` as the messages' sequences."""
+        """Pack the columns into `_body`, with `last` as the messages' sequences."""
         shape, plain = self.shape, list(values)
         for ring in shape.rings:
             plain[ring.index] = last[ring.spec.name]
@@ -271,7 +276,7 @@ class RegionWriter(_Region):
                 self._memory[at : at + len(record)] = record
 
     def _not_encodable(self, values: Sequence[Scalar | None]) -> Bug:
-        """Find the tag that did not fit; only on the way out."""
+        """Find the tag that did not fit. Called only after packing failed."""
         for spec, value in zip(self.shape.layout.tags, values, strict=True):
             try:
                 struct.pack("<d" if spec.kind is TagKind.REAL else "<q", 0 if value is None else value)
@@ -287,10 +292,10 @@ class RegionWriter(_Region):
 
 
 class RegionReader(_Region):
-    """A reader of a region; any number of them, each with its own place in every message ring.
+    """A reader of a region. A region may have any number of readers, each with its own position in every message ring.
 
-    `retries` counts looks that failed, `gave_up` snapshots that were answered with the last one, `missed` messages that
-    were overwritten before this reader came by, by tag.
+    `retries` counts failed attempts, `gave_up` the snapshots that repeated the last one, and `missed` the messages, by
+    tag, that were overwritten before this reader read them.
     """
 
     def __init__(self, memory: memoryview, shape: RegionShape) -> None:
@@ -312,28 +317,30 @@ class RegionReader(_Region):
             _NO_MESSAGES,
         )
         self._columns = b""
-        """Packed, those of the latest snapshot."""
+        """The packed columns of the latest snapshot."""
         self._marks = b""
-        """The quality bytes that `_empty` and `_qualities` were made of: they change seldom."""
+        """The quality bytes from which `_empty` and `_qualities` were made; they change seldom."""
         self._empty: list[int] = []
         self._qualities = b""
 
     def resume(self, tag: str, seq: int) -> None:
-        """Message `seq` of `tag` is already dealt with (a reader that was restarted): the next one is `seq` + 1."""
+        """Continue after message `seq` of `tag`, which was handled before the reader was restarted: the next one is `seq` + 1."""
         self._seen[tag] = seq
-        self._columns = b""  # the same columns may mean other new messages now
+        self._columns = b""  # the same columns may now stand for other new messages
 
     def seen(self, tag: str) -> int:
-        """The sequence of the last message of `tag` that a snapshot carried or counted as missed."""
+        """Return the sequence of the last message of `tag` that a snapshot carried or counted as missed."""
         return self._seen[tag]
 
     @property
     def latest(self) -> Snapshot:
-        """What the last `snapshot` answered, without looking again; counter 0 before the first."""
+        """Return the result of the last `snapshot` without reading again; its counter is 0 before the first."""
         return self._latest
 
     def snapshot(self) -> Snapshot:
-        """The latest publication, whole. Never waits: at most `MAX_LOOKS` looks, then the last snapshot again."""
+        """Return the latest complete publication. Never waits: after at most `MAX_LOOKS` attempts, it returns the last
+        snapshot again.
+        """
         for _ in range(MAX_LOOKS):
             counter = self._words[0]
             if counter == self._latest.counter:
@@ -347,7 +354,7 @@ class RegionReader(_Region):
         return self._again()
 
     def _again(self) -> Snapshot:
-        """The last snapshot; its messages were handed out before."""
+        """Return the last snapshot without its messages, which were returned before."""
         s = self._latest
         if s.messages:
             s = self._latest = replace(s, messages=_NO_MESSAGES)
@@ -358,7 +365,7 @@ class RegionReader(_Region):
         counter, t_ns, flags = shape.head.unpack_from(body)
         named = RegionFlag(flags) if flags else _UNFLAGGED
         columns, stamps = body[shape.columns_at :], body[shape.times_at : shape.columns_at]
-        if columns == self._columns:  # as a rule: a scan comes by more often than values, sequences among them, change
+        if columns == self._columns:  # the usual case: scans are more frequent than changes of values and sequences
             return Snapshot(
                 shape, counter, t_ns, named, latest.values, latest.qualities, latest.reasons, stamps, _NO_MESSAGES
             )
@@ -372,7 +379,7 @@ class RegionReader(_Region):
         return Snapshot(shape, counter, t_ns, named, values, marks, reasons, stamps, messages)
 
     def _decode_columns(self, columns: bytes) -> tuple[tuple[Scalar | None, ...], bytes, bytes]:
-        """Values, qualities and reasons."""
+        """Return values, qualities and reasons."""
         values = list(self.shape.columns.unpack(columns))
         reasons, marks = values.pop(), values.pop()
         for i in self.shape.bool_indexes:
@@ -385,7 +392,7 @@ class RegionReader(_Region):
         return tuple(values), self._qualities, reasons
 
     def _drain(self, ring: RingShape, last: int) -> tuple[Message, ...]:
-        """Messages from the first unseen one to `last`; the ones that are overwritten are counted."""
+        """Return the messages from the first unseen one to `last`, and count those that were overwritten."""
         tag, spec = ring.spec.name, ring.spec
         first = max(self._seen[tag] + 1, last - spec.depth + 1)
         self.missed[tag] += first - self._seen[tag] - 1
@@ -398,7 +405,7 @@ class RegionReader(_Region):
             data = copy[RECORD_HEAD.size : RECORD_HEAD.size + length]
             if got == seq and length <= spec.max_bytes and _record_check(seq, t_ns, data) == check:
                 found.append(Message(seq, t_ns, data))
-            else:  # the writer has come round: it published more than `depth` since the counter was read
+            else:  # the writer published more than `depth` messages since the counter was read
                 self.missed[tag] += 1
         return tuple(found)
 

@@ -1,6 +1,6 @@
-"""What a reader of a process image gets: one publication of a region, whole. Values only.
+"""One complete publication of a region, as a reader of a process image receives it. Values only.
 
-It must never know where the memory is, nor who wrote it.
+This module must not know where the memory is or who wrote it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _REASONS = {int(reason): reason for reason in Reason}
 
 
 class RegionFlag(IntFlag):
-    """What a writer says about all of its region."""
+    """Flags that a writer sets for its whole region."""
 
     NONE = 0
     STOPPED = 1
-    """The writer stopped on purpose or by its watchdog: nothing in the region may be acted upon."""
+    """The writer stopped, intentionally or by its watchdog: the values of the region must not be acted upon."""
 
 
 _UNFLAGGED = RegionFlag.NONE  # an Enum's members are slow to look up
@@ -37,12 +37,14 @@ class Message(msgspec.Struct, frozen=True, gc=False):
 
 
 class Snapshot(msgspec.Struct, frozen=True, gc=False):
-    """One publication of a region, whole. `counter` counts publications from 1; 0 means that there never was one.
+    """One complete publication of a region. `counter` counts publications from 1; 0 means that nothing was published
+    yet.
 
-    `values`, `qualities`, `reasons` and `stamps` are columns in the order of the region's tags; `value` joins them
-    for one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, what is new since
-    the reader's last snapshot, in order; a tag without news has no entry. Times stay packed in `stamps` until somebody
-    asks for one: hardly anybody does. As long as no value, quality or reason changes, snapshots share those columns.
+    `values`, `qualities`, `reasons` and `stamps` are columns in the order of the region's tags; `value` joins them for
+    one tag. A MESSAGE tag's value is the sequence of its last message. `messages` holds, by tag, the messages that are
+    new since the reader's last snapshot, in order; a tag without new messages has no entry. Times stay packed in
+    `stamps` until they are requested, which is rare. As long as no value, quality or reason changes, snapshots share
+    those columns.
     """
 
     shape: RegionShape
@@ -56,16 +58,16 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
     messages: Mapping[str, tuple[Message, ...]]
 
     def value(self, tag: str | int) -> TagValue:
-        """The value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
+        """Return the value of a tag by name or index. `raw` is not carried. Raises KeyError or IndexError."""
         i = self.shape.index[tag] if isinstance(tag, str) else tag
         return TagValue(self.values[i], _QUALITIES[self.qualities[i]], _REASONS[self.reasons[i]], self.time_ns(i))
 
     def time_ns(self, index: int) -> int:
-        """The source's time of the tag at `index` (monotonic)."""
+        """Return the source's time of the tag at `index` (monotonic)."""
         return int.from_bytes(self.stamps[8 * index : 8 * index + 8], "little", signed=True)
 
     def all(self) -> dict[str, TagValue]:
-        """Every tag by name."""
+        """Return every tag by name."""
         return {name: self.value(i) for name, i in self.shape.index.items()}
 
     @property
@@ -73,5 +75,5 @@ class Snapshot(msgspec.Struct, frozen=True, gc=False):
         return self.flags is not _UNFLAGGED and bool(self.flags & RegionFlag.STOPPED)
 
     def age_ns(self, now_ns: int) -> float:
-        """How long ago the writer published this: its heartbeat. Infinite when it never did."""
+        """Return the time since the writer published this (its heartbeat); infinite if it never published."""
         return now_ns - self.t_ns if self.counter else float("inf")

@@ -1,7 +1,7 @@
 """Open a file that a user named: a regular file of a limited size, so that reading it always ends.
 
-A pipe without a writer would be waited for, a device such as /dev/zero has no end, and a file of zeros that takes no room on the
-disk would fill the memory. A symbolic link is followed; what it leads to must be a regular file.
+Opening a pipe without a writer would block, a device such as /dev/zero has no end, and a file of zeros that takes no
+room on the disk would fill the memory. A symbolic link is followed; its target must be a regular file.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _KINDS = {
 
 
 def open_input(path: Path) -> io.BufferedReader:
-    """Open `path` for reading bytes. Raises `FileInvalid` if it is no regular file, `OSError` if it cannot be opened."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # an ordinary open waits for a pipe's writer
+    """Open `path` for reading bytes. Raises `FileInvalid` if it is not a regular file, `OSError` if it cannot be opened."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # else a pipe is waited for
     try:
         kind = stat.S_IFMT(os.fstat(descriptor).st_mode)
         if kind == stat.S_IFDIR:

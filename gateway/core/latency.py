@@ -1,4 +1,4 @@
-"""How long answers took: counts in fixed buckets, bounded over months. It never knows what is measured."""
+"""Response times, counted in fixed buckets, so that months take no more memory. This module does not know what is measured."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any
 from fieldtwin.gateway.core.clock import NS_PER_MS, NS_PER_S
 
 BOUNDS_MS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
-"""Upper ends of the buckets, inclusive; what took longer is in one more. From TCP on a switch to a slow line with a slow unit."""
+"""Upper limits of the buckets, inclusive; one further bucket counts longer times. They range from TCP on a switch to a
+slow serial line with a slow device.
+"""
 
 RECENT = 64
-"""How many durations `recent_longest_ns` looks back."""
+"""The number of latest durations that `recent_longest_ns` covers."""
 
 _BOUNDS_NS = tuple(ms * NS_PER_MS for ms in BOUNDS_MS)
 
@@ -34,9 +36,11 @@ class Latencies:
 
     @property
     def recent_longest_ns(self) -> int:
-        """The longest of the last `RECENT` durations; 0 before the first."""
+        """Return the longest of the last `RECENT` durations, or 0 before the first."""
         return max(self._recent, default=0)
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able: `bounds_ms`, `counts` (one more than bounds, each of its bucket alone) and `total_s`."""
+        """Return a JSON-able description: `bounds_ms`, `counts` (one more than bounds, each for its bucket alone) and
+        `total_s`.
+        """
         return {"bounds_ms": list(BOUNDS_MS), "counts": list(self.counts), "total_s": self.total_ns / NS_PER_S}

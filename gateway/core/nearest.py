@@ -6,10 +6,10 @@ import difflib
 from collections.abc import Iterable
 
 ALIKE = 0.5
-"""How much of two names has to agree (`difflib.SequenceMatcher.ratio`) for one to be meant by the other."""
+"""The smallest similarity of two names (`difflib.SequenceMatcher.ratio`) at which one is suggested for the other."""
 
 
 def did_you_mean(name: str, known: Iterable[str], otherwise: str = "") -> str:
-    """Return a hint with the `known` name that is most like `name`, or `otherwise` where none is like it."""
+    """Return a hint with the `known` name that is most similar to `name`, or `otherwise` if none is similar."""
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=ALIKE)
     return f"did you mean {near[0]!r}?" if near else otherwise

@@ -33,7 +33,7 @@ class Nursery:
         self._ended.set()
 
     async def wait(self) -> None:
-        """Until a child fails, or all have ended. Raises the first failure in order of creation."""
+        """Wait until a child fails or all have ended. Raises the first failure in order of creation."""
         while any(not child.done() for child in self._children):
             await self._ended.wait()
             self._ended.clear()
@@ -41,7 +41,7 @@ class Nursery:
         self._raise_first()
 
     def failure(self) -> BaseException | None:
-        """What the first child that failed raised, in order of creation; None while none has."""
+        """Return the exception of the first child that failed, in order of creation; None while no child has failed."""
         for child in self._children:
             if child.done() and not child.cancelled() and (error := child.exception()) is not None:
                 return error
@@ -67,8 +67,8 @@ class Nursery:
                 try:
                     await asyncio.wait([child])
                 except asyncio.CancelledError:
-                    child.cancel()  # somebody cancelled us meanwhile: passed on, and raised below
-            if not child.cancelled():  # kept, and raised below unless something else is on its way already
+                    child.cancel()  # we were cancelled meanwhile: cancel the child, and raise below
+            if not child.cancelled():  # kept, and raised below unless another exception is already being raised
                 failed = failed or child.exception()
         if me is not None and me.cancelling() > asked_before:
             raise asyncio.CancelledError

@@ -1,8 +1,8 @@
 """A device profile with everything resolved: addresses as sent, sizes, groups, commands.
 
-Both sides of a wire read the same profile and nothing else in common: the driver decodes with fieldtwin.gateway.devices.codec,
-the emulator encodes with a codec of its own (DESIGN.md, the one idea). Addresses are shown both ways, as printed in manuals
-and as sent (decision 9).
+The driver and the emulator read the same profile and share nothing else: the driver decodes with
+fieldtwin.gateway.devices.codec, the emulator encodes with its own codec (DESIGN.md, the one idea). Addresses are shown
+in two forms, as printed in manuals and as sent (decision 9).
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ class RegisterRange:
 
     @property
     def end(self) -> int:
-        """One past the last address."""
+        """Return the address after the last one."""
         return self.address + self.count
 
     def overlaps(self, other: RegisterRange) -> bool:
-        """Return whether the two have a register (or bit) in common."""
+        """Return whether the two ranges have a register (or bit) in common."""
         return self.table == other.table and self.address < other.end and other.address < self.end
 
     def __str__(self) -> str:
-        """Both ways: ``30001 (input:0)``, with the count where it is not 1."""
+        """Return both forms of the address, ``30001 (input:0)``, with the count if it is not 1."""
         digit = dict(PRINTED)[self.table]
         number = self.address + 1
         printed = f"{digit}{number:04d}" if number <= 9999 else f"{digit}{number:05d}"
@@ -84,7 +84,7 @@ class Tag:
 
     @property
     def registers(self) -> RegisterRange:
-        """Where a Modbus tag stands; a profile's protocol guarantees it."""
+        """Return the registers of a Modbus tag; the profile's protocol guarantees that it has some."""
         assert self.at is not None
         return self.at
 
@@ -106,18 +106,18 @@ class Tag:
 
     @property
     def is_bit(self) -> bool:
-        """True when the value is a single bit: type bool, or one bit of a register."""
+        """Return whether the value is a single bit: type bool, or one bit of a register."""
         return self.type == "bool" or (self.bits is not None and self.bits[0] == self.bits[1])
 
     @property
     def is_integer(self) -> bool:
-        """True when the engineering value is a whole number: an integer type without scale and offset."""
+        """Return whether the engineering value is a whole number: an integer type without scale and offset."""
         plain = self.scale == 1.0 and self.offset == 0.0 and self.scale_by is None
         return self.type in INTEGER_RANGES and plain
 
     @property
     def limits(self) -> tuple[float, float] | None:
-        """The smallest and largest value that may be written, in engineering units; None where anything goes."""
+        """Return the smallest and largest value that may be written, in engineering units; None if there are no limits."""
         if self.range is not None:
             return self.range
         if self.bits is not None:
@@ -140,7 +140,7 @@ class Message:
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """Which tag counts samples and which holds their period in seconds."""
+    """The tag that counts samples and the tag that holds their period in seconds."""
 
     count: str
     period: str
@@ -150,7 +150,7 @@ class Sampled:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """One mailbox: two registers (sequence, length in bytes), the payload, and the acknowledged sequence elsewhere."""
+    """One mailbox: two registers (sequence, length in bytes), the payload after them, and the acknowledged sequence elsewhere."""
 
     name: str
     at: RegisterRange
@@ -160,8 +160,11 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class OwnFunction:
-    """A function that no standard knows: `request` and `reply` are its data, without the function code. `sets`: what tags
-    hold afterwards, in engineering units."""
+    """A function of the device that is not in the standard.
+
+    `request` and `reply` are its data, without the function code. `sets` maps tags to the values that they hold
+    afterwards, in engineering units.
+    """
 
     name: str
     code: int
@@ -172,8 +175,11 @@ class OwnFunction:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """When `tag` is read, or written (with `value`, if that is not None), `sets` says what tags hold afterwards. Engineering
-    units."""
+    """A side effect of reading or writing `tag`: `sets` maps tags to the values that they hold afterwards, in
+    engineering units.
+
+    If `value` is not None, only writing that value has the effect.
+    """
 
     tag: Tag
     on_read: bool
@@ -205,24 +211,24 @@ class DeviceProfile:
 
     @property
     def eds_path(self) -> Path | None:
-        """The EDS that a CANopen profile names, beside the profile."""
+        """Return the path of the EDS that a CANopen profile names, in the profile's folder."""
         return Path(self.path).parent / self.form.eds if self.form.eds else None
 
     def group(self, poll: str) -> list[Tag]:
-        """The readable tags of a poll group, in the file's order."""
+        """Return the readable tags of a poll group, in the file's order."""
         return [t for t in self.tags.values() if t.poll == poll and t.readable]
 
     @property
     def groups(self) -> list[str]:
-        """The poll groups, in the file's order."""
+        """Return the poll groups, in the file's order."""
         return list(dict.fromkeys(t.poll for t in self.tags.values() if t.readable))
 
     @property
     def command_list(self) -> frozenset[str]:
-        """The commands a device of this profile accepts (SPEC ruling 12).
+        """Return the commands that a device of this profile accepts (SPEC ruling 12).
 
-        ``read_<group>`` for each poll group, the names in `commands`, ``set_<tag>`` for a writable tag without one; a
-        transmitter accepts ``send`` and ``acknowledge``, a CANopen node the NMT commands.
+        They are ``read_<group>`` for each poll group, the names in `commands`, and ``set_<tag>`` for a writable tag
+        without one. A transmitter accepts ``send`` and ``acknowledge``, a CANopen node the NMT commands.
         """
         named = set(self.form.commands.values())
         commands = {f"read_{g}" for g in self.groups} | set(self.form.commands)
@@ -235,7 +241,7 @@ class DeviceProfile:
 
     @property
     def own_functions(self) -> dict[str, OwnFunction]:
-        """The functions of the device's own, by name."""
+        """Return the device-specific functions, by name."""
         return {
             name: OwnFunction(
                 name,
@@ -249,7 +255,7 @@ class DeviceProfile:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """What reading and writing tags does besides, in the file's order."""
+        """Return the side effects of reading and writing tags, in the file's order."""
         return tuple(
             Effect(
                 self.tags[e.read or e.written or ""],
@@ -261,14 +267,14 @@ class DeviceProfile:
         )
 
     def command_for(self, tag: str) -> str:
-        """The command that writes `tag`."""
+        """Return the command that writes `tag`."""
         return next((c for c, t in self.form.commands.items() if t == tag), f"set_{tag}")
 
 
 def resolve_address(text: int | str, numbering: str, count: int = 1) -> RegisterRange:
     """Read an address: ``30001`` / ``400001`` as printed in manuals, ``input:0`` / ``holding:0x10`` as sent.
 
-    Raises ValueError with a sentence that says what would have been right.
+    Raises ValueError with a sentence that names a valid form.
     """
     if isinstance(text, str) and ":" in text:
         table, _, number = text.partition(":")
@@ -292,9 +298,10 @@ def resolve_address(text: int | str, numbering: str, count: int = 1) -> Register
 
 
 def resolve_gap(text: str, numbering: str) -> RegisterRange:
-    """Read a range of registers, both ends included: ``30001..30010`` as printed, ``input:0..9`` or ``input:5`` as sent.
+    """Read a range of registers, both ends included: ``30001..30010`` as printed, ``input:0..9`` or ``input:5`` as
+    sent.
 
-    Raises ValueError with a sentence that says what would have been right.
+    Raises ValueError with a sentence that names a valid form.
     """
     first, dots, last = text.partition("..")
     start = resolve_address(first, numbering)
@@ -307,18 +314,18 @@ def resolve_gap(text: str, numbering: str) -> RegisterRange:
 
 
 def gap_text(gap: RegisterRange) -> str:
-    """A range as a profile's `gaps` has it, as sent; what `resolve_gap` reads."""
+    """Return a range in the notation of a profile's `gaps`, as sent; `resolve_gap` reads it."""
     last = f"..{gap.end - 1}" if gap.count > 1 else ""
     return f"{gap.table}:{gap.address}{last}"
 
 
 def load_profile(path: Path) -> DeviceProfile:
-    """Read a profile; raises `FileInvalid` with line and column for anything wrong."""
+    """Read a profile. Raises `FileInvalid` with line and column for every error."""
     return resolve(load(path))
 
 
 def resolve(file: YamlFile) -> DeviceProfile:
-    """A parsed profile file as a `DeviceProfile`."""
+    """Return a parsed profile file as a `DeviceProfile`."""
     form = validate(file, ProfileForm)
     tags: dict[str, Tag] = {}
     for name, tag_form in form.tags.items():
@@ -342,7 +349,7 @@ def resolve(file: YamlFile) -> DeviceProfile:
 
 
 def _tags_of(file: YamlFile, form: ProfileForm, name: str, t: TagForm) -> Iterable[Tag]:
-    """One tag, or several for a name such as ``voltage_l1..3``: the following ones stand right behind the first."""
+    """Return one tag, or several for a name such as ``voltage_l1..3``, whose registers directly follow each other."""
     loc: tuple[Key, ...] = ("tags", name)
     kind = t.type or form.defaults.type
     if form.protocol == "canopen":
@@ -422,7 +429,7 @@ WRITE_FUNCTIONS: dict[Table, tuple[int, ...]] = {"coil": (5, 15), "holding": (6,
 
 
 def _check_functions(file: YamlFile, p: DeviceProfile) -> None:
-    """Every value must be readable, and writable where it says so, with a function that the device has."""
+    """Check that the device has the functions to read every value, and to write every value that is marked as writable."""
     functions = p.form.limits.functions
     for tag in p.tags.values():
         if tag.at is None:
@@ -449,7 +456,7 @@ def _check_functions(file: YamlFile, p: DeviceProfile) -> None:
 
 
 def _check_reads(file: YamlFile, p: DeviceProfile) -> None:
-    """What is one value, message or sample must come in one read, and a sample's counter must be able to count."""
+    """Check that one value, message or sample fits into one read, and that a sample's counter can count."""
     most = p.form.limits.read_registers
     for tag in p.tags.values():
         if tag.at is not None and tag.readable and tag.at.count > most:
@@ -490,7 +497,7 @@ def _check_sets(file: YamlFile, p: DeviceProfile, loc: tuple[Key, ...], sets: It
 
 
 def _check_stated(file: YamlFile, p: DeviceProfile) -> None:
-    """Effects, and what functions that carry no registers answer: the device must have what they need."""
+    """Check that the device has what is needed by its effects and by its functions that carry no registers."""
     for i, effect in enumerate(p.effects):
         if not (effect.tag.readable if effect.on_read else effect.tag.writable):
             verb = "read" if effect.on_read else "written"
@@ -513,7 +520,7 @@ def _check_stated(file: YamlFile, p: DeviceProfile) -> None:
 
 
 def _check_references(file: YamlFile, p: DeviceProfile) -> None:
-    """Every tag that is named elsewhere in the profile must exist, and be of the kind that its use needs."""
+    """Check that every tag that the profile refers to exists and is of the required kind."""
     wanted: list[tuple[tuple[Key, ...], str]] = [(("commands", c), t) for c, t in p.form.commands.items()]
     wanted += [(("messages", m.name, "when"), m.when) for m in p.messages.values()]
     wanted += [(("identify", i, "tag"), e.tag) for i, e in enumerate(p.form.identify)]

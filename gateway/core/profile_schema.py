@@ -1,6 +1,6 @@
-"""What a device profile may say: the pydantic models of the YAML form (see docs and `fieldtwin schema profile`).
+"""The form of a device profile: the pydantic models of the YAML file (see docs and `fieldtwin schema profile`).
 
-Only the form is here. fieldtwin.gateway.core.profile turns it into frozen objects with resolved addresses.
+fieldtwin.gateway.core.profile turns the form into frozen objects with resolved addresses.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ FileNumber = Annotated[int, Field(ge=1, le=0xFFFF)]
 
 
 class Strict(BaseModel):
-    """Unknown keys are refused; values are not coerced."""
+    """A form that refuses unknown keys and does not convert values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class Factory(Strict):
-    """How the device leaves the factory."""
+    """The device's settings when it leaves the factory."""
 
     baudrate: int = Field(default=19200, gt=0)
     frame: str = Field(default="8E1", pattern=r"^[78][NEO][12]$")
@@ -51,7 +51,7 @@ class Factory(Strict):
 
 
 class Limits(Strict):
-    """What the device accepts; both the driver and the emulator keep to it."""
+    """The limits of the device, which both the driver and the emulator observe."""
 
     functions: list[int] | None = None
     read_registers: int = Field(default=125, ge=1, le=125)
@@ -60,7 +60,7 @@ class Limits(Strict):
 
 
 class TimingForm(Strict):
-    """What pace the device needs of whoever asks it; a system file may say otherwise. Milliseconds."""
+    """The timing that the device needs from its clients, in milliseconds. A system file may override it."""
 
     timeout_ms: int | None = Field(default=None, ge=1, le=3_600_000, description="how long a reply may take")
     spacing_ms: int = Field(default=0, ge=0, le=60_000, description="pause between a reply and the next request")
@@ -68,7 +68,7 @@ class TimingForm(Strict):
 
 
 class Defaults(Strict):
-    """What a tag is unless it says otherwise."""
+    """The properties of a tag that does not set them itself."""
 
     type: ValueType = "uint16"
     order: Order = "ABCD"
@@ -76,7 +76,7 @@ class Defaults(Strict):
 
 
 class TagForm(Strict):
-    """One value of the device. `at` for Modbus, `object` for CANopen ("6010:00")."""
+    """One value of the device. Modbus uses `at`, CANopen uses `object` ("6010:00")."""
 
     at: Address | None = None
     object: str | None = Field(default=None, pattern=r"^[0-9A-Fa-f]{4}:[0-9A-Fa-f]{2}$")
@@ -111,7 +111,7 @@ class MessageForm(Strict):
 
 
 class SampledForm(Strict):
-    """The values of group `poll` are samples: new when tag `count` moves, taken every tag `period` seconds."""
+    """The values of group `poll` are samples: new when tag `count` changes, taken every tag `period` seconds."""
 
     count: str
     period: str
@@ -135,7 +135,7 @@ class MailboxForm(Strict):
 
 
 class IdentifyForm(Strict):
-    """A read whose answer tells this device from others; `tag` names the value to compare with `expect`."""
+    """A read whose reply distinguishes this device from others; `tag` names the value to compare with `expect`."""
 
     tag: str
     expect: str | int | None = Field(
@@ -156,7 +156,7 @@ class TriggerForm(Strict):
 
 
 class FunctionForm(Strict):
-    """A function of the device's own (AP 5). Request and reply are data bytes in hex, without the function code."""
+    """A device-specific function (AP 5). Request and reply are data bytes in hex, without the function code."""
 
     code: int = Field(ge=1, le=127)
     request: str = Field(default="", pattern=r"^([0-9A-Fa-f]{2} ?)*$", description="what it takes; else exception 03")
@@ -166,7 +166,7 @@ class FunctionForm(Strict):
 
 
 class EffectForm(Strict):
-    """What reading or writing a tag does besides: other tags, or itself, hold something else afterwards."""
+    """A side effect of reading or writing a tag: the values that other tags, or the tag itself, hold afterwards."""
 
     read: Name | None = None
     written: Name | None = None

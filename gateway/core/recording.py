@@ -1,18 +1,20 @@
-"""Recordings: what a device said, or how its signals went, as JSON Lines that outlive a crash.
+"""Recordings of a device's replies, or of its signals, as JSON Lines files that survive a crash.
 
 The first line is a header; every further line is one record and is written with one ``write``, so that a killed process
-loses at most the line that it was writing. Two kinds:
+loses at most the line that it was writing. There are two kinds:
 
 ``exchanges``  ``{"t": 1.25, "unit": 1, "req": "0400000002", "rep": "04044148f5c3", "lat": 0.021}``
-               `req` and `rep` are hex of the protocol data unit (Modbus: function code and data; neither unit id nor
-               CRC nor MBAP header), `t` seconds since the start when the request was sent, `lat` seconds from the
-               request's last byte to the reply's. Instead of `rep` there is ``"err": "timeout"`` where no valid reply
-               came. An empty `rep` is a broadcast, to which none belongs.
-``signals``    ``[1.25, 10.31, 18.402, 4.5871]``: seconds since the start, then one number a signal in the header's
-               order, ``null`` where there is none. An array and not an object: a third of the size, as easy to diff.
+               `req` and `rep` are hex of the protocol data unit (Modbus: function code and data; neither unit ID nor
+               CRC nor MBAP header), `t` is the time at which the request was sent, in seconds since the start, and `lat`
+               the seconds from the request's last byte to the reply's. If no valid reply came, there is
+               ``"err": "timeout"`` instead of `rep`. An empty `rep` is a broadcast, which has no reply.
+``signals``    ``[1.25, 10.31, 18.402, 4.5871]``: seconds since the start, then one number for each signal in the
+               header's order, ``null`` if it has no value. An array is a third of the size of an object, and as easy
+               to compare.
 
-Reading is streaming, memory is bounded by a block of lines. A last line that was cut off is reported and not used (`truncated`);
-anything else that is not a record is `FileInvalid` with path and line. This module knows no clock: every time is given.
+A recording is read as a stream; the memory is limited to a block of lines. A last line that was cut off is reported and
+not used (`truncated`); any other line that is not a record raises `FileInvalid` with path and line. This module has no
+clock: the caller supplies every time.
 """
 
 from __future__ import annotations
@@ -30,45 +32,45 @@ from fieldtwin.gateway.core.errors import Bug, FileInvalid
 from fieldtwin.gateway.core.input_file import open_input
 
 MAX_LINE_BYTES = 65_536
-"""Longer lines are refused: the longest Modbus exchange takes about 1,100."""
+"""Longer lines are refused: the longest Modbus exchange takes about 1,100 bytes."""
 
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
-"""Of the last two each system has one."""
+"""Each operating system has only one of the last two flags."""
 
 _OTHER_FILES = (
     (b'{"fieldtwin_dump"', " but a dump: fieldtwin infer, diff and report read it"),
     (b'{"started"', " but raw traffic: fieldtwin import makes a recording of it"),
 )
-"""What people give instead, by how it begins."""
+"""Files that users give by mistake, recognised by their first bytes."""
 
 BLOCK_BYTES = 4 * MAX_LINE_BYTES
-"""What is read at once of a recording of exchanges."""
+"""Bytes of a recording of exchanges that are read in one block."""
 
 Kind = Literal["exchanges", "signals"]
 Source = Literal["measured", "synthetic", "imported"]
 ExchangeError = Literal["timeout", "crc", "desync", "lost"]
-"""Why an exchange has no reply: silence, a broken check sum, a frame that was no answer, a connection that ended."""
+"""Why an exchange has no reply: timeout, wrong check sum, a frame that did not answer the request, or a lost connection."""
 
 
 def looks_like_another_file(path: Path) -> bool:
-    """Whether a file begins as one that people take for a recording: a dump, or raw traffic. Raises `OSError`."""
+    """Return whether a file begins like one that is often mistaken for a recording: a dump, or raw traffic. Raises `OSError`."""
     with open_input(path) as file:
         begins = file.read(max(len(other) for other, _ in _OTHER_FILES))
     return any(begins.startswith(other) for other, _ in _OTHER_FILES)
 
 
 class SignalInfo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What a signal is: its unit as a person writes it, and the column of the file that it was imported from."""
+    """A signal: its unit as displayed, and the column of the file from which it was imported."""
 
     unit: str = ""
     column: str = ""
 
 
 class RecordingHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True, kw_only=True):
-    """The first line: of which device this is, of what kind, and where it comes from.
+    """The first line: the recorded device, the kind of recording, and its origin.
 
-    `prototype` is true when the recorded device was an emulator (SPEC ruling 15); `start_utc` is ISO 8601, empty when
-    the start's date is not known; `profile_hash` is that of the device profile in use, empty when there was none.
+    `prototype` is true if the recorded device was an emulator (SPEC ruling 15). `start_utc` is ISO 8601, empty if the
+    date of the start is not known. `profile_hash` is that of the device profile in use, empty if there was none.
     """
 
     version: Literal[1] = msgspec.field(name="fieldtwin_recording")
@@ -84,9 +86,9 @@ class RecordingHeader(msgspec.Struct, frozen=True, forbid_unknown_fields=True, o
 
 
 class Exchange(msgspec.Struct, frozen=True, gc=False):
-    """One request and what came of it. `reply` is None exactly when `error` says why.
+    """One request and its result. `reply` is None exactly when `error` gives the reason.
 
-    A struct and not a dataclass: a recording of a day has millions, and these are made in a third of the time.
+    This is a struct, not a dataclass: a recording of a day has millions, and a struct is made in a third of the time.
     """
 
     t_s: float
@@ -98,7 +100,7 @@ class Exchange(msgspec.Struct, frozen=True, gc=False):
 
 
 class SignalRow(msgspec.Struct, frozen=True, gc=False):
-    """All signals at one time, in the header's order; NaN where there is no value."""
+    """All signals at one time, in the header's order; NaN for a signal without a value."""
 
     t_s: float
     values: tuple[float, ...]
@@ -122,12 +124,12 @@ R = TypeVar("R")
 
 
 def encode_header(header: RecordingHeader) -> bytes:
-    """The header's line, newline included."""
+    """Return the header's line, newline included."""
     return _encoder.encode(header) + b"\n"
 
 
 def encode_exchange(exchange: Exchange) -> bytes:
-    """An exchange's line, newline included."""
+    """Return an exchange's line, newline included."""
     line: dict[str, object] = {"t": exchange.t_s, "unit": exchange.unit, "req": exchange.request.hex()}
     if exchange.reply is not None:
         line["rep"] = exchange.reply.hex()
@@ -138,22 +140,23 @@ def encode_exchange(exchange: Exchange) -> bytes:
 
 
 def encode_row(t_s: float, values: Sequence[float]) -> bytes:
-    """A signal row's line, newline included. NaN and infinities become null."""
+    """Return a signal row's line, newline included. NaN and infinities become null."""
     return _encoder.encode([t_s, *values]) + b"\n"
 
 
 def shown(path: Path) -> str:
-    """A recording's name and where it comes from, as a person reads it: ``cast.jsonl (synthetic)``. Raises `FileInvalid`."""
+    """Return a recording's name and origin for display: ``cast.jsonl (synthetic)``. Raises `FileInvalid`."""
     with RecordingReader(path) as reader:
         header = reader.header
     return f"{path.name} ({header.source}{', of an emulator' if header.prototype else ''})"
 
 
 class RecordingReader:
-    """A recording being read: `header` at once, then `exchanges()` or `rows()`, once, in the file's order.
+    """Reads a recording: `header` is available immediately, then `exchanges()` or `rows()` once, in the file's order.
 
-    After the last record `truncated` says whether a cut-off line followed it, and `lines` how many lines were whole.
-    Use it as a context manager. Raises `FileInvalid` for a file that is not there, is none of ours, or is broken.
+    After the last record, `truncated` says whether a cut-off line followed it, and `lines` how many lines were
+    complete. Use it as a context manager. Raises `FileInvalid` for a file that does not exist, is not a recording, or
+    is damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -181,12 +184,14 @@ class RecordingReader:
         self._file.close()
 
     def exchanges(self) -> Iterator[Exchange]:
-        """The exchanges that follow. The recording must be of kind `exchanges`."""
+        """Yield the exchanges that follow. The recording must be of kind `exchanges`."""
         self._expect("exchanges")
         return self._exchanges()
 
     def _exchanges(self) -> Iterator[Exchange]:
-        """Whole blocks of lines at once while they are in order; from one that is not, line by line, which says where."""
+        """Decode whole blocks of lines while they are valid; from an invalid block on, line by line, to report the line
+        number.
+        """
         while self._file.seekable():
             start = self._file.tell()
             block = self._file.read(BLOCK_BYTES)
@@ -204,7 +209,7 @@ class RecordingReader:
         yield from self._records(_read_exchange)
 
     def rows(self) -> Iterator[SignalRow]:
-        """The rows that follow, their times never going back. The recording must be of kind `signals`."""
+        """Yield the rows that follow; their times never decrease. The recording must be of kind `signals`."""
         self._expect("signals")
         width, last_t = len(self.header.signals), -math.inf
 
@@ -243,7 +248,7 @@ class RecordingReader:
         return header
 
     def _next_line(self) -> bytes:
-        """The next line with its newline, b"" at the end of the file."""
+        """Return the next line with its newline, b"" at the end of the file."""
         try:
             line = self._file.readline(MAX_LINE_BYTES + 1)
         except OSError as error:
@@ -274,8 +279,8 @@ class RecordingReader:
 class RecordingWriter:
     """Appends records to a new file, each with one write. Use it as a context manager.
 
-    The file must not exist: a recording is never overwritten. A full disk raises `FileInvalid`, and the file is cut back
-    to its last whole record.
+    The file must not exist: a recording is never overwritten. A full disk raises `FileInvalid`, and the file is cut
+    back to its last complete record.
     """
 
     def __init__(self, path: Path, header: RecordingHeader) -> None:
@@ -309,14 +314,14 @@ class RecordingWriter:
         self.records += 1
 
     def row(self, t_s: float, values: Sequence[float]) -> None:
-        """Append all signals at time `t_s`, in the header's order; NaN where there is no value."""
+        """Append all signals at time `t_s`, in the header's order; NaN for a signal without a value."""
         if self.header.kind != "signals" or len(values) != len(self.header.signals):
             raise Bug("no row for this recording", expected=f"{len(self.header.signals)} values", got=str(len(values)))
         self._append(encode_row(t_s, values))
         self.records += 1
 
     def sync(self) -> None:
-        """Have what was written survive a power cut too."""
+        """Write everything to the disk, so that it also survives a power failure."""
         try:
             os.fsync(self._fd)
         except OSError as error:
@@ -335,7 +340,7 @@ class RecordingWriter:
             raise Bug("a record is too long", expected=f"{MAX_LINE_BYTES} bytes", got=str(len(line)))
         try:
             done = os.write(self._fd, line)
-            while done < len(line):  # a signal, or the disk is nearly full: the rest, or the reason why not
+            while done < len(line):  # signal, or disk nearly full: write the rest, or get the reason
                 done += os.write(self._fd, line[done:])
         except OSError as error:
             os.ftruncate(self._fd, self._size)
@@ -344,7 +349,7 @@ class RecordingWriter:
 
 
 def _read_exchange(line: bytes) -> Exchange:
-    """One line of an exchanges recording; raises ValueError."""
+    """Return the exchange of one line. Raises ValueError."""
     return _exchange_of(_exchange_decoder.decode(line))
 
 
@@ -363,7 +368,7 @@ def _exchange_of(raw: _ExchangeLine) -> Exchange:
 
 
 def _read_row(line: bytes, width: int) -> SignalRow:
-    """One line of a signals recording; raises ValueError."""
+    """Return the row of one line of a signals recording. Raises ValueError."""
     raw = _row_decoder.decode(line)
     if len(raw) != width + 1:
         raise ValueError(f"expected a time and {width} values, got {len(raw)} numbers")

@@ -1,4 +1,4 @@
-"""What is started whole or not at all, and ended in the reverse order of its beginning. It must never know what that is."""
+"""Start several parts together or not at all, and end them in reverse order. This module must not know what the parts are."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import Self
 
 
 class Started(ABC):
-    """``async with``: `_start` puts what it begins on `_stack`; where it fails, what was begun is ended, and the error goes on.
+    """An asynchronous context manager whose parts are started in `_start`, which puts each on `_stack`.
 
-    In the end `_stop` goes first, while all of it is there, and the stack is unwound whatever came of that.
+    If `_start` fails, the parts that were started are ended, and the error is raised. On leaving, `_stop` runs first,
+    while all parts still run; then the stack is unwound even if `_stop` failed.
     """
 
     def __init__(self) -> None:
@@ -18,10 +19,10 @@ class Started(ABC):
 
     @abstractmethod
     async def _start(self) -> None:
-        """Begin, in order."""
+        """Start the parts, in order."""
 
     async def _stop(self) -> None:  # noqa: B027  # most have nothing to do then
-        """What is to be done before anything is ended: nothing, unless said."""
+        """Do what is needed before any part is ended; by default nothing."""
 
     async def __aenter__(self) -> Self:
         try:

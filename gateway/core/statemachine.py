@@ -1,14 +1,14 @@
 """The observatory's state machine, M = (Q, Sigma, delta, q0, F).
 
-Q = {STANDBY, ACTIVE, OFF}, Sigma = Z, q0 = STANDBY, F = {OFF}. delta depends on the sign of the commanded period alone, from
-every state, OFF included (SPEC ruling 6):
+Q = {STANDBY, ACTIVE, OFF}, Sigma = Z, q0 = STANDBY, F = {OFF}. delta depends on the sign of the commanded period alone,
+from every state, OFF included (SPEC ruling 6):
 
     x > 0  ->  ACTIVE   the sensor samples every x seconds
     x = 0  ->  STANDBY  nothing is sampled
     x < 0  ->  OFF      nothing is sampled; accepting for analysis, not absorbing
 
-Pure: no time, no I/O, no connection to the plant. The control logic, the digital model and every twin hold an
-instance each.
+Pure: no time, no I/O, no connection to the plant. The control logic, the digital model and every twin each hold one
+instance.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class STATE(ABC):
 
     @abstractmethod
     def execute(self, period_s: int) -> int:
-        """The sampling period in seconds that this state imposes, 0 when nothing is sampled."""
+        """Return the sampling period in seconds that this state imposes, 0 if nothing is sampled."""
 
 
 class ACTIVE(STATE):
@@ -55,7 +55,7 @@ class OFF(STATE):
 
 
 STATES: dict[str, STATE] = {s.name: s for s in (STANDBY(), ACTIVE(), OFF())}
-"""Q, in the order of their codes 0, 1, 2 wherever a state is written as a number."""
+"""Q, in the order of the codes 0, 1, 2 that represent a state as a number."""
 
 STATE_CODES = {name: code for code, name in enumerate(STATES)}
 ACCEPTING = frozenset({"OFF"})
@@ -69,14 +69,14 @@ def delta(period_s: int) -> STATE:
 
 
 def encode_period(period_s: int) -> COMMAND:
-    """A period command: seconds, signed 16 bit, big endian. Raises `Desync` outside -32768..32767."""
+    """Return a period command: seconds, signed 16 bit, big endian. Raises `Desync` outside -32768..32767."""
     if not PERIOD_MIN <= period_s <= PERIOD_MAX:
         raise Desync("a period command", expected=f"{PERIOD_MIN} to {PERIOD_MAX} s", got=str(period_s))
     return COMMAND(_PERIOD.pack(period_s))
 
 
 def decode_period(command: COMMAND) -> int:
-    """The period of a command in seconds. Raises `Desync` when it is not two bytes."""
+    """Return the period of a command in seconds. Raises `Desync` if the command is not two bytes."""
     if len(command.data) != _PERIOD.size:
         raise Desync("a period command", expected="2 bytes", got=f"{len(command.data)} bytes {command.data.hex()}")
     (period_s,) = _PERIOD.unpack(command.data)
@@ -91,7 +91,7 @@ class EventStateMachine:
         self.period_s = 0
 
     def process_event(self, command: COMMAND) -> STATE:
-        """Take a command; the new state. A command that is none changes nothing and raises `Desync`."""
+        """Apply a command and return the new state. An invalid command changes nothing and raises `Desync`."""
         period_s = decode_period(command)
         self.period_s = period_s
         self.state = delta(period_s)

@@ -1,4 +1,4 @@
-"""One after the other, in the order of asking: a lock that costs next to nothing while nobody else is there.
+"""A fair lock: it is granted in the order of requests, and costs next to nothing while it is not contended.
 
     if not turn.take():
         await turn.wait()
@@ -7,7 +7,8 @@
     finally:
         turn.pass_on()
 
-As `asyncio.Lock`, which takes five calls and two coroutines for the same; on paths that are walked with every exchange.
+It does the same as `asyncio.Lock`, which needs five calls and two coroutines. It is for code that runs with every
+exchange.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from contextlib import suppress
 
 
 class Turn:
-    """Whose turn it is. Not for threads."""
+    """A fair lock for the tasks of one event loop. Not for threads."""
 
     __slots__ = ("_taken", "_waiting")
 
@@ -27,28 +28,28 @@ class Turn:
         self._waiting: deque[asyncio.Future[None]] = deque()
 
     def take(self) -> bool:
-        """Take the turn if it is free. False: `wait` for it."""
+        """Take the lock if it is free. If it returns False, the caller has to `wait` for it."""
         if self._taken:
             return False
         self._taken = True
         return True
 
     async def wait(self) -> None:
-        """Return when the turn is ours. Cancelled before, it is not, and goes to the next."""
+        """Return when the caller holds the lock. If the wait is cancelled, the lock goes to the next waiting task."""
         mine: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.append(mine)
         try:
             await mine
         except BaseException:
-            if mine.done() and not mine.cancelled():  # it was passed on to us all the same
+            if mine.done() and not mine.cancelled():  # the lock was granted before the cancellation: release it
                 self.pass_on()
             else:
-                with suppress(ValueError):  # it was passed over already
+                with suppress(ValueError):  # already removed from the queue
                     self._waiting.remove(mine)
             raise
 
     def pass_on(self) -> None:
-        """The turn goes to whoever waits longest, or is free."""
+        """Grant the lock to the task that has waited longest, or free it."""
         while self._waiting:
             following = self._waiting.popleft()
             if not following.done():

@@ -1,7 +1,7 @@
-"""Passwords in URLs: found, so that they can be refused, and left out of what people and logs are told.
+"""Find passwords in URLs, to refuse them or to hide them in messages and logs.
 
-A URL stands on command lines, in files that are shared, and in messages; a password belongs into the environment or a file of its
-own. Pure text.
+A URL appears on command lines, in files that are shared, and in messages; a password belongs in the environment or in a
+separate file. Pure text handling.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ HIDDEN = "***"
 
 
 def has_password(url: str) -> bool:
-    """Whether `url` names a password, behind its user or as a parameter."""
+    """Return whether `url` contains a password, after its user name or as a parameter."""
     return bool(_USER.search(url) or _PARAMETER.search(url))
 
 
 def without_password(url: str) -> str:
-    """`url` with ``***`` in place of passwords."""
+    """Return `url` with ``***`` in place of passwords."""
     return _PARAMETER.sub(rf"\g<1>{HIDDEN}", _USER.sub(rf"\g<1>:{HIDDEN}@", url))

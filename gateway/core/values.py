@@ -1,7 +1,7 @@
-"""Values as they travel: the paper's DATA family, and a tag's value with its quality.
+"""The paper's DATA types, and a tag's value with its quality.
 
-DATA is a bit sequence (``bytes``); COMMAND and RESPONSE are DATA, MEASUREMENT and STATUS are RESPONSEs, a RECORDING is a
-RESPONSE. All are frozen: what was received cannot be changed on the way (SPEC, ControlLogic: "payload unaltered").
+DATA is a bit sequence (``bytes``); COMMAND and RESPONSE are DATA, MEASUREMENT and STATUS are RESPONSEs, a RECORDING is
+a RESPONSE. All are frozen: received data cannot be changed on the way (SPEC, ControlLogic: "payload unaltered").
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ class DATA:
 
 @dataclass(frozen=True, slots=True)
 class COMMAND(DATA):
-    """What is asked of a device: its bits, and the name under which the device's command list knows it.
+    """A command to a device: its bits, and its name in the device's command list.
 
-    Between far side and control logic a command is a period in seconds, signed 16 bit (SPEC ruling 17), without a name.
+    Between the topside controller and the control logic, a command is a period in seconds, signed 16 bit (SPEC ruling
+    17), without a name.
     """
 
     name: str = ""
@@ -31,7 +32,7 @@ class COMMAND(DATA):
 
 @dataclass(frozen=True, slots=True)
 class RESPONSE(DATA):
-    """What a device answers: a MEASUREMENT or a STATUS."""
+    """A device's response: a MEASUREMENT or a STATUS."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +42,7 @@ class MEASUREMENT(RESPONSE):
 
 @dataclass(frozen=True, slots=True)
 class STATUS(RESPONSE):
-    """What state a device or system is in. Carries state and period (SPEC ruling 7)."""
+    """The state of a device or system. Carries state and period (SPEC ruling 7)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class RECORDING(RESPONSE):
 
 
 class Quality(IntEnum):
-    """How far a value can be trusted (IEC 62541 reduces to these). Ordered: a larger number is worse."""
+    """How far a value can be trusted (the qualities of IEC 62541 reduce to these). Ordered: a larger number is worse."""
 
     GOOD = 0
     SUBSTITUTED = 1
@@ -89,11 +90,14 @@ Scalar = bool | int | float | str | bytes
 
 
 class TagValue(msgspec.Struct, frozen=True, gc=False):
-    """A tag's value at an instant. A `msgspec` struct, since these are made with every reply: a frozen dataclass costs ten times
-    as much. `msgspec.structs.replace` makes one from another.
+    """A tag's value at an instant.
 
-    `value` is in engineering units, or None when there never was one. `t_ns` is the source's monotonic time: when the
-    reply that carried it was complete. `raw` is what the device sent, byte for byte, empty if nothing did.
+    It is a `msgspec` struct because one is made with every reply: a frozen dataclass costs ten times as much.
+    `msgspec.structs.replace` makes one from another.
+
+    `value` is in engineering units, or None if there has been no value yet. `t_ns` is the source's monotonic time at
+    which the reply that carried the value was complete. `raw` holds the bytes that the device sent, empty if it sent
+    none.
     """
 
     value: Scalar | None
@@ -107,11 +111,13 @@ class TagValue(msgspec.Struct, frozen=True, gc=False):
         return self.quality is Quality.GOOD
 
     def age_s(self, now_ns: int) -> float:
-        """Seconds since the source had this value; infinite when it never had one."""
+        """Return the seconds since the source had this value; infinite if it never had one."""
         return (now_ns - self.t_ns) / 1e9 if self.t_ns else float("inf")
 
     def describe(self, now_ns: int) -> dict[str, Scalar | None]:
-        """For JSON: value (bytes as hex), quality, reason, and age in seconds, None where there never was a value."""
+        """Return a JSON-able description: value (bytes as hex), quality, reason, and age in seconds (None if there has
+        been no value).
+        """
         return {
             "value": self.value.hex() if isinstance(self.value, bytes) else self.value,
             "quality": str(self.quality),

@@ -1,11 +1,11 @@
-"""YAML as users mean it, and errors that point at the spot.
+"""Read YAML as users mean it, with errors that name line and column.
 
-Scalars follow YAML 1.2's core schema: only ``true`` and ``false`` are booleans and nothing is sexagesimal, so ``OFF`` and
-``1017:00`` stay strings (PyYAML's 1.1 reads them as False and 61020). Stricter than 1.2 in one thing: a float has a point, so
-that ``8E1`` is a frame and not 80. Duplicate keys are refused. The line and
-column of every key and value are kept, so that a validation error can name them.
+Scalars follow YAML 1.2's core schema: only ``true`` and ``false`` are booleans and no number is sexagesimal, so ``OFF``
+and ``1017:00`` stay strings (PyYAML's 1.1 reads them as False and 61020). It is stricter than 1.2 in one respect: a
+float needs a point, so that ``8E1`` is a serial frame and not 80. Duplicate keys are refused. The line and column of
+every key and value are kept, so that a validation error can name them.
 
-`load` reads a file, `validate` turns it into a pydantic model; both raise `FileInvalid` and nothing else.
+`load` reads a file, `validate` turns it into a pydantic model; both raise `FileInvalid` and no other error.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_BYTES = 8 * 1024 * 1024
 MAX_VALUES = 100_000
 
 MAX_DIGITS = 21
-"""Characters of an integer, with its sign."""
+"""The largest number of characters of an integer, including its sign."""
 
 Key = str | int
 Position = tuple[int, int]
@@ -39,7 +39,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader with YAML 1.2 core scalars."""
+    """A SafeLoader with the scalars of YAML 1.2's core schema."""
 
 
 _Loader.yaml_implicit_resolvers = {}
@@ -53,7 +53,7 @@ for _tag, _pattern, _first in (
 
 
 def _integer(loader: _Loader, node: yaml.ScalarNode) -> int:
-    """An integer of at most 64 bits: more digits cost time, and no register, object or time has them."""
+    """Read an integer of at most 64 bits. More digits would cost time, and registers, objects and times are not longer."""
     text = str(node.value)
     value = (
         int(text, 0) if len(text) <= MAX_DIGITS and "x" in text else int(text) if len(text) <= MAX_DIGITS else 1 << 64
@@ -78,19 +78,19 @@ _OTHER_FILES = (
     (b"\xff\xfe", "it looks like UTF-16: save it as UTF-8"),
     (b"\xfe\xff", "it looks like UTF-16: save it as UTF-8"),
 )
-"""What people give instead, by its first bytes."""
+"""Files that users give by mistake, recognised by their first bytes."""
 
 
 @dataclass(frozen=True)
 class YamlFile:
-    """A parsed file: plain data, and where each path of keys stands (line and column from 1)."""
+    """A parsed file: plain data, and the position of each path of keys (line and column from 1)."""
 
     path: str
     data: dict[str, Any]
     positions: dict[tuple[Key, ...], Position]
 
     def line(self, loc: tuple[Key, ...]) -> int:
-        """Where `loc` stands, or its nearest parent that does."""
+        """Return the line of `loc`, or of its nearest parent that is in the file."""
         return self._place(loc)[0]
 
     def _place(self, loc: tuple[Key, ...]) -> Position:
@@ -101,13 +101,13 @@ class YamlFile:
     def error(
         self, loc: tuple[Key, ...], message: str, *, expected: str = "", got: str = "", hint: str = ""
     ) -> FileInvalid:
-        """A `FileInvalid` at the spot of `loc`, or of its nearest parent that stands in the file."""
+        """Return a `FileInvalid` at the position of `loc`, or of its nearest parent that is in the file."""
         line, column = self._place(loc)
         return FileInvalid(message, path=self.path, line=line, column=column, expected=expected, got=got, hint=hint)
 
 
 def load(path: Path) -> YamlFile:
-    """Read and parse `path`. The top must be a mapping."""
+    """Read and parse `path`. The top level must be a mapping."""
     try:
         text = read_input(path, MAX_BYTES).decode("utf-8")
     except OSError as e:
@@ -149,9 +149,9 @@ def parse(text: str, path: str) -> YamlFile:
 def _note_positions(
     loader: _Loader, node: yaml.Node, loc: tuple[Key, ...], out: dict[tuple[Key, ...], Position], path: str
 ) -> None:
-    """Walk the node tree: remember where each value stands, refuse duplicate keys."""
+    """Walk the node tree, note the position of each value, and refuse duplicate keys."""
     out.setdefault(loc, (node.start_mark.line + 1, node.start_mark.column + 1))
-    if len(out) > MAX_VALUES:  # a few aliases of aliases are millions of values
+    if len(out) > MAX_VALUES:  # a few aliases of aliases can expand to millions of values
         raise FileInvalid("the file holds too many values", path=path, line=1, expected=f"at most {MAX_VALUES}")
     if isinstance(node, yaml.SequenceNode):
         for i, child in enumerate(node.value):
@@ -199,7 +199,7 @@ def _translate(file: YamlFile, model: type[BaseModel], e: ValidationError) -> Fi
 
 
 def _translate_place(file: YamlFile, model: type[BaseModel], errors: list[ErrorDetails]) -> FileInvalid:
-    """One error for a value that fits no branch of a union, with what every branch expects."""
+    """Return one error for a value that fits no branch of a union, with what every branch expects."""
     expected = [expected_value(error, _keys_at(model, error["loc"])) for error in errors]
     if not all(expected):
         return _translate_one(file, model, errors[0])
@@ -225,9 +225,10 @@ _LIMIT_WORDS = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "a
 
 
 def expected_value(error: ErrorDetails, keys: Iterable[str] = ()) -> str:
-    """Return in plain English what pydantic expected of a value, or an empty text if its own message has to do.
+    """Return in plain English what pydantic expected of a value, or an empty text if pydantic's own message has to be
+    used.
 
-    `keys` are those of the form that a value should have been.
+    `keys` are the keys of the form that the value should have been.
     """
     kind, _, rest = error["type"].partition("_")
     if kind == "model" and keys:
@@ -241,7 +242,7 @@ def expected_value(error: ErrorDetails, keys: Iterable[str] = ()) -> str:
 
 
 def _keys_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """The keys of the form at `loc`; none if there is no form there."""
+    """Return the keys of the form at `loc`, or an empty list if `loc` is not a form."""
     return _known_keys(model, loc) if loc else list(model.model_fields)
 
 
@@ -271,7 +272,7 @@ def _inside(loc: tuple[Key, ...]) -> str:
 
 
 def _in_file(file: YamlFile, loc: tuple[Key, ...]) -> tuple[Key, ...]:
-    """Pydantic's location without the parts that are not in the file (union tags, "[key]")."""
+    """Return pydantic's location without the parts that are not in the file (union tags, "[key]")."""
     out: tuple[Key, ...] = ()
     for part in loc:
         if (*out, part) in file.positions:
@@ -280,7 +281,7 @@ def _in_file(file: YamlFile, loc: tuple[Key, ...]) -> tuple[Key, ...]:
 
 
 def _known_keys(model: type[BaseModel], loc: tuple[Key, ...]) -> list[str]:
-    """The keys that the model at `loc` knows, by walking annotations; those of the top where that fails."""
+    """Return the keys that the model at `loc` knows, found by walking annotations; the keys of the top level if that fails."""
     current: Any = model
     for part in loc:
         fields = getattr(current, "model_fields", None)
@@ -294,7 +295,7 @@ def _known_keys(model: type[BaseModel], loc: tuple[Key, ...]) -> list[str]:
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """The pydantic models inside an annotation such as ``dict[str, Bus] | None``."""
+    """Return the pydantic models inside an annotation such as ``dict[str, Bus] | None``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     found: list[type[BaseModel]] = []

@@ -1,1 +1,4 @@
-"""Faults that can be put on a wire or into a device: one file a fault, one name. `registry.FAULTS` has them all."""
+"""Faults that can be injected into a link or a device: one file per fault, one name.
+
+`registry.FAULTS` lists all of them.
+"""

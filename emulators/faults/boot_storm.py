@@ -22,7 +22,7 @@ class BootStorm(CanFault):
     form = Form
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
-        return False  # it only adds
+        return False  # the fault only adds frames
 
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return as_is(frame)

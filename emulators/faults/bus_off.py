@@ -1,4 +1,4 @@
-"""A node that comes to so many errors that its controller leaves the bus."""
+"""A node with so many errors that its controller leaves the bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A device that has no time: exception 06 instead of an answer."""
+"""A device that answers exception 06 because it is busy."""
 
 from __future__ import annotations
 

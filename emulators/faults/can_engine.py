@@ -1,4 +1,4 @@
-"""What the faults that are in make of a CAN frame of a node, or to one. Pure: told the time, tells what goes on instead."""
+"""The effect of the active faults on a CAN frame to or from a node. Pure: the caller passes the time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from fieldtwin.gateway.core.canframe import CanFrame
 
 
 def struck(faults: WireFaults, way: Way, frame: CanFrame, node: int, now_ns: int) -> list[CanPiece] | None:
-    """What becomes of the frame; None: nothing happens to it. Several faults strike one after the other."""
+    """Return the frames that replace `frame`, or None if no fault strikes it.
+
+    Several faults are applied one after the other.
+    """
     pieces: list[CanPiece] | None = None
     for active in faults.in_at(now_ns):
         fault = active.fault
@@ -30,8 +33,10 @@ def struck(faults: WireFaults, way: Way, frame: CanFrame, node: int, now_ns: int
 
 
 def aimed(active: Active, frame: CanFrame) -> bool:
-    """Whether a frame is one that the fault's `cob_id` and `index` mean. An index stands in SDO requests and replies that name
-    an object, so in no segment."""
+    """Return whether the `cob_id` and the `index` of the fault match the frame.
+
+    Only SDO requests and replies that name an object have an index; segments do not.
+    """
     aim = active.aim
     if aim.cob_id is not None and frame.can_id != aim.cob_id:
         return False
@@ -42,5 +47,5 @@ def aimed(active: Active, frame: CanFrame) -> bool:
 
 
 def seen(way: Way, node: int) -> Frame:
-    """A node's frame as an `Active` counts it."""
+    """Return a node's frame in the form that an `Active` counts."""
     return Frame(way, Framing.RAW, b"", node)

@@ -1,6 +1,6 @@
-"""Faults of a node on a CAN bus: what becomes of its frames, and what it sends that nobody asked for.
+"""Faults of a node on a CAN bus: the effect on its frames, and the frames that it sends unprompted.
 
-Pure, as the others: a frame and a random generator in, frames with delays out.
+Pure, like all faults: the input is a frame and a random generator, the output is frames with delays.
 """
 
 from __future__ import annotations
@@ -19,40 +19,40 @@ HEARTBEAT, EMCY, SDO_REPLY, SDO_REQUEST, SYNC = 0x700, 0x80, 0x580, 0x600, 0x80
 
 @dataclass(frozen=True, slots=True)
 class CanPiece:
-    """A frame that goes on, `delay_s` after the one that it comes of."""
+    """A frame to forward, `delay_s` after the frame that it is made from."""
 
     frame: CanFrame
     delay_s: float = 0.0
 
 
 class CanFault(Fault):
-    """Strikes frames that a node sends (REPLY) or hears (REQUEST). `node`: its id."""
+    """A fault that strikes frames which a node sends (REPLY) or hears (REQUEST). `node` is its node ID."""
 
     kind = Kind.CAN
     ways = frozenset((Way.REPLY,))
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
-        """Whether a frame is of the kind that this fault is about."""
+        """Return whether the fault applies to this kind of frame."""
         return True
 
     @abstractmethod
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
-        """What becomes of `frame`."""
+        """Return the frames that replace `frame`."""
 
     def appears(self, node: int, random: Random) -> tuple[CanPiece, ...]:
-        """What the node sends when the fault is put in."""
+        """Return the frames that the node sends when the fault is put in."""
         return ()
 
 
 class BusFault(Fault):
-    """Spoils attempts to send on the modelled wire; only a bus that is modelled here has it."""
+    """A fault that destroys attempts to send; only a modelled CAN bus supports it."""
 
     kind = Kind.CAN
     ways: ClassVar[frozenset[Way]] = frozenset((Way.REPLY,))
     attempts: ClassVar[int | None] = None
-    """How many attempts are spoilt; None: all that match while it lasts."""
+    """Number of attempts that are destroyed; None: all that match while the fault lasts."""
 
 
 def as_is(frame: CanFrame) -> tuple[CanPiece, ...]:
-    """The frame, untouched."""
+    """Return the frame unchanged."""
     return (CanPiece(frame),)

@@ -1,4 +1,4 @@
-"""Frames that arrive together, as a busy stack or a USB adapter hands them over."""
+"""Frames that arrive together, as a busy stack or a USB adapter delivers them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two that talk at once on a line: what is heard is neither."""
+"""Two devices that transmit on a line at the same time, so that both frames are destroyed."""
 
 from __future__ import annotations
 

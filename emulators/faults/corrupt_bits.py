@@ -1,4 +1,4 @@
-"""Bits that are read as others, anywhere in the frame."""
+"""Inverted bits anywhere in the frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A check sum that does not fit."""
+"""A wrong checksum."""
 
 from __future__ import annotations
 

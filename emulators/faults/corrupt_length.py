@@ -1,4 +1,4 @@
-"""A length that does not fit what follows."""
+"""A length field that does not match the data."""
 
 from __future__ import annotations
 

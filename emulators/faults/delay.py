@@ -1,4 +1,4 @@
-"""A frame that arrives later than it was sent."""
+"""A frame that arrives late."""
 
 from __future__ import annotations
 

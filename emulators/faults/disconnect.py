@@ -1,4 +1,4 @@
-"""A device that goes away, and comes back when the fault is over."""
+"""A device that disconnects, and returns when the fault is over."""
 
 from __future__ import annotations
 

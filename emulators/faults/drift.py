@@ -1,4 +1,4 @@
-"""A sensor that wanders off."""
+"""A sensor whose value drifts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two nodes with one id: the other answers and beats too."""
+"""Two nodes with one node ID: the second one also answers and sends heartbeats."""
 
 from __future__ import annotations
 

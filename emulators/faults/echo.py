@@ -1,4 +1,4 @@
-"""A two-wire adapter that hears itself."""
+"""A two-wire adapter that receives its own frames."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node that reports error upon error."""
+"""A node that reports one error after the other."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class EmcyBurst(CanFault):
     form = Form
 
     def aims_at(self, frame: CanFrame, node: int) -> bool:
-        return False  # it only adds
+        return False  # the fault only adds frames
 
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         return as_is(frame)

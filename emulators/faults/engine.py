@@ -1,4 +1,7 @@
-"""Which faults are in on a bus, and what they make of each frame. Pure: told the time, tells what shall happen."""
+"""The active faults of a bus, and their effect on each frame.
+
+Pure: the caller passes the time and carries out the result.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +12,19 @@ from fieldtwin.emulators.faults.frames import Frame, Framing, Way, understood
 
 
 class WireFaults:
-    """The faults of one bus. `on_change` is told when a fault is put in or taken away (its ends look again)."""
+    """The faults of one bus. Each of `listeners` is called when a fault is put in."""
 
     def __init__(self, framing: Framing) -> None:
         self.framing = framing
         self.active: dict[str, Active] = {}
         self.listeners: list[Callable[[Active], None]] = []
-        """Told of each fault that is put in, in the order of their subscription."""
+        """Called with each fault that is put in, in the order of their subscription."""
         self.watch: Callable[[object, Way, bytes], None] | None = None
-        """Told what is on the wire: who carries it (an end), which way, the bytes. What a fault keeps back is no reply on the
-        wire; what an emulator never gets to hear is a request on it all the same. It may not raise."""
+        """Called with the bytes on the wire: the end that carries them, their direction, the bytes.
+
+        A reply that a fault holds back is not on the wire; a request is on the wire even if the emulator never receives
+        it. The callback may not raise.
+        """
 
     def put_in(self, active: Active) -> None:
         self.active[active.id] = active
@@ -29,14 +35,17 @@ class WireFaults:
         return self.active.pop(id, None) is not None
 
     def in_at(self, now_ns: int) -> list[Active]:
-        """Those whose time has come, in the order in which they were put in. Those whose time is over are forgotten."""
+        """Return the faults whose time has come, in the order in which they were put in.
+
+        Remove those whose time is over.
+        """
         over = [id for id, active in self.active.items() if active.until_ns is not None and now_ns >= active.until_ns]
         for id in over:
             del self.active[id]
         return [active for active in self.active.values() if active.from_ns <= now_ns]
 
     def refuses(self, now_ns: int) -> bool:
-        """Return whether a connection that is asked for now is refused. Each fault that refuses it has struck."""
+        """Return whether a connection that is requested now is refused. Each fault that refuses it is counted as struck."""
         refusing = [
             a for a in self.active.values() if isinstance(a.fault, WireFault) and a.fault.refuses and in_time(a, now_ns)
         ]
@@ -45,8 +54,10 @@ class WireFaults:
         return bool(refusing)
 
     def decide(self, frame: Frame, now_ns: int) -> Outcome | None:
-        """What becomes of the frame; None: nothing happens to it. Several faults strike in the order in which they were put in,
-        those that divide it after the others."""
+        """Return the effect on the frame, or None if no fault strikes it.
+
+        Faults are applied in the order in which they were put in, except that faults which divide the frame come last.
+        """
         outcome: Outcome | None = None
         if frame.spared:
             return None
@@ -63,7 +74,7 @@ class WireFaults:
 
 
 def in_time(active: Active, now_ns: int) -> bool:
-    """Whether a fault's time has come and is not over."""
+    """Return whether the start of a fault has been reached and its end has not."""
     return active.from_ns <= now_ns and (active.until_ns is None or now_ns < active.until_ns)
 
 

@@ -1,4 +1,4 @@
-"""An error on the wire: a frame is spoilt and sent again by its controller."""
+"""An error on the bus: a frame is destroyed and sent again by its controller."""
 
 from __future__ import annotations
 

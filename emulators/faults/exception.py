@@ -1,4 +1,4 @@
-"""A device that refuses."""
+"""A device that refuses a request with an exception."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CODES = {
     10: "gateway path unavailable",
     11: "gateway target device failed to respond",
 }
-"""APP V1.1b3, 7. Others are the vendor's own."""
+"""APP V1.1b3, 7. All other codes are vendor-specific."""
 
 
 class Form(Parameters):

@@ -1,7 +1,7 @@
-"""What a fault is: a name, what it aims at, its parameters, and what it makes of a frame.
+"""The classes of faults: a name, an aim, parameters, and the effect on a frame.
 
-Pure: a fault is handed a frame and a random generator of its own, and answers with what shall happen; the engine carries it
-out. It never opens, waits or reads a clock.
+Pure: a fault receives a frame and its own random generator, and returns the effect; the engine carries it out. A fault
+never opens connections, waits or reads a clock.
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from fieldtwin.gateway.core.profile import Tag
 
 
 class Hang(Enum):
-    """What becomes of a connection."""
+    """The effect of a fault on a connection."""
 
     CLOSE = "close"
-    """It is ended in order (FIN); on a serial line nothing can be ended."""
+    """The connection is closed in order (FIN); on a serial line there is no connection to close."""
     RESET = "reset"
-    """It is torn down at once (RST)."""
+    """The connection is reset at once (RST)."""
     HALF_OPEN = "half_open"
-    """Nothing passes any more, and nobody is told."""
+    """Nothing passes any more, and neither side is notified."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Bytes that go on, `delay_s` after the frame was there and behind what still waits.
+    """Bytes to forward, `delay_s` after the frame arrived and after all bytes that still wait.
 
-    `overtake`: past what still waits. `gather`: together with what comes within that time. `back`: to whoever sent it.
+    `overtake`: forward them before bytes that still wait. `gather`: forward them together with bytes that arrive within
+    that time. `back`: return them to the sender.
     """
 
     data: bytes
@@ -43,19 +44,19 @@ class Piece:
     gather: bool = False
     back: bool = False
     gone: Callable[[], bool] | None = None
-    """Whether it went by itself meanwhile, asked when its time has come."""
+    """Returns whether the piece has been forwarded already; called when its time has come."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a fault makes of a frame: pieces in order, and what becomes of the connection behind them."""
+    """The effect of a fault on a frame: pieces in order, and the effect on the connection after them."""
 
     pieces: tuple[Piece, ...] = ()
     hang: Hang | None = None
 
 
 def passed(*data: bytes) -> Outcome:
-    """These bytes, at once."""
+    """Return an outcome that forwards these bytes without delay."""
     return Outcome(tuple(Piece(d) for d in data))
 
 
@@ -63,7 +64,7 @@ LOST = Outcome()
 
 
 class Aim(BaseModel):
-    """What a fault strikes. What is not said matches everything."""
+    """The frames or values that a fault strikes. A key that is not given matches everything."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
@@ -79,7 +80,7 @@ class Aim(BaseModel):
     """A tag of the device."""
     cob_id: int | None = Field(default=None, ge=0, le=0x7FF)
     index: int | None = Field(default=None, ge=0, le=0xFFFF)
-    """An object of CANopen: SDO requests and replies that name it."""
+    """A CANopen object: the SDO requests and replies that name it."""
     direction: Literal["request", "reply", "both", ""] = ""
     nth: int | None = Field(default=None, ge=1)
     every: int | None = Field(default=None, ge=1)
@@ -87,25 +88,25 @@ class Aim(BaseModel):
     until: str | float | int | None = None
     probability: float = Field(default=1.0, ge=0.0, le=1.0)
     optional: bool = False
-    """A run in which the fault never struck has tested something all the same."""
+    """A run passes even if the fault never struck."""
 
 
 class Parameters(BaseModel):
-    """A fault's own parameters; each has a default, and its unit in its name."""
+    """The parameters of one kind of fault; each has a default, and its unit in its name."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
 HEX = r"^([0-9A-Fa-f]{2} ?)*$"
-"""Bytes that a parameter spells out."""
+"""Bytes that a parameter gives in hexadecimal."""
 
 
 class Nothing(Parameters):
-    """None."""
+    """A fault without parameters."""
 
 
 class Kind(Enum):
-    """Where a fault can be put."""
+    """Where a fault can be injected."""
 
     BYTES = "serial lines and sockets"
     CAN = "CAN buses"
@@ -113,62 +114,65 @@ class Kind(Enum):
 
 
 class Fault(ABC):
-    """One kind of fault, made with its parameters. The class is the catalogue's entry."""
+    """One kind of fault, created with its parameters. The class attributes describe it in the list of faults."""
 
     name: ClassVar[str]
     summary: ClassVar[str]
     kind: ClassVar[Kind]
     form: ClassVar[type[Parameters]] = Nothing
     ways: ClassVar[frozenset[Way]] = frozenset((Way.REPLY,))
-    """Which way it strikes where its aim does not say."""
+    """The directions in which it strikes if its aim does not give one."""
     codes: ClassVar[Mapping[int, str]] = {}
-    """What the standard knows for its parameter `code`."""
+    """The meanings that the standard gives to its parameter `code`."""
 
     def __init__(self, parameters: Parameters) -> None:
         self.parameters: Any = parameters
 
 
 class WireFault(Fault):
-    """Strikes frames on serial lines and sockets."""
+    """A fault that strikes frames on serial lines and sockets."""
 
     kind = Kind.BYTES
 
     @abstractmethod
     def strike(self, frame: Frame, random: Random) -> Outcome:
-        """What becomes of `frame`."""
+        """Return the effect on `frame`."""
 
     def appears(self) -> Hang | None:
-        """What becomes of connections that are open when the fault is put in."""
+        """Return the effect on connections that are open when the fault is put in."""
         return None
 
     refuses: ClassVar[bool] = False
-    """Whether nobody can connect while it lasts."""
+    """Whether new connections are refused while the fault lasts."""
     divides: ClassVar[bool] = False
-    """Whether it delivers the frame in several pieces, all bytes unchanged. Such a fault strikes after all others: they expect a
-    whole frame, and bytes that they add to a piece would lie inside the frame, where Modbus TCP cannot notice them."""
+    """Whether the fault delivers the frame in several pieces, with all bytes unchanged.
+
+    Such a fault is applied after all others. The others expect a whole frame, and bytes that they add to a piece would
+    lie inside the frame, where Modbus TCP cannot detect them.
+    """
 
 
 class ValueFault(Fault):
-    """Changes what a device holds."""
+    """A fault that changes the values that a device holds."""
 
     kind = Kind.VALUE
     ways: ClassVar[frozenset[Way]] = frozenset()
 
     def learn(self, tags: Iterable[Tag]) -> None:
-        """Take note of the tags of the device that the fault is put into, before it strikes."""
+        """Record the tags of the device that the fault is put into, before it strikes."""
 
     def on(self, tag: str) -> ValueFault | None:
-        """Return the fault as it strikes `tag`; None where it leaves that tag alone."""
+        """Return the fault as it strikes `tag`; None if it does not change that tag."""
         return self
 
     @abstractmethod
     def distort(self, value: float, since_s: float, held: float, random: Random) -> float:
-        """The value instead of `value`. `since_s`: seconds since the fault began; `held`: what it was then."""
+        """Return the replacement of `value`. `since_s`: seconds since the fault began; `held`: the value at that time."""
 
 
 @dataclass
 class Active:
-    """A fault that is in: what it strikes, until when, and how often it did."""
+    """An active fault: what it strikes, from when until when, and how often it has struck."""
 
     id: str
     fault: Fault
@@ -179,14 +183,14 @@ class Active:
     matched: int = 0
     struck: int = 0
     units: Sequence[int] = field(default_factory=tuple)
-    """Units that `device` and `bus` stand for; none: all."""
+    """Unit IDs that `device` and `bus` resolve to; empty: all."""
     addresses: range | None = None
     counts: range | None = None
     functions: frozenset[int] = frozenset()
-    """Those of the table that the addresses are in; none: all."""
+    """Function codes of the table that contains the addresses; empty: all."""
 
     def strikes(self, frame: Frame, now_ns: int) -> bool:
-        """Whether it strikes this frame; counts what matches."""
+        """Return whether the fault strikes this frame, and count frames that match its aim."""
         aim = self.aim
         if now_ns < self.from_ns or (self.until_ns is not None and now_ns >= self.until_ns):
             return False

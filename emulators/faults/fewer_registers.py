@@ -1,4 +1,4 @@
-"""A device that answers fewer registers than it was asked for."""
+"""A device that returns fewer registers than the request asked for."""
 
 from __future__ import annotations
 

@@ -1,8 +1,11 @@
-"""Whole frames out of what a medium delivers, so that a fault can aim at one: RTU, ASCII, MBAP; datagrams of a digital thread,
-packets of MQTT; else chunks as they come.
+"""Cuts the bytes of a medium into whole frames, so that a fault can aim at one.
 
-Lenient on purpose: what makes no frame is passed on after `FLUSH_S`, unchanged. The emulators' own receivers judge. In a stream
-whose frames say how long they are (`Framing.streams`) the rest of one is waited for: to pass half of it would end the stream.
+It supports RTU, ASCII and MBAP frames, datagrams of a digital thread and MQTT packets; other bytes are passed on in the
+chunks in which they arrive.
+
+The parser is lenient on purpose: bytes that form no frame are passed on unchanged after `FLUSH_S`, and the emulators'
+own receivers decide about them. In a stream whose frames carry their length (`Framing.streams`) it waits for the rest
+of a frame, because passing half of it on would break the stream.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ from enum import Enum
 from fieldtwin.emulators.modbus.rtu_shapes import crc16
 
 FLUSH_S = 0.05
-"""How long bytes that make no frame wait for more."""
+"""How long bytes that form no frame wait for more, in seconds."""
 LONGEST = 1024
 LONGEST_IN_STREAM = 256 * 1024
 _MBAP_HEADER = 7
@@ -21,29 +24,29 @@ _MQTT_TYPE, _MQTT_PUBLISH, _MQTT_QOS = 0xF0, 0x30, 0x06
 """Bits of a packet's first byte (MQTT 2.1.2, 3.3.1.2)."""
 _ADDRESSED = frozenset((1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 24))
 _SINGLE = frozenset((5, 6, 22, 24))
-"""Functions that are about one register, coil or queue, so that no count is in the request."""
+"""Functions that access one register, coil or queue, so that the request has no count."""
 
 
 class Framing(Enum):
-    """What the bytes on a wire are. RAW: nobody knows."""
+    """The frame format of the bytes on a wire. RAW: the format is unknown."""
 
     RTU = "rtu"
     ASCII = "ascii"
     MBAP = "mbap"
     THREAD = "thread"
-    """A digital thread over TCP: each datagram behind its length in two bytes."""
+    """A digital thread over TCP: each datagram follows its length in two bytes."""
     MQTT = "mqtt"
-    """Packets of MQTT. Only a PUBLISH with QoS 0 can be struck: all else is the session with the broker."""
+    """MQTT packets. Only a PUBLISH with QoS 0 can be struck: all other packets belong to the session with the broker."""
     RAW = "raw"
 
     @property
     def streams(self) -> bool:
-        """Whether frames come over TCP in whatever pieces, and each says how long it is."""
+        """Whether frames are part of a TCP stream with arbitrary segments, and carry their own length."""
         return self in (Framing.THREAD, Framing.MQTT)
 
 
 class Way(Enum):
-    """Which way a frame goes: a request to the device, or its reply."""
+    """The direction of a frame: a request to the device, or its reply."""
 
     REQUEST = "request"
     REPLY = "reply"
@@ -51,9 +54,10 @@ class Way(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One frame. `pdu` is empty, `unit` and `function` are -1 where it is not understood.
+    """One frame. If it is not understood, `pdu` is empty, and `unit` and `function` are -1.
 
-    `address` and `count` are those of the request, also in its reply: the first register or bit, and how many; -1: none.
+    `address` and `count` are those of the request, also in its reply: the first register or bit, and the quantity; -1:
+    none.
     """
 
     way: Way
@@ -66,7 +70,7 @@ class Frame:
 
     @property
     def spared(self) -> bool:
-        """Whether no fault strikes it."""
+        """Whether no fault may strike the frame."""
         return (
             self.framing is Framing.MQTT
             and self.data != b""
@@ -75,12 +79,12 @@ class Frame:
 
     @property
     def function(self) -> int:
-        """Without the bit of an exception."""
+        """The function code without the exception bit."""
         return self.pdu[0] & 0x7F if self.pdu else -1
 
 
 class Assembler:
-    """One direction of one connection. `feed` gives what is whole; `flush` the rest, as it is."""
+    """One direction of one connection. `feed` returns the whole frames; `flush` returns the remaining bytes unchanged."""
 
     def __init__(self, way: Way, framing: Framing) -> None:
         self.way = way
@@ -99,11 +103,11 @@ class Assembler:
         return frames
 
     def flush(self) -> list[Frame]:
-        """What is left, as a frame that nobody understands."""
+        """Return the remaining bytes as one frame that is not understood."""
         return [self._take(len(self.pending))] if self.pending else []
 
     def _whole(self) -> int:
-        """The length of the frame at the front; 0: not whole."""
+        """Return the length of the frame at the front; 0: it is incomplete."""
         buffer = self.pending
         if self.framing is Framing.RAW:
             return len(buffer)
@@ -127,7 +131,7 @@ class Assembler:
 
 
 def _mqtt_length(buffer: bytearray) -> int:
-    """Of the packet at the front, its header included (MQTT 1.5.5); 0: not to be told yet."""
+    """Return the length of the packet at the front with its header (MQTT 1.5.5); 0: more bytes are needed to know it."""
     rest = 0
     for at, byte in enumerate(buffer[1:5]):
         rest |= (byte & 0x7F) << 7 * at
@@ -137,7 +141,7 @@ def _mqtt_length(buffer: bytearray) -> int:
 
 
 def understood(way: Way, framing: Framing, data: bytes) -> Frame:
-    """`data` as a frame, with unit and PDU where they can be told."""
+    """Return `data` as a frame, with unit ID and PDU if they can be determined."""
     adu = b""
     if framing is Framing.MBAP and len(data) > _MBAP_HEADER and len(data) == 6 + int.from_bytes(data[4:6]):
         adu = data[6:]

@@ -1,4 +1,4 @@
-"""Bytes behind a frame that belong to nothing."""
+"""Bytes after a frame that belong to no frame."""
 
 from __future__ import annotations
 

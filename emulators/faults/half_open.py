@@ -1,4 +1,4 @@
-"""A connection whose other side is gone without a word."""
+"""A connection whose peer has disappeared without closing it."""
 
 from __future__ import annotations
 

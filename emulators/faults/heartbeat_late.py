@@ -1,4 +1,4 @@
-"""A node whose heartbeat is late now and then."""
+"""A node whose heartbeat is sometimes late."""
 
 from __future__ import annotations
 

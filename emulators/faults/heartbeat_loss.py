@@ -1,4 +1,4 @@
-"""A node that forgets its heartbeat."""
+"""A node that sends no heartbeat."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that arrive a little later, each by another time."""
+"""Frames that arrive late, each by a different time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fault files as JSON schema, for editors: one shape for each fault, told apart by its name."""
+"""JSON schema of fault files, for editors: one schema per fault, selected by its name."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ABOUT = {
 
 
 def fault_defs() -> dict[str, Any]:
-    """The `$defs` that a schema with faults in it needs: `Fault`, any of them, and what an aim may say."""
+    """Return the `$defs` that a schema with faults needs: `Fault` (any fault) and the keys of an aim."""
     aims = Aim.model_json_schema()["properties"]
     return {
         "Fault": {"title": "Fault", "oneOf": [_one(kind) for kind in FAULTS.values()]},
@@ -38,7 +38,7 @@ def fault_defs() -> dict[str, Any]:
 
 
 def fault_file_schema() -> dict[str, Any]:
-    """A file of faults."""
+    """Return the schema of a fault file."""
     faults = {"type": "array", "minItems": 1, "maxItems": MOST, "items": {"$ref": "#/$defs/Fault"}}
     return {
         "title": "Fault file",

@@ -1,4 +1,4 @@
-"""A reply that comes when nobody waits for it any more."""
+"""A reply that arrives after the client has given up waiting."""
 
 from __future__ import annotations
 

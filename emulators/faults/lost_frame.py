@@ -1,4 +1,4 @@
-"""A frame of a node that nobody receives."""
+"""A frame of a node that is lost."""
 
 from __future__ import annotations
 

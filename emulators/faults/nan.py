@@ -1,4 +1,4 @@
-"""A sensor that has no value: not a number, or what its type says instead."""
+"""A sensor without a value: NaN, or the value that its type uses instead."""
 
 from __future__ import annotations
 

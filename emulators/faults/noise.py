@@ -1,4 +1,4 @@
-"""Bytes before a frame, as a line that floats while nobody drives it."""
+"""Bytes before a frame, as on a floating line that no device drives."""
 
 from __future__ import annotations
 

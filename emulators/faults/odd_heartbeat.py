@@ -1,4 +1,4 @@
-"""A node that says that it is in a state which is none, or in another than it is in."""
+"""A node whose heartbeat reports an undefined or wrong state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SDO replies that are none, or to something else (CiA 301, 7.2.4)."""
+"""Invalid SDO replies, or replies to a different request (CiA 301, 7.2.4)."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class OddSdo(CanFault):
 
     def strike(self, frame: CanFrame, node: int, random: Random) -> tuple[CanPiece, ...]:
         p, data = self.parameters, bytearray(frame.data)
-        if data[0] >> 5 in (_UPLOAD, 3):  # an initiate: the others name no object and no size
+        if data[0] >> 5 in (_UPLOAD, 3):  # an initiate; segments name no object and no size
             index = (int.from_bytes(data[1:3], "little") + p.index_by) & 0xFFFF
             data[1:3] = index.to_bytes(2, "little")
             if data[0] >> 5 == _UPLOAD and not data[0] & _EXPEDITED and data[0] & _SIZED:

@@ -1,7 +1,7 @@
-"""The faults of one emulated device that has no system around it: `fieldtwin emulate DEVICE --faults FILE`.
+"""The faults of one emulated device outside of a system: `fieldtwin emulate DEVICE --faults FILE`.
 
-An aim knows no names of buses and devices here; a register may be named if the device has a profile. Faults of values need a
-device whose registers are made from its profile.
+Here an aim may not name buses or devices; it may name a register if the device has a profile. Value faults need a
+device whose registers are created from its profile.
 """
 
 from __future__ import annotations
@@ -22,20 +22,23 @@ from fieldtwin.gateway.core.profile import DeviceProfile, Tag
 
 
 class DeviceFaults:
-    """Faults as they were said, checked by `check_device`. They begin at `start_ns`, the loop's time in nanoseconds."""
+    """The faults as given in the file, checked by `check_device`.
+
+    They begin at `start_ns`, the loop's time in nanoseconds.
+    """
 
     def __init__(
         self, said: Iterable[Mapping[str, Any]], profile: DeviceProfile | None, seed: int, start_ns: int
     ) -> None:
         self.put_in: list[Active] = []
-        """What was put in, once for each wire, with how often it struck."""
+        """The faults that were put in, once for each wire, with the number of times each has struck."""
         self._specs = [parse_fault(dict(one), number=number) for number, one in enumerate(said, 1)]
         self._profile = profile
         self._seed = seed
         self._start_ns = start_ns
 
     def on_wire(self, framing: Framing) -> WireFaults:
-        """The faults of one wire of the device."""
+        """Return the faults of one wire of the device."""
         faults = WireFaults(framing)
         for spec in self._specs:
             if spec.kind.kind is Kind.BYTES:
@@ -43,7 +46,7 @@ class DeviceFaults:
         return faults
 
     def on_values(self, distortions: Distortions) -> None:
-        """Put the faults of values into a device."""
+        """Put the value faults into a device."""
         for spec in self._specs:
             if spec.kind.kind is Kind.VALUE:
                 active = self._active(spec)
@@ -72,7 +75,7 @@ class DeviceFaults:
 
 
 def check_device(spec: FaultSpec, profile: DeviceProfile | None, *, values: bool) -> None:
-    """Raise `WrongAim` for a fault that one device cannot have. `values`: whether its values can be changed."""
+    """Raise `WrongAim` for a fault that a single device cannot have. `values`: whether its values can be changed."""
     aim, kind = spec.aim, spec.kind.kind
     for key, name in (("device", aim.device), ("bus", aim.bus)):
         if name:
@@ -106,7 +109,7 @@ def _tag(aim: Aim, profile: DeviceProfile | None) -> Tag | None:
 
 
 def _place(aim: Aim, profile: DeviceProfile | None) -> tuple[range | None, frozenset[int]]:
-    """The addresses that are aimed at, None for all, and the functions of their table."""
+    """Return the addresses that are aimed at, None for all, and the functions of their table."""
     tag = _tag(aim, profile)
     if tag is not None:
         at = tag.registers

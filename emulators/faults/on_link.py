@@ -1,4 +1,4 @@
-"""Faults of a wire of which nobody knows more than its framing: a link between two strangers."""
+"""Faults of a link between two third-party programs, of which only the framing is known."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 
 
 def check_link(spec: FaultSpec) -> None:
-    """Raises `WrongAim` for what needs a system file, devices, registers by name, values; and for CAN."""
+    """Raise `WrongAim` for a fault that needs a system file, devices, register names, values or a CAN bus."""
     _check_kind(spec, Kind.BYTES, "one of a line or socket")
     _check_names(spec, "unit, function, address")
     if spec.aim.address is not None:
@@ -24,7 +24,7 @@ def check_link(spec: FaultSpec) -> None:
 
 
 def check_can_link(spec: FaultSpec) -> None:
-    """As `check_link`, of a link between two CAN buses."""
+    """Do the same as `check_link` for a link between two CAN buses."""
     _check_kind(spec, Kind.CAN, "one of a CAN bus")
     _check_names(spec, "unit, cob_id, index")
     if issubclass(spec.kind, BusFault):
@@ -55,7 +55,7 @@ def wire_faults(
     start_ns: int,
     check: Callable[[FaultSpec], None] = check_link,
 ) -> WireFaults:
-    """The faults, all put in; their times count from `start_ns`. Raises as `check`."""
+    """Return the faults of a link, all put in; their times count from `start_ns`. Raises what `check` raises."""
     faults = WireFaults(framing)
     for number, one in enumerate(said, 1):
         spec = parse_fault(dict(one), number=number)

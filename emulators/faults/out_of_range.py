@@ -1,4 +1,4 @@
-"""A sensor beyond its range."""
+"""A sensor outside of its range."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class OutOfRange(ValueFault):
             try:
                 self._of_tag[tag.name] = OutOfRange(Form(value=beyond(tag, tag.name)))
             except WrongAim:
-                continue  # its type has no such value, so the fault leaves the tag alone
+                continue  # the type has no value out of range, so the fault does not change the tag
 
     def on(self, tag: str) -> ValueFault | None:
         return self if self.parameters.value is not None else self._of_tag.get(tag)

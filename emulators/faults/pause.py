@@ -1,4 +1,4 @@
-"""A silence inside a frame, longer than any receiver may wait (SL 2.5.1.1: t1.5)."""
+"""A silence inside a frame, longer than a receiver accepts (SL 2.5.1.1: t1.5)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every fault by its name."""
+"""All faults by name."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ def _load() -> dict[str, type[Fault]]:
 
 
 FAULTS: dict[str, type[Fault]] = _load()
-"""In the order of the catalogue."""
+"""The faults by name, in the order of the list of faults."""
 
 
 def fault_class(name: str) -> type[Fault]:
-    """Raises `UsageError` that names the nearest."""
+    """Return the class of a fault. Raises `UsageError`, which suggests the nearest name."""
     found = FAULTS.get(name)
     if found is None:
         hint = did_you_mean(name, FAULTS, otherwise="`fieldtwin faults` lists them")

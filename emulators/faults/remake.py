@@ -1,4 +1,4 @@
-"""A frame with another unit id or PDU, its check sum or length as it should be."""
+"""Rebuild a frame with a different unit ID or PDU and a correct checksum or length."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fieldtwin.emulators.modbus.rtu_shapes import with_crc
 
 
 def remade(frame: Frame, *, unit: int | None = None, pdu: bytes | None = None) -> bytes:
-    """The bytes of `frame` with these parts instead. What was not understood stays as it is."""
+    """Return the bytes of `frame` with these parts replaced. A frame that was not understood is returned unchanged."""
     if not frame.pdu:
         return frame.data
     adu = bytes((frame.unit if unit is None else unit,)) + (frame.pdu if pdu is None else pdu)

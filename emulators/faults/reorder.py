@@ -1,4 +1,4 @@
-"""A frame that is overtaken by the one behind it."""
+"""A frame that is overtaken by the next one."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Reorder(WireFault):
         )
 
     def _went(self, frame: Frame) -> bool:
-        """Its time is up: nobody overtook it, or it went behind another long ago."""
+        """Return whether the frame has already been sent after a later one; otherwise its time is up, and release it."""
         if self._held is not frame:
             return True
         self._held = None

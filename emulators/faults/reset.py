@@ -1,4 +1,4 @@
-"""A connection that is torn down inside a frame (RST)."""
+"""A connection that is reset inside a frame (RST)."""
 
 from __future__ import annotations
 

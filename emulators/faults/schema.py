@@ -28,7 +28,7 @@ _NOT_OF = {
     Kind.CAN: frozenset({"function", "address", "registers"}),
     Kind.VALUE: frozenset(_AIM_KEYS) - {"device", "register", "from", "until", "optional"},
 }
-"""What of an aim means nothing to a kind of fault."""
+"""The keys of an aim that have no meaning for a kind of fault."""
 
 
 _DURATION = re.compile(r"^([0-9]+(?:\.[0-9]+)?)(ms|s|min|h)?$")
@@ -38,7 +38,7 @@ MOST = 10_000
 
 @dataclass(frozen=True, slots=True)
 class FaultSpec:
-    """A fault that may be put in. Times in seconds of the run; `until_s` None: until it is taken away."""
+    """A fault that may be put in. Times are in seconds of the run; `until_s` None: until it is taken away."""
 
     id: str
     kind: type[Fault]
@@ -48,17 +48,17 @@ class FaultSpec:
     until_s: float | None
 
     def make(self) -> Fault:
-        """The fault, anew: some remember."""
+        """Return a new instance of the fault, because some faults keep state."""
         return self.kind(self.kind.form.model_validate(self.parameters))
 
 
 def aims_of(kind: type[Fault]) -> list[str]:
-    """The keys of an aim that mean something to a fault."""
+    """Return the keys of an aim that have a meaning for this fault."""
     return [key for key in _AIM_KEYS if key not in _NOT_OF[kind.kind]]
 
 
 def seconds(value: str | float | int) -> float:
-    """``5s``, ``250ms``, ``2min``, ``24h``, or seconds. Raises `UsageError`."""
+    """Return the seconds of ``5s``, ``250ms``, ``2min``, ``24h``, or of a number of seconds. Raises `UsageError`."""
     if isinstance(value, int | float):
         return float(value)
     match = _DURATION.match(value.strip())
@@ -70,7 +70,7 @@ def seconds(value: str | float | int) -> float:
 def parse_fault(
     said: dict[str, Any], file: YamlFile | None = None, loc: tuple[Key, ...] = (), number: int = 1
 ) -> FaultSpec:
-    """One fault. Raises `FileInvalid` at its spot in `file`, or `UsageError` where there is no file."""
+    """Return one fault. Raises `FileInvalid` with its position in `file`, or `UsageError` if there is no file."""
 
     def wrong(key: str, message: str, *, expected: str = "", got: str = "", hint: str = "") -> FileInvalid | UsageError:
         if file is not None:
@@ -124,11 +124,14 @@ def parse_fault(
 
 
 Check = Callable[[FaultSpec], object]
-"""Raises `WrongAim` for a fault that cannot be where it is to be put in."""
+"""Raises `WrongAim` for a fault that cannot be put in at this place."""
 
 
 def load_faults(path: Path, check: Check | None = None) -> tuple[dict[str, Any], ...]:
-    """The faults of a file, checked, as they were said, each with an id. Raises `FileInvalid` at its spot."""
+    """Return the faults of a file, checked, as given, each with an ID.
+
+    Raises `FileInvalid` with the position in the file.
+    """
     file = load(path)
     for key in file.data:
         if key != "faults":
@@ -150,7 +153,7 @@ def load_faults(path: Path, check: Check | None = None) -> tuple[dict[str, Any],
 
 
 def checked(check: Check, spec: FaultSpec, file: YamlFile, loc: tuple[Key, ...]) -> None:
-    """Raises `FileInvalid` where `check` says that the aim is wrong."""
+    """Raise `FileInvalid` if `check` rejects the aim."""
     try:
         check(spec)
     except WrongAim as e:
@@ -159,7 +162,7 @@ def checked(check: Check, spec: FaultSpec, file: YamlFile, loc: tuple[Key, ...])
 
 
 def counted(count: str | int | None) -> range | None:
-    """The counts of registers or bits that ``40``, ``65..125`` or ``65..`` means; None: all. Raises `WrongAim`."""
+    """Return the register or bit counts that ``40``, ``65..125`` or ``65..`` means; None: all. Raises `WrongAim`."""
     if count is None:
         return None
     low, dots, high = str(count).partition("..")
@@ -175,7 +178,7 @@ def counted(count: str | int | None) -> range | None:
 
 
 MOST_COUNTED = 2000
-"""Bits that one request can read (AP 6.1)."""
+"""The largest number of bits that one request can read (AP 6.1)."""
 
 FUNCTIONS_OF = {
     "coil": frozenset({1, 5, 15}),
@@ -183,11 +186,11 @@ FUNCTIONS_OF = {
     "input": frozenset({4}),
     "holding": frozenset({3, 6, 16, 22, 23, 24}),
 }
-"""Table to the function codes that address it."""
+"""Table -> the function codes that address it."""
 
 
 def addressed(address: str | int) -> tuple[range, frozenset[int]]:
-    """The PDU address that ``0x10`` or ``holding:0x10`` is, and the functions of its table. Raises `WrongAim`."""
+    """Return the PDU address that ``0x10`` or ``holding:0x10`` means, and the functions of its table. Raises `WrongAim`."""
     table, _, number = str(address).rpartition(":")
     try:
         at = int(number, 0)

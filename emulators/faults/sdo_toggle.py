@@ -1,4 +1,4 @@
-"""An SDO server that does not turn its toggle bit."""
+"""An SDO server that does not toggle its toggle bit."""
 
 from __future__ import annotations
 

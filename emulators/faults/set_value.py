@@ -1,4 +1,4 @@
-"""A value that somebody sets, whatever the recording says."""
+"""A fixed value that replaces the recorded one."""
 
 from __future__ import annotations
 

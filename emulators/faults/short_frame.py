@@ -1,4 +1,4 @@
-"""Frames of fewer bytes than were agreed."""
+"""Frames with fewer bytes than expected."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sensor that jumps now and then."""
+"""A sensor whose value jumps occasionally."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A sensor that hangs."""
+"""A sensor whose value is frozen."""
 
 from __future__ import annotations
 

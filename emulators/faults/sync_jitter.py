@@ -1,4 +1,4 @@
-"""SYNC that comes unevenly."""
+"""SYNC messages that arrive at irregular intervals."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Which numbers a tag can hold on the wire, and which of them lie outside of its declared range.
+"""The numbers that a tag can hold on the wire, and those of them that lie outside of its declared range.
 
-Values are in engineering units. Pure. A tag whose factor stands in a register of its own (`scale_by`) has no fixed limits: the
-factor decides while the device runs.
+Values are in engineering units. Pure. A tag whose scale factor is in a separate register (`scale_by`) has no fixed
+limits: the factor is known only while the device runs.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ PLAUSIBLE = 1.0e9
 FLOAT_LIMITS = {"float32": 3.4028234663852886e38, "float64": 1.7976931348623157e308}
 """The largest finite numbers (IEEE 754)."""
 _MOST_SENTINELS = 64
-"""Neighbours of a limit that may be sentinels, which mean "no value" and not a value out of range."""
+"""Number of neighbours of a limit that may be sentinels, which mean "no value" and not a value out of range."""
 
 
 def numbers(tags: Iterable[Tag]) -> list[Tag]:
@@ -27,7 +27,7 @@ def numbers(tags: Iterable[Tag]) -> list[Tag]:
 
 
 def limits(tag: Tag) -> tuple[float, float] | None:
-    """Return the smallest and the largest value that the type of `tag` can carry; None for no fixed limits."""
+    """Return the smallest and the largest value that the type of `tag` can carry; None if there are no fixed limits."""
     if tag.scale_by is not None:
         return None
     raw = _raw_limits(tag)
@@ -51,8 +51,9 @@ def check_value(tag: Tag, value: float, name: str, hint: str = "") -> None:
 def beyond(tag: Tag, name: str) -> float:
     """Return a value outside of the declared range of `tag`: the largest one that its type carries, else the smallest.
 
-    Where no range is declared, it is the largest value of the type. Infinity stands for the largest raw number of a tag with a
-    factor of its own: the device limits it. Raises `WrongAim` if the type carries no value outside of the range.
+    If no range is declared, it is the largest value of the type. For a tag with a scale factor of its own, infinity
+    stands for the largest raw number; the device limits it. Raises `WrongAim` if the type carries no value outside of
+    the range.
     """
     if tag.scale_by is not None:
         return math.inf
@@ -122,7 +123,7 @@ def _raw_limits(tag: Tag) -> tuple[float, float] | None:
 
 
 def _no_sentinel(tag: Tag, raw: float, step: int) -> float:
-    """Return `raw`, or the number next to it that the profile does not declare to mean "no value"."""
+    """Return `raw`, or the nearest number that the profile does not declare to mean "no value"."""
     for _ in range(_MOST_SENTINELS):
         if tag.at is None or int(raw) % (1 << 16 * tag.at.count) not in tag.sentinels:
             break

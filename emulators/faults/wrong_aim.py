@@ -1,4 +1,4 @@
-"""The error of a fault that cannot be where it is to be put in."""
+"""The error for a fault that cannot be put in at the requested place."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 
 class WrongAim(UsageError):
-    """An aim that cannot be meant; `key` is the key of the fault that says it."""
+    """An aim that cannot be used; `key` is the key of the fault that is wrong."""
 
     def __init__(self, key: str, message: str, *, expected: str = "", got: str = "", hint: str = "") -> None:
         super().__init__(message, expected=expected, got=got, hint=hint)

@@ -1,4 +1,4 @@
-"""A device at another baud rate: framing errors and bytes that were never sent."""
+"""A device with a wrong baud rate: framing errors and bytes that were never sent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame with another function code."""
+"""A frame with a wrong function code."""
 
 from __future__ import annotations
 

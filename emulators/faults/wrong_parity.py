@@ -1,4 +1,4 @@
-"""A device with another parity: about half of the bytes are errors, and dropped by the port."""
+"""A device with a wrong parity: about half of the bytes have parity errors, and the port drops them."""
 
 from __future__ import annotations
 

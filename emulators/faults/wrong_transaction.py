@@ -1,4 +1,4 @@
-"""A reply to another transaction (Modbus TCP)."""
+"""A reply with a wrong transaction ID (Modbus TCP)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A frame under another unit id."""
+"""A frame with a wrong unit ID."""
 
 from __future__ import annotations
 

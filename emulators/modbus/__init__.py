@@ -1,4 +1,4 @@
-"""Our own Modbus server for emulated devices: bank (data), unit (functions), rtu and mbap (framing), serve (asyncio).
+"""Modbus server of the emulated devices: bank (data), unit (functions), rtu and mbap (framing), serve (asyncio).
 
-It shares no code with the master that it answers: a mistake in common code would cancel itself out.
+The server shares no code with the project's Modbus client: a mistake in common code would cancel itself out.
 """

@@ -1,7 +1,7 @@
-"""Modbus ASCII, server side: ``:``, unit and PDU in hexadecimal, LRC, CR LF (SL 2.5.2). Pure.
+"""Modbus ASCII, server side: ``:``, unit ID and PDU in hexadecimal, LRC, CR LF (SL 2.5.2). Pure.
 
-A colon begins a frame wherever it stands, so a second one restarts (row MB-070); a pause of over a second inside a frame
-ends it. Which character stands for LF can be changed by function 08/03 (AP 6.8).
+A colon always begins a frame, so a second colon restarts the frame (row MB-070). A pause of more than one second inside
+a frame ends it. Function 08/03 can replace LF with a different character (AP 6.8).
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from fieldtwin.gateway.core.clock import NS_PER_S
 CHARACTER_GAP_NS = NS_PER_S
 """The longest pause between two characters of a frame (SL 2.5.2.1)."""
 MAX_CHARACTERS = 513
-"""Of a frame: colon, 2 for each of unit, 253 bytes of PDU and LRC, CR and LF (SL 2.5.2.1)."""
+"""Longest frame in characters: colon, 2 for each byte of unit ID, 253 bytes of PDU and LRC, CR and LF (SL 2.5.2.1)."""
 MIN_BYTES = 3
-"""Unit, function, LRC."""
+"""Unit ID, function code and LRC."""
 _COLON, _RETURN = b":", b"\r"
 
 
 def lrc(frame: bytes) -> int:
-    """The check sum of SL 2.5.2.2: two's complement of the sum of all bytes."""
+    """Return the checksum of SL 2.5.2.2: the two's complement of the sum of all bytes."""
     return (0x100 - sum(frame) % 0x100) % 0x100
 
 
 class AsciiReceiver:
-    """Cuts frames out of a line; they come out in binary, LRC included.
+    """Cuts frames out of the characters of a serial line. Frames are returned in binary, LRC included.
 
-    `crc_errors` counts frames that began and were none: a bad LRC or character, cut off by a colon or a pause, too long.
-    `noise_bytes` counts the characters of those, and all outside of frames.
+    `crc_errors` counts damaged frames: the LRC or a character is wrong, a colon or a pause cut the frame off, or it is
+    too long. `noise_bytes` counts the characters of damaged frames and all characters outside of frames.
     """
 
     def __init__(self, gap_ns: int = CHARACTER_GAP_NS) -> None:
@@ -44,11 +44,11 @@ class AsciiReceiver:
 
     @property
     def pending(self) -> int:
-        """Characters of a frame that is not whole, at most `MAX_CHARACTERS`."""
+        """Number of characters of an incomplete frame, at most `MAX_CHARACTERS`."""
         return len(self._buffer)
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Frames that are whole now, oldest first. Never raises, whatever comes."""
+        """Return the frames that are now complete, oldest first. Never raises, whatever `data` contains."""
         if self._buffer and now_ns - self._last_ns > self.gap_ns:
             self._damaged(len(self._buffer))
         if not data:
@@ -77,7 +77,7 @@ class AsciiReceiver:
         return frames
 
     def _restart_at_last_colon(self, end: int) -> None:
-        """Every colon before `end` but the last began a frame that is none."""
+        """Discard everything before the last colon in front of `end`: each earlier colon began a damaged frame."""
         last = self._buffer.rfind(_COLON, 0, end)
         if last > 0:
             self.crc_errors += self._buffer.count(_COLON, 0, last)
@@ -93,7 +93,10 @@ class AsciiReceiver:
 
 
 class AsciiSlave(LineSlave):
-    """The units of one ASCII line. `units`: unit id (1 to 247) -> unit; `gap_ns`: the longest pause inside a frame."""
+    """The units of one ASCII line.
+
+    `units` maps a unit ID (1 to 247) to its unit; `gap_ns` is the longest pause in a frame.
+    """
 
     check_bytes = 1
 
@@ -109,7 +112,7 @@ class AsciiSlave(LineSlave):
         return _COLON + frame.hex().upper().encode("ascii") + _RETURN + self._ascii.delimiter
 
     def _exchange(self, frame: bytes, now_ns: int) -> Exchange:
-        exchange = super()._exchange(frame, now_ns)  # its reply still ends as its request did
+        exchange = super()._exchange(frame, now_ns)  # the reply still ends with the old delimiter
         unit = self.units.get(frame[0])
         if unit is not None:
             self._ascii.delimiter = bytes((unit.diagnostics.delimiter,))
@@ -117,7 +120,10 @@ class AsciiSlave(LineSlave):
 
 
 def _decoded(text: bytes) -> bytes | None:
-    """The bytes of a frame, LRC included and found right; None where it is none. Digits are 0 to 9 and A to F only."""
+    """Return the bytes of a frame, LRC included, or None if the frame is invalid or its LRC is wrong.
+
+    Only the digits 0 to 9 and A to F are valid.
+    """
     if not text.endswith(_RETURN) or text != text.upper() or b" " in text:
         return None
     try:

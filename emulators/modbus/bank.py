@@ -1,4 +1,4 @@
-"""The data behind a Modbus unit: four tables of cells, and what a unit may be refused.
+"""The data behind a Modbus unit: four tables of cells, and the errors with which a unit can refuse a request.
 
 A bank knows addresses and integers. It never knows function codes, frames or engineering units.
 """
@@ -16,16 +16,16 @@ from fieldtwin.gateway.core.errors import DeviceRefused, UsageError
 Table = Literal["coil", "discrete", "input", "holding"]
 Access = Literal["ro", "rw", "wo"]
 Undeclared = Literal["exception", "zero", "hold"]
-"""What cells are that no span declares, in tables that have spans: refused, always 0, or 0 until they are written."""
+"""How cells that no span declares behave, in tables that have spans: refused, always 0, or 0 until they are written."""
 
 BIT_TABLES: frozenset[str] = frozenset({"coil", "discrete"})
 WRITABLE_TABLES: frozenset[str] = frozenset({"coil", "holding"})
 ADDRESSES = 0x10000
-"""Addresses of a table: 0000h to FFFFh as sent in a PDU (AP 4.4)."""
+"""Number of addresses in a table: 0000h to FFFFh as sent in a PDU (AP 4.4)."""
 
 
 class Refusal(DeviceRefused):
-    """The device says no; `code` is the exception code that goes into the reply (AP 7)."""
+    """A request that the device refuses; `code` is the exception code of the reply (AP 7)."""
 
     code: ClassVar[int] = 4
 
@@ -47,7 +47,7 @@ class DeviceFailure(Refusal):
 
 
 class Acknowledge(Refusal):
-    """Accepted, and it takes long: the master polls on (AP 7, code 05)."""
+    """The device accepted the request, but needs a long time for it: the client must poll (AP 7, code 05)."""
 
     code = 5
 
@@ -57,7 +57,7 @@ class Busy(Refusal):
 
 
 class NegativeAcknowledge(Refusal):
-    """A program function that cannot be performed (PI-MBUS-300; counted as NAK, SL appendix A)."""
+    """The device cannot perform a program function (PI-MBUS-300; counted as NAK, SL appendix A)."""
 
     code = 7
 
@@ -69,28 +69,28 @@ class MemoryParityError(Refusal):
 
 
 class RegisterBank(ABC):
-    """What a unit reads and writes. Addresses are as sent (0 to 65535), bits are 0 or 1, registers 0 to 65535.
+    """The cells that a unit reads and writes. Addresses are as sent (0 to 65535), bits are 0 or 1, registers 0 to 65535.
 
     `read` and `write` may raise any `Refusal`; a refused write changes nothing. `now_ns` is the emulator's time, so
-    that a bank may be a function of time.
+    that a bank can be a function of time.
     """
 
     @abstractmethod
     def read(self, table: Table, address: int, count: int, now_ns: int) -> Sequence[int]:
-        """`count` cells from `address` on."""
+        """Return the values of `count` cells, starting at `address`."""
 
     @abstractmethod
     def write(self, table: Table, address: int, values: Sequence[int], now_ns: int) -> None:
-        """Set cells from `address` on: all of them, or none and a `Refusal`."""
+        """Set the cells from `address` on. Either all of them change, or none changes and a `Refusal` is raised."""
 
     def check_read(self, table: Table, address: int, count: int, now_ns: int) -> None:
-        """Raise what `read` would raise. For a bank whose reads have side effects: override it."""
+        """Raise what `read` would raise. A bank whose reads have side effects must override this method."""
         self.read(table, address, count, now_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """`count` neighbouring cells that exist. `access` is the master's; discrete and input are never writable."""
+    """`count` adjacent cells that exist. `access` is the client's access; discrete and input cells are never writable."""
 
     table: Table
     start: int
@@ -111,11 +111,12 @@ OnWrite = Callable[[Table, int, tuple[int, ...], int], None]
 
 @dataclass(frozen=True, slots=True)
 class CellHooks:
-    """What one cell does when a master touches it; each is called with ``(value, now_ns)``.
+    """Side effects of one cell when a client reads or writes it. Each hook is called with ``(value, now_ns)``.
 
-    `reading` is told what the cell holds and says what the master gets: a live value, or the old one of a cell that clears
-    itself. `checking` may raise a `Refusal` before anything of the request has changed. `written` has the effect: it comes
-    when all cells of the request hold their values, in the order of their addresses, and may set others (`MapBank.poke`).
+    `reading` receives the value of the cell and returns the value that the client gets: a live value, or the old value
+    of a cell that clears itself. `checking` may raise a `Refusal` before the request has changed anything. `written`
+    carries out the effect. It is called after all cells of the request hold their values, in the order of their
+    addresses, and may set other cells (`MapBank.poke`).
     """
 
     reading: Callable[[int, int], int] | None = None
@@ -126,29 +127,29 @@ class CellHooks:
 _NO_HOOKS = CellHooks()
 
 MAX_PLANS = 1024
-"""Different reads of a bank that are kept in mind."""
+"""Number of different reads for which a bank keeps a plan."""
 
 
 class _Plan(NamedTuple):
-    """How to read neighbouring cells: all at once, and which of them have a hook of their own."""
+    """How to read adjacent cells: a function that reads all of them, and the cells that have a `reading` hook."""
 
     cells: Callable[[dict[int, int]], Sequence[int]]
     hooked: tuple[tuple[int, Callable[[int, int], int]], ...]
 
 
 class _Zeros(dict[int, int]):
-    """Cells of which those that were never set are 0."""
+    """Cells that read as 0 if they were never set."""
 
     def __missing__(self, address: int) -> int:
         return 0
 
 
 class MapBank(RegisterBank):
-    """Plain cells in declared spans, all zero at first. Gaps between spans do not exist (exception 02), or are as `undeclared`
-    says.
+    """Plain cells in declared spans, all zero at first. `undeclared` says what cells outside of the spans do; by
+    default they do not exist (exception 02).
 
-    `on_write(table, address, values, now_ns)` is called for a write of the master that is otherwise fine, before any
-    cell changes; a `Refusal` raised there is the device's answer and nothing changes.
+    `on_write(table, address, values, now_ns)` is called for each valid write of the client before any cell changes. A
+    `Refusal` raised there is the device's answer, and nothing changes.
     """
 
     def __init__(
@@ -157,7 +158,7 @@ class MapBank(RegisterBank):
         cells = dict[int, int] if undeclared == "exception" else _Zeros
         self._cells: dict[Table, dict[int, int]] = {table: cells() for table in get_args(Table)}
         self._filled = frozenset({"exception": (), "zero": ("read",), "hold": ("read", "written", "set")}[undeclared])
-        """What can be done with cells that no span declares."""
+        """The operations that are allowed on cells that no span declares."""
         self._declared: dict[Table, set[int]] = {table: set() for table in self._cells}
         self._readable: dict[Table, set[int]] = {table: set() for table in self._cells}
         self._writable: dict[Table, set[int]] = {table: set() for table in self._cells}
@@ -180,7 +181,7 @@ class MapBank(RegisterBank):
             self._writable[span.table].update(addresses)
 
     def hook(self, table: Table, address: int, hooks: CellHooks) -> None:
-        """Give a cell side effects, in place of those that it had. Raises `IllegalAddress` where there is none."""
+        """Set the side effects of a cell, replacing earlier ones. Raises `IllegalAddress` if the cell does not exist."""
         self._require(self._declared, table, range(address, address + 1), "hooked")
         self._hooks[table, address] = hooks
         self._plans.clear()
@@ -195,7 +196,10 @@ class MapBank(RegisterBank):
         return values
 
     def _plan(self, table: Table, address: int, count: int) -> _Plan:
-        """How to read these cells. Kept: masters ask the same again and again; forgotten when what is there changes."""
+        """Return how to read these cells, and keep the plan, because clients repeat their reads.
+
+        Changed hooks clear the plans.
+        """
         addresses = range(address, address + count)
         self._require(self._readable, table, addresses, "read")
         hooks = enumerate(self._hooks.get((table, place), _NO_HOOKS).reading for place in addresses)
@@ -224,14 +228,17 @@ class MapBank(RegisterBank):
                 hooks.written(value, now_ns)
 
     def peek(self, table: Table, address: int) -> int:
-        """The device's own view of a cell, whatever its access. Raises `IllegalAddress` where there is none."""
+        """Return the value of a cell as the device sees it, whatever its access.
+
+        Raises `IllegalAddress` if it does not exist.
+        """
         try:
-            return self._cells[table][address]  # of undeclared cells that are filled: 0
+            return self._cells[table][address]  # undeclared cells that `undeclared` fills read as 0
         except KeyError:
             raise IllegalAddress("no cell that can be read", where=f"{table}:{address}") from None
 
     def poke(self, table: Table, address: int, *values: int) -> None:
-        """The device sets its own cells, read-only ones included. Raises `IllegalAddress` or `IllegalValue`."""
+        """Set cells from the device's side, read-only ones included. Raises `IllegalAddress` or `IllegalValue`."""
         limit = 1 if table in BIT_TABLES else 0xFFFF
         for value in values:
             if not 0 <= value <= limit:

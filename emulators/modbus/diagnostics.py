@@ -1,6 +1,7 @@
-"""What a unit counts, and the functions that read and clear it: 07, 08, 0B and 0Ch (AP 6.7 to 6.10; SL appendix A).
+"""The counters of a unit, and the functions that read and clear them: 07, 08, 0B and 0Ch (AP 6.7 to 6.10; SL appendix A).
 
-Two views of one set of numbers: `UnitCounters` only grow (they are evidence), a master's view starts at its last clear.
+There are two views of the same numbers: `UnitCounters` only grow (they are evidence); the client's view starts at its
+last clear.
 """
 
 from __future__ import annotations
@@ -21,34 +22,37 @@ CLEAR_OVERRUN = 0x14
 
 @dataclass(slots=True)
 class UnitCounters:
-    """Everything since the unit was made. `bus_*` count the line it hangs on, the rest what concerns this unit."""
+    """Counters since the unit was created.
+
+    `bus_*` count frames on the unit's serial line, the others those for this unit.
+    """
 
     bus_messages: int = 0
-    """Whole frames heard on the line, for whomever (CPT1)."""
+    """Complete frames on the line, whatever their unit ID (CPT1)."""
     bus_errors: int = 0
-    """Damaged frames heard on the line (CPT2)."""
+    """Damaged frames on the line (CPT2)."""
     requests: int = 0
-    """Addressed to this unit, broadcasts not included."""
+    """Requests addressed to this unit, broadcasts not included."""
     replies: int = 0
-    """Sent, exceptions included."""
+    """Replies sent, exceptions included."""
     exceptions: int = 0
     """Exception responses sent (CPT3)."""
     broadcasts: int = 0
-    """Addressed to unit 0 of a serial line."""
+    """Requests addressed to unit 0 of a serial line."""
     busy: int = 0
     """Exception responses with code 06 (CPT7)."""
     unanswered: int = 0
-    """Heard and not answered: broadcasts, listen-only (CPT5)."""
+    """Requests received and not answered: broadcasts, and all requests in listen-only mode (CPT5)."""
     completed: int = 0
-    """Carried out without an exception, broadcasts included; not those that fetch events (AP 6.9)."""
+    """Requests executed without an exception, broadcasts included, except those that fetch events (AP 6.9)."""
     naks: int = 0
     """Exception responses with code 07 (CPT6)."""
     overruns: int = 0
-    """Messages that came faster than they could be taken (CPT8). Only a fault makes one: nothing here can overrun."""
+    """Messages that arrived faster than the unit could take them (CPT8). Only a fault can cause one in an emulator."""
 
     @property
     def messages(self) -> int:
-        """Messages that were for this unit (CPT4)."""
+        """Messages addressed to this unit (CPT4)."""
         return self.requests + self.broadcasts
 
 
@@ -67,14 +71,14 @@ _UNCOUNTED = (0x0B, 0x0C)
 _DIAGNOSTICS, _CLEARING = 0x08, (b"\x08\x00\x01", b"\x08\x00\x0a")
 _LINE_FEED = 0x0A
 _FRAME_CHARACTERS = frozenset(b":0123456789ABCDEFabcdef\r")
-"""What can stand inside an ASCII frame, and so cannot end one."""
+"""Characters that can occur inside an ASCII frame, and therefore cannot end one."""
 
 
 class Diagnostics:
     """Functions 07, 08, 0B and 0C of one unit.
 
-    `status` are the eight outputs of function 07, `register` is what 08/02 reads; both are the device's to set.
-    `delimiter` is the character that ends ASCII frames in place of LF once 08/03 said so.
+    `status` holds the eight outputs of function 07, `register` the value that 08/02 reads; the device sets both.
+    `delimiter` is the character that ends ASCII frames instead of LF after a request 08/03.
     """
 
     def __init__(self, counters: UnitCounters) -> None:
@@ -87,23 +91,26 @@ class Diagnostics:
         self._cleared = UnitCounters()
 
     def clear(self) -> None:
-        """The master's counters start again at zero; the unit's own do not."""
+        """Restart the client's counters at zero; the unit's own counters keep their values."""
         self._cleared = replace(self.counters)
 
     def wakes(self, pdu: bytes) -> bool:
-        """Whether `pdu` is the one request that ends listen-only mode: 08/01. It does so, and is not answered."""
+        """Return whether `pdu` is 08/01, the only request that ends listen-only mode; if so, end it.
+
+        The unit does not answer it.
+        """
         if pdu not in _RESTARTS:
             return False
         self._restart(pdu)
         return True
 
     def completed(self, pdu: bytes) -> None:
-        """A request was carried out."""
+        """Count a request that was executed."""
         if pdu[0] not in _UNCOUNTED and not (pdu[0] == _DIAGNOSTICS and pdu[:3] in _CLEARING):
             self.counters.completed += 1
 
     def respond(self, pdu: bytes) -> bytes | None:
-        """The answer to an 08h request, None where the standard wants none. Raises `Refusal`."""
+        """Return the answer to an 08h request, or None if the standard requires silence. Raises `Refusal`."""
         if len(pdu) < 3:
             raise IllegalValue("diagnostic request without a sub-function")
         sub = int.from_bytes(pdu[1:3], "big")
@@ -125,17 +132,17 @@ class Diagnostics:
         return self._execute(sub, pdu)
 
     def exception_status(self, pdu: bytes) -> bytes:
-        """Function 07."""
+        """Answer function 07."""
         _require_bare(pdu)
         return bytes((pdu[0], self.status & 0xFF))
 
     def event_counter(self, pdu: bytes, processing: bool) -> bytes:
-        """Function 0B. `processing`: a program command of before is still under way."""
+        """Answer function 0B. `processing`: an earlier program command is still being executed."""
         _require_bare(pdu)
         return pdu[:1] + self._status_and_count(processing)
 
     def event_log(self, pdu: bytes, processing: bool) -> bytes:
-        """Function 0C."""
+        """Answer function 0C."""
         _require_bare(pdu)
         data = self._status_and_count(processing) + _word(self._since_clear("bus_messages")) + self.log.content
         return bytes((pdu[0], len(data))) + data

@@ -1,6 +1,6 @@
 """FIFO queues of registers, function 18h (AP 6.18).
 
-Pure. A queue stands at its pointer address; reading does not empty it, the device does.
+Pure. A queue is identified by its pointer address. A read does not empty the queue; only the device takes values out.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from fieldtwin.emulators.modbus.bank import IllegalAddress, IllegalValue
 from fieldtwin.gateway.core.errors import UsageError
 
 MOST_READ = 31
-"""Registers that one answer can hold; a longer queue is refused with 03 until the device took some out."""
+"""Registers that fit one answer; a longer queue is refused with 03 until the device takes some out."""
 
 
 class FifoQueues:
     """The queues of a unit by pointer address (0 to 65535), each of at most `capacity` registers, empty at first.
 
-    `dropped` counts what did not fit.
+    `dropped` counts the registers that did not fit.
     """
 
     def __init__(self, addresses: Iterable[int], capacity: int = MOST_READ) -> None:
@@ -31,7 +31,7 @@ class FifoQueues:
             self._queues[address] = deque()
 
     def push(self, address: int, *values: int) -> None:
-        """Append registers (0 to 65535). Raises `IllegalAddress` where no queue is, `IllegalValue`."""
+        """Append registers (0 to 65535). Raises `IllegalAddress` if there is no queue, or `IllegalValue`."""
         queue = self._queue(address)
         for value in values:
             if not 0 <= value <= 0xFFFF:
@@ -42,12 +42,12 @@ class FifoQueues:
                 queue.append(value)
 
     def take(self, address: int, count: int = 1) -> list[int]:
-        """The device takes up to `count` registers from the head. Raises `IllegalAddress`."""
+        """Remove up to `count` registers from the head, as the device does, and return them. Raises `IllegalAddress`."""
         queue = self._queue(address)
         return [queue.popleft() for _ in range(min(count, len(queue)))]
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes:
-        """The answer to an 18h request. Raises `Refusal`."""
+        """Return the answer to an 18h request. Raises `Refusal`."""
         if len(pdu) != 3:
             raise IllegalValue("length of the request", expected="3 bytes", got=str(len(pdu)))
         queue = self._queue(pdu[1] << 8 | pdu[2])

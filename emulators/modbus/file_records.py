@@ -1,6 +1,6 @@
 """File records, functions 14h and 15h (AP 6.14, 6.15): numbered files of 16-bit records.
 
-Pure: request PDU in, response PDU out. What a file means is the device's business.
+Pure: it takes a request PDU and returns a response PDU. The device decides what a file means.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from fieldtwin.gateway.core.errors import UsageError
 
 REFERENCE_TYPE = 6
 MAX_RECORDS = 10_000
-"""Records of a file: 0000h to 270Fh."""
+"""Most records in a file: 0000h to 270Fh."""
 _GROUP = 7
 """Bytes of a sub-request: reference type, file, record, count."""
 _MOST_READ, _MOST_ASKED, _MOST_WRITTEN = 0xF5, 0xF5, 0xFB
@@ -21,7 +21,7 @@ _MOST_READ, _MOST_ASKED, _MOST_WRITTEN = 0xF5, 0xF5, 0xFB
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """One sub-request; `values` of a write."""
+    """One sub-request; `values` holds the records of a write."""
 
     file: int
     record: int
@@ -30,9 +30,9 @@ class Group:
 
 
 class FileRecords:
-    """The files of a unit: number (1 to 65535) -> records it has (1 to 10000), all zero at first.
+    """The files of a unit: file number (1 to 65535) -> number of records (1 to 10000), all zero at first.
 
-    `read_only` files refuse writes with exception 02.
+    Writes to `read_only` files are refused with exception 02.
     """
 
     def __init__(self, sizes: Mapping[int, int], read_only: Sequence[int] = ()) -> None:
@@ -45,15 +45,15 @@ class FileRecords:
         self._read_only = frozenset(read_only)
 
     def peek(self, file: int, record: int, count: int = 1) -> list[int]:
-        """What the file holds, as the device sees it. Raises `IllegalAddress`."""
+        """Return records of a file as the device sees them. Raises `IllegalAddress`."""
         return self._span(Group(file, record, count))[record : record + count]
 
     def poke(self, file: int, record: int, *values: int) -> None:
-        """The device sets its own records, read-only files included. Raises `IllegalAddress`."""
+        """Set records from the device's side, read-only files included. Raises `IllegalAddress`."""
         self._span(Group(file, record, len(values)))[record : record + len(values)] = values
 
     def respond_read(self, pdu: bytes, now_ns: int) -> bytes:
-        """Function 14h. All spans, or a `Refusal`."""
+        """Answer function 14h: return all requested spans, or raise a `Refusal`."""
         if len(pdu) < 2 or pdu[1] != len(pdu) - 2 or not _GROUP <= pdu[1] <= _MOST_ASKED or pdu[1] % _GROUP:
             raise IllegalValue("byte count of a file request", got=pdu[1:2].hex())
         groups = [_group(pdu[at : at + _GROUP]) for at in range(2, len(pdu), _GROUP)]
@@ -67,7 +67,7 @@ class FileRecords:
         return bytes((pdu[0], size)) + data
 
     def respond_write(self, pdu: bytes, now_ns: int) -> bytes:
-        """Function 15h: all spans are written, or none and a `Refusal`. The response is the request."""
+        """Answer function 15h: write all spans, or write none and raise a `Refusal`. The response is the request."""
         if len(pdu) < 2 or pdu[1] != len(pdu) - 2 or not _GROUP + 2 <= pdu[1] <= _MOST_WRITTEN:
             raise IllegalValue("byte count of a file request", got=pdu[1:2].hex())
         groups, at = [], 2
@@ -100,7 +100,7 @@ class FileRecords:
 
 
 def _group(data: bytes) -> Group:
-    if data[0] != REFERENCE_TYPE:  # 02 for all that a sub-request says, by the flow chart of AP 6.14
+    if data[0] != REFERENCE_TYPE:  # the flow chart of AP 6.14 gives 02 for every field of a sub-request
         raise IllegalAddress("reference type", expected=str(REFERENCE_TYPE), got=str(data[0]))
     file, record, count = (data[i] << 8 | data[i + 1] for i in (1, 3, 5))
     return Group(file, record, count)

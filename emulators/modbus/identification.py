@@ -1,6 +1,6 @@
-"""Device identification, function 2Bh with MEI type 0Eh (AP 6.21): numbered texts, in several frames where need be.
+"""Device identification, function 2Bh with MEI type 0Eh (AP 6.21): numbered texts, in several frames if necessary.
 
-Pure: request PDU in, response PDU out.
+Pure: it takes a request PDU and returns a response PDU.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from fieldtwin.gateway.core.errors import UsageError
 
 MEI_TYPE = 0x0E
 BASIC, REGULAR, EXTENDED, INDIVIDUAL = 1, 2, 3, 4
-"""Read device id codes: three categories as a stream, and one object alone."""
+"""Read device id codes: three categories as a stream, and one individual object."""
 _LAST_OF = {BASIC: 0x02, REGULAR: 0x7F, EXTENDED: 0xFF}
 _INDIVIDUAL_ACCESS = 0x80
 _HEAD = 7
 MAX_OBJECT = 253 - _HEAD - 2
-"""Bytes of the longest object that fits a PDU of its own: 244."""
+"""Bytes of the longest object that fits into one PDU: 244."""
 
 
 class Identification:
     """The objects of one device: number -> bytes. 0 vendor name, 1 product code and 2 revision are mandatory.
 
-    3 to 6 (URL, product name, model name, application name) are regular ones, from 80h on they are the vendor's.
+    3 to 6 (URL, product name, model name, application name) are regular objects; those from 80h on are vendor-specific.
     """
 
     def __init__(self, objects: Mapping[int, bytes]) -> None:
@@ -42,10 +42,10 @@ class Identification:
         self._level = next(code for code in (BASIC, REGULAR, EXTENDED) if highest <= _LAST_OF[code])
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes:
-        """The answer to a 2Bh request.
+        """Return the answer to a 2Bh request.
 
-        Refused with 01 for another MEI type, 03 for a code that is none or a wrong length, and 02 for one object alone that
-        is not there. A stream that is asked for from an unknown object on begins at object 0 (AP 6.21).
+        Refuses with 01 a different MEI type, with 03 an invalid code or a wrong length, and with 02 an individual
+        object that does not exist. A stream that is requested from an unknown object on begins at object 0 (AP 6.21).
         """
         if len(pdu) < 2 or pdu[1] != MEI_TYPE:
             raise IllegalFunction("MEI type", expected="0Eh", got=pdu[1:2].hex())
@@ -69,7 +69,10 @@ class Identification:
         return self._frame(code, numbers[:fitting], following)
 
     def _frame(self, code: int, numbers: list[int], following: int) -> bytes:
-        """`following`: the object with which the next frame begins; 0 (which never follows) when this is the last."""
+        """Return one frame.
+
+        `following` is the first object of the next frame; 0 (which never follows) if this is the last.
+        """
         more = 0xFF if following else 0x00
         head = bytes((0x2B, MEI_TYPE, code, self._level | _INDIVIDUAL_ACCESS, more, following, len(numbers)))
         return head + b"".join(bytes((n, len(self.objects[n]))) + self.objects[n] for n in numbers)

@@ -1,7 +1,7 @@
-"""Several units on one serial line (MODBUS over Serial Line V1.02, SL below), whatever frames they speak.
+"""Several units on one serial line (MODBUS over Serial Line V1.02, SL below), for every frame format.
 
-Pure. A unit answers what is addressed to it, executes what is addressed to 0, and keeps silent about all else: other
-units' traffic, damaged frames, noise. Pacing and waiting happen elsewhere; frames are cut and made by a subclass.
+Pure. A unit answers requests addressed to it, executes broadcasts (unit ID 0), and ignores everything else: the traffic
+of other units, damaged frames, noise. Pacing and waiting happen elsewhere; a subclass cuts and builds the frames.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ LOWEST_UNIT, HIGHEST_UNIT = 1, 247
 
 
 class Exchange(msgspec.Struct, frozen=True, gc=False):
-    """A whole frame that was heard, and the whole frame to send for it; empty when there is nothing to say.
+    """A complete frame that was received, and the complete frame to send in reply; empty if there is no reply.
 
-    `latency_s`: how long the unit says that it thinks about this answer (`ModbusUnit.latency_s`).
+    `latency_s` is the processing time that the unit states for this reply (`ModbusUnit.latency_s`).
     """
 
     heard: bytes
@@ -33,8 +33,11 @@ class Exchange(msgspec.Struct, frozen=True, gc=False):
 
 @dataclass(frozen=True, slots=True)
 class LineCounters:
-    """What went over the line so far. `frames` are whole, for whomever; `crc_errors` are damaged ones, LRC and strict
-    timing included; `noise_bytes` are all bytes that belong to no frame."""
+    """Traffic counters of a line.
+
+    `frames` are complete frames, whatever their unit ID; `crc_errors` are damaged frames, with wrong LRCs and
+    violations of strict timing included; `noise_bytes` are all bytes that belong to no frame.
+    """
 
     frames: int
     crc_errors: int
@@ -42,7 +45,7 @@ class LineCounters:
 
 
 class Receiver(Protocol):
-    """Cuts frames out of what a line delivers; `feed` returns them without delimiters, with their check sum."""
+    """Cuts frames out of what a line delivers; `feed` returns them without delimiters, with their checksum."""
 
     gap_ns: int
     frames: int
@@ -56,10 +59,10 @@ class Receiver(Protocol):
 
 
 class LineSlave(ABC):
-    """The units of one line. `units`: unit id (1 to 247) -> unit."""
+    """The units of one line. `units` maps a unit ID (1 to 247) to its unit."""
 
     check_bytes: int
-    """How many bytes of check sum a received frame ends in."""
+    """Number of checksum bytes at the end of a received frame."""
 
     def __init__(self, units: Mapping[int, ModbusUnit], receiver: Receiver) -> None:
         for unit_id in units:
@@ -74,20 +77,23 @@ class LineSlave(ABC):
 
     @property
     def gap_ns(self) -> int:
-        """After which pause no frame goes on."""
+        """The pause after which an unfinished frame cannot continue."""
         return self._receiver.gap_ns
 
     @property
     def pending(self) -> int:
-        """Bytes of a frame that is not whole; feed ``b""`` after `gap_ns` of silence to be rid of them."""
+        """Bytes of an incomplete frame; feed ``b""`` after `gap_ns` of silence to discard them."""
         return self._receiver.pending
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Replies to what is whole now, in order. `now_ns`: when `data` came; it never goes back."""
+        """Return the replies to the frames that are now complete, in order.
+
+        `now_ns`: when `data` came; it never goes back.
+        """
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
     def receive(self, data: bytes, now_ns: int) -> list[Exchange]:
-        """Like `feed`, with every frame that was heard, for taps and journals."""
+        """Do the same as `feed`, but return every received frame too, for taps and journals."""
         errors_before = self._receiver.crc_errors
         frames = self._receiver.feed(data, now_ns)
         errors = self._receiver.crc_errors - errors_before
@@ -98,10 +104,10 @@ class LineSlave(ABC):
 
     @abstractmethod
     def encode(self, frame: bytes) -> bytes:
-        """`frame` (unit id and PDU) as it goes on the line."""
+        """Return `frame` (unit ID and PDU) as it is sent on the line."""
 
     def as_heard(self, frame: bytes) -> bytes:
-        """A received frame as it was on the line."""
+        """Return a received frame as it was on the line."""
         return frame
 
     def _exchange(self, frame: bytes, now_ns: int) -> Exchange:
@@ -122,7 +128,7 @@ class LineSlave(ABC):
         if len(self.units) > 1:
             for (
                 unit
-            ) in self.units.values():  # a reply is a message to the neighbours; the sender's receiver is off meanwhile
+            ) in self.units.values():  # the other units hear the reply too; the sender's receiver is off meanwhile
                 if unit is not addressed:
                     unit.heard(messages=1)
         return Exchange(heard, self.encode(bytes((unit_id,)) + response), addressed.latency_s)

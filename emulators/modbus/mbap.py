@@ -1,7 +1,7 @@
 """Modbus TCP, server side, for one connection (MODBUS Messaging on TCP/IP Implementation Guide V1.0b, TG below).
 
-Pure: bytes or datagrams in, response ADUs out, in the order of the requests. It never knows sockets, and no other
-connection. Inside TLS it is the same; what a client's certificate allows is asked of whoever knows.
+Pure: it takes bytes or datagrams and returns response ADUs in the order of the requests. It never knows sockets or
+other connections. It works the same way inside TLS; the `allow` callback decides what a client's certificate permits.
 """
 
 from __future__ import annotations
@@ -14,30 +14,31 @@ from fieldtwin.emulators.modbus.unit import ModbusUnit
 from fieldtwin.gateway.core.errors import Desync, UsageError
 
 HEADER = 6
-"""Transaction id, protocol id and length: what precedes the bytes that the length counts (TG 3.1.3)."""
+"""Bytes of transaction ID, protocol ID and length: those that precede the bytes counted by the length field (TG 3.1.3)."""
 MIN_LENGTH, MAX_LENGTH = 2, 254
-"""Unit id and function; unit id and the largest PDU of 253 bytes."""
+"""Unit ID and function code; unit ID and the largest PDU of 253 bytes."""
 MAX_IN_FLIGHT = 16
-"""TG 4.4.2.2 names 1 to 16 as usual for a server."""
+"""TG 4.4.2.2 gives 1 to 16 as usual for a server."""
 ANY_UNIT = (0, 255)
-"""Unit ids that mean the device itself, where there is only one behind the address (TG 4.4.1.2)."""
+"""Unit IDs that mean the device itself, if there is only one device at the address (TG 4.4.1.2)."""
 NO_PATH = 0x0A
 
 Allow = Callable[[int, bytes], bool]
-"""``(unit id, pdu)`` -> whether this client may ask for that."""
+"""``(unit id, pdu)`` -> whether this client may send that request."""
 
 
 class MbapSlave:
-    """The units behind one connection. `units`: unit id -> unit.
+    """The units behind one connection. `units` maps a unit ID to its unit.
 
-    With a single unit, ids 0 and 255 reach it too, and are echoed; with `any_unit` every id does, as with devices that ignore
-    it. A unit id that no unit has is answered with exception 0A, as a gateway does without a route. At most
-    `max_in_flight` requests of those that came together are executed; the rest gets exception 06.
+    A single unit is also reached with the IDs 0 and 255, and echoes them; with `any_unit` it is reached with every ID,
+    like devices that ignore it. A request for an unknown unit ID is answered with exception 0A, as a gateway without a
+    route does. At most `max_in_flight` of the requests that arrive together are executed; the others get exception 06.
 
-    A request that `allow` refuses gets exception 01 (MODBUS/TCP Security, 8.3), unexecuted; without it all are allowed.
+    A request that `allow` refuses is not executed and gets exception 01 (MODBUS/TCP Security, 8.3); without `allow` all
+    requests are permitted.
 
-    `desync` says why nothing more is understood: a length that no ADU can have leaves no way to find the next one.
-    The connection is to be closed then; what is fed later is dropped.
+    `desync` gives the reason why the rest of the stream cannot be parsed: after a length that no ADU can have, the
+    start of the next ADU is unknown. The connection must then be closed; data that is fed later is dropped.
     """
 
     def __init__(
@@ -61,22 +62,22 @@ class MbapSlave:
         """Requests that reached a unit, and the replies to them."""
         self.requests = 0
         self.discarded = 0
-        """ADUs that were dropped: not Modbus, or too short for a function."""
+        """Number of ADUs that were dropped: not Modbus, or too short for a function code."""
         self._allow = allow
         self._any_unit = any_unit
         self._buffer = bytearray()
 
     @property
     def pending(self) -> int:
-        """Bytes of an ADU that is not whole."""
+        """Bytes of an incomplete ADU."""
         return len(self._buffer)
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Response ADUs to what is whole now, in order. Never raises, whatever comes."""
+        """Return response ADUs to the requests that are now complete, in order. Never raises, whatever `data` contains."""
         return [exchange.reply for exchange in self.receive(data, now_ns) if exchange.reply]
 
     def receive(self, data: bytes, now_ns: int) -> list[Exchange]:
-        """Like `feed`, with every request ADU, for taps and journals."""
+        """Do the same as `feed`, but return every request ADU too, for taps and journals."""
         if self.desync is not None:
             return []
         if not self._buffer and _is_adu(data):
@@ -91,7 +92,10 @@ class MbapSlave:
         return exchanges
 
     def answer(self, data: bytes, now_ns: int) -> bytes:
-        """Like `feed`, the responses in one piece. What comes is one whole ADU as a rule: that is not copied together first."""
+        """Do the same as `feed`, but return the responses as one byte string.
+
+        Usually `data` is exactly one ADU, which is then not copied into the buffer first.
+        """
         if not self._buffer and _is_adu(data):
             if self.desync is not None:
                 return b""
@@ -100,7 +104,7 @@ class MbapSlave:
         return b"".join(self.feed(data, now_ns))
 
     def receive_datagram(self, data: bytes, now_ns: int) -> list[Exchange]:
-        """Like `receive`, for a datagram: what is not whole at its end is dropped, and nothing outlives it."""
+        """Do the same as `receive`, for a datagram: an ADU that is incomplete at its end is dropped, and no state is kept."""
         exchanges = self.receive(data, now_ns)
         self.discarded += bool(self._buffer)
         self._buffer.clear()
@@ -124,7 +128,7 @@ class MbapSlave:
                 adu = bytes(buffer[begin:at])
                 break
             self.discarded += 1
-        del buffer[:at]  # once: a flood of ADUs that are none is cut through in one go
+        del buffer[:at]  # only once, so that a flood of invalid ADUs costs one deletion
         return adu
 
     def _exchange(self, adu: bytes, busy: bool, now_ns: int) -> Exchange:
@@ -133,7 +137,7 @@ class MbapSlave:
         return Exchange(adu, reply, unit.latency_s if unit is not None and reply else 0.0)
 
     def _reply(self, unit: ModbusUnit | None, adu: bytes, busy: bool, now_ns: int) -> bytes:
-        """The whole response, empty for silence."""
+        """Return the complete response, or an empty byte string for silence."""
         pdu = adu[7:]
         response: bytes | None
         if unit is None:
@@ -159,6 +163,6 @@ class MbapSlave:
 
 
 def _is_adu(data: bytes) -> bool:
-    """Whether a chunk is one whole ADU of Modbus, and nothing else: as a rule."""
+    """Return whether a chunk is exactly one Modbus ADU, which is the usual case."""
     length = len(data) - HEADER
     return MIN_LENGTH <= length <= MAX_LENGTH and data[5] == length and data[2:5] == b"\0\0\0"

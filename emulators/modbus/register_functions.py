@@ -1,7 +1,7 @@
-"""Functions over cells: 01 to 06, 0F, 10, 16 and 17h over a bank (AP 6.1 to 6.6, 6.11, 6.12, 6.16, 6.17).
+"""Functions that access cells: 01 to 06, 0F, 10, 16 and 17h on a bank (AP 6.1 to 6.6, 6.11, 6.12, 6.16, 6.17).
 
-Pure: request PDU in, response PDU out, or a `Refusal`. Checks go in the order of the flow charts of AP 6: quantities and
-lengths (03), addresses (02), then execution. A refused request has changed nothing.
+Pure: a function takes a request PDU and returns a response PDU, or raises a `Refusal`. The checks follow the flow
+charts of AP 6: quantities and lengths (03), addresses (02), then execution. A refused request changes nothing.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from fieldtwin.gateway.core.errors import UsageError
 STANDARD_FUNCTIONS = frozenset({*range(0x01, 0x09), 0x0B, 0x0C, 0x0F, 0x10, 0x11, 0x14, 0x15, 0x16, 0x17, 0x18, 0x2B})
 
 TABLES: dict[int, Table] = {0x01: "coil", 0x02: "discrete", 0x03: "holding", 0x04: "input"}
-"""Function code of a read -> what it reads."""
+"""Function code of a read -> the table that it reads."""
 
 
 @dataclass(frozen=True, slots=True)
 class UnitLimits:
-    """What a device of this kind supports; the defaults are the protocol's own limits (AP 6).
+    """The functions and quantities that a device supports; the defaults are the protocol's own limits (AP 6).
 
-    `functions` that a unit has no means for (files, queues, ids, user-defined ones) are answered with 01 all the same.
-    `even_only`: values take two registers and half a value is refused: an odd count with 03, an odd address with 02.
+    A function in `functions` for which a unit has no data (files, queues, identification, user-defined functions) is
+    still answered with 01. `even_only`: values take two registers, and access to half a value is refused: an odd count
+    with 03, an odd address with 02.
     """
 
     functions: frozenset[int] = STANDARD_FUNCTIONS
@@ -54,11 +55,11 @@ class UnitLimits:
 
 _ADDRESS_AND_COUNT = struct.Struct(">HH").unpack_from
 _READ_REPLIES = tuple(struct.Struct(f">BB{count}H").pack for count in range(126))
-"""By the number of registers: function, byte count and registers as they are sent."""
+"""Packers by the number of registers: function code, byte count and registers as they are sent."""
 
 
 class RegisterFunctions:
-    """The functions over one bank, within one device's limits."""
+    """The functions on one bank, within the limits of one device."""
 
     def __init__(self, bank: RegisterBank, limits: UnitLimits) -> None:
         self.bank = bank
@@ -137,7 +138,10 @@ class RegisterFunctions:
         return bytes((pdu[0], len(values))) + values
 
     def _require_registers(self, address: int, count: int, most: int) -> None:
-        """03 before 02. A single write (most == 1) of half a value is the device's own affair."""
+        """Check the count (03) before the address (02).
+
+        A single write (most == 1) of half a value is left to the device.
+        """
         _require_count(count, most)
         pairs = self.limits.even_only and most > 1
         if pairs and count % 2:
@@ -156,7 +160,7 @@ def _pack_words(values: Sequence[int]) -> bytes:
 
 
 def _pack_bits(values: Sequence[int]) -> bytes:
-    """First bit in the lowest place of the first byte, the last byte filled up with zeros (AP 6.1)."""
+    """Pack bits: the first bit is the lowest of the first byte, and the last byte is padded with zeros (AP 6.1)."""
     data = bytearray((len(values) + 7) // 8)
     for i, value in enumerate(values):
         data[i // 8] |= bool(value) << i % 8
@@ -164,7 +168,7 @@ def _pack_bits(values: Sequence[int]) -> bytes:
 
 
 def _block(pdu: bytes, at: int) -> tuple[int, int, bytes]:
-    """Address, count and data of a write of several cells; the byte count must be that of the data (row MB-040)."""
+    """Return address, count and data of a write of several cells. The byte count must match the data (row MB-040)."""
     if len(pdu) < at + 5 or pdu[at + 4] != len(pdu) - at - 5:
         raise IllegalValue("byte count and length differ", got=f"{len(pdu)} bytes")
     address, count = _words(pdu[at : at + 4])

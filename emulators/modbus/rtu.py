@@ -1,4 +1,4 @@
-"""Modbus RTU, server side: the units of one line behind RTU frames (SL 2.5.1)."""
+"""Modbus RTU, server side: the units of one line that uses RTU frames (SL 2.5.1)."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ __all__ = ["Exchange", "LineCounters", "RtuSlave"]
 
 
 class RtuSlave(LineSlave):
-    """The units of one RTU line. `units`: unit id (1 to 247) -> unit; `gap_ns`: after which pause no frame goes on.
+    """The units of one RTU line. `units` maps a unit ID (1 to 247) to its unit; after a pause of `gap_ns` no frame
+    continues.
 
-    Tolerant by default: frames are told by length and check sum. `strict` gives the line's settings and has frames told by
-    the pauses of SL 2.5.1.1 alone, which only makes sense where bytes are delivered one by one and in time.
+    By default frames are recognised by length and checksum, which tolerates irregular timing. `strict` gives the
+    settings of the line; frames are then recognised by the pauses of SL 2.5.1.1 alone, which requires that bytes are
+    delivered one by one and in time.
     """
 
     check_bytes = 2

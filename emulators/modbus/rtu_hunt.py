@@ -1,8 +1,8 @@
-"""Finding the next RTU frame in a line's bytes when it is not known where one begins.
+"""Search for the next RTU frame in the bytes of a line when the start of a frame is not known.
 
-Every byte may begin a frame, of which only a correct check sum tells. Of several the one that is whole first is taken, so
-that it does not matter in which pieces the bytes came, and each byte is looked at a bounded number of times however
-they come: what is under trial is kept between calls. Pure.
+Every byte may begin a frame, and only a correct checksum confirms it. Of several candidates, the one that is complete
+first is taken. The result therefore does not depend on how the bytes were divided, and each byte is examined a bounded
+number of times, because the candidates are kept between calls. Pure.
 """
 
 from __future__ import annotations
@@ -22,41 +22,45 @@ from fieldtwin.emulators.modbus.rtu_shapes import (
 )
 
 LOST_AFTER = 4 * MAX_FRAME
-"""Bytes without a frame after which only frames to the units here are looked for, of functions whose length is known: in
-that much garbage others' frames do not help to find one's place any more, and trying every byte for one costs too much."""
+"""Bytes without a frame after which the search only considers frames to the units served here, with functions whose
+length is known. In so much garbage the frames of other units no longer help to resynchronise, and trying every byte
+costs too much.
+"""
 
 IDLE_NOISE = 4
-"""Bytes that a line may make up while it changes direction (row MB-008)."""
+"""Bytes of noise that a line may produce while it changes direction (row MB-008)."""
 
 _REQUEST, _RESPONSE = 0, 1
 
 
 class Hunt:
-    """One search, from the byte that proved to begin no frame on. `own`: the unit ids served here, `declared` what they
-    say of their requests."""
+    """One search, starting at a byte that turned out not to begin a frame.
+
+    `own` are the unit IDs served here, `declared` the request lengths that their units declare.
+    """
 
     def __init__(self, own: frozenset[int], declared: Declared) -> None:
         self._own = own
         self._declared = declared
         self._ours = _pattern(own)
-        self._base = 0  # bytes that the owner dropped: places are counted from the hunt's first byte
-        self._next = 0  # the first place that is not under trial
-        self._due: list[
-            tuple[int, int, int]
-        ] = []  # heap of (place of the end, place of the start, request or response)
-        self._searches: list[list[int]] = []  # [start, place reached, CRC up to there] of frames of unknown length
+        self._base = 0  # bytes dropped by the owner; positions count from the first byte of the hunt
+        self._next = 0  # the first position that has not been tried
+        self._due: list[tuple[int, int, int]] = []  # heap of (end position, start position, request or response)
+        self._searches: list[list[int]] = []  # [start, position reached, CRC up to there] of frames of unknown length
 
     def dropped(self, count: int) -> None:
-        """The owner took `count` bytes off the front of the buffer; trials that began there are over."""
+        """Record that the owner removed `count` bytes from the front of the buffer; candidates that began there are
+        dropped.
+        """
         self._base += count
 
     @property
     def has_dropped(self) -> bool:
-        """Whether bytes of the hunt are gone from the buffer."""
+        """Whether bytes of this search have already been removed from the buffer."""
         return self._base > 0
 
     def search(self, buffer: bytearray) -> tuple[int, int] | None:
-        """Start and end of the frame in `buffer` that is whole first, or None: then call again when there is more."""
+        """Return start and end of the first complete frame in `buffer`, or None; then call again with more data."""
         size = self._base + len(buffer)
         while True:
             horizon = min(self._due[0][0], size) if self._due else size
@@ -73,7 +77,7 @@ class Hunt:
                 return start - self._base, end - self._base
 
     def _candidate(self, buffer: bytearray, horizon: int) -> int | None:
-        """The next place to try, passing over what cannot begin a frame that is looked for."""
+        """Return the next position to try, skipping bytes that cannot begin a frame of the kind that is searched for."""
         place = self._next
         if place < LOST_AFTER:
             self._next += 1
@@ -101,8 +105,8 @@ class Hunt:
                 unknown = True
             elif MIN_FRAME <= shape.length <= MAX_FRAME:
                 heappush(self._due, (place + shape.length, place, kind))
-        # By CRC alone: the frame that may begin where the last one ended, and one to us behind a byte or two of idle noise.
-        # Elsewhere it would find frames in garbage, one in 65536 tries.
+        # The CRC alone decides for a frame that may begin where the last one ended, and for one to our units after a
+        # byte or two of idle noise. Elsewhere it would find frames in garbage, once in 65536 tries.
         if unknown and (place == 0 or (ours and place < IDLE_NOISE)):
             self._searches.append([place, place, 0xFFFF])
 
@@ -117,7 +121,7 @@ class Hunt:
         return shape.length == len(frame) and crc16(frame) == 0
 
     def _advance(self, buffer: bytearray, horizon: int) -> tuple[int, int] | None:
-        """Take the searches by CRC alone up to `horizon`; of several that end there, the one that ends first."""
+        """Advance the searches by CRC alone up to `horizon`. If several end there, return the one that ends first."""
         best: tuple[int, int] | None = None
         kept = []
         for search in self._searches:

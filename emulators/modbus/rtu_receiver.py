@@ -1,12 +1,12 @@
-"""Where RTU frames begin and end in what a line delivers, as a server on a shared line hears it.
+"""Where RTU frames begin and end in what a line delivers, as heard by a server on a shared line.
 
-Frames are told by their length and check sum, never by silence alone: behind USB adapters, ptys and sockets the
-pauses of the line are gone (SL 2.5.1.1 is what a UART sees). A long pause only decides that an unfinished frame stays
-unfinished. Pure: bytes and ``now`` in, whole frames out; who is asked and what is answered is known elsewhere.
+Frames are recognised by their length and checksum, never by silence alone: USB adapters, ptys and sockets do not
+preserve the pauses of the line (SL 2.5.1.1 describes what a UART sees). A long pause only decides that an unfinished
+frame stays unfinished. Pure: it takes bytes and ``now`` and returns complete frames. It does not know units or replies.
 
-Others' traffic is on the line too, requests and responses, and is told apart only by trying both lengths. The first
-byte of the buffer is trusted to begin a frame and may hold back what follows until that frame is whole; once it proves
-to be noise, every byte behind it is tried (`rtu_hunt`) and only a correct check sum counts.
+The line also carries requests to and responses from other units, which are distinguished only by trying both lengths.
+The first byte of the buffer is assumed to begin a frame and may hold back later bytes until that frame is complete. If
+it proves to be noise, every following byte is tried (`rtu_hunt`) and only a correct checksum counts.
 """
 
 from __future__ import annotations
@@ -30,18 +30,19 @@ from fieldtwin.gateway.core.clock import NS_PER_MS
 __all__ = ["FRAME_GAP_NS", "MAX_FRAME", "MIN_FRAME", "RtuReceiver", "crc16", "with_crc"]
 
 FRAME_GAP_NS = 50 * NS_PER_MS
-"""A pause after which nobody goes on with a frame: well over t3.5 and over the 16 ms of a USB adapter's timer, well
-under any master's response timeout."""
+"""A pause after which no sender continues a frame: well over t3.5 and over the 16 ms of a USB adapter's timer, well
+under the response timeout of any client.
+"""
 
 _NOISE, _WAIT = 0, -1
 
 
 class RtuReceiver:
-    """Cuts frames out of a line. `own`: the unit ids served here, which never *send* anything that is heard here;
-    `declared`: what they say of the length of their own functions' requests.
+    """Cuts frames out of the bytes of a line. `own` are the unit IDs served here, whose own frames are never heard
+    here; `declared` gives the request lengths of their device-specific functions.
 
-    `crc_errors` counts runs of at least `MIN_FRAME` bytes that belong to no frame, `noise_bytes` every such byte. They
-    are known once the next frame is found or the line has paused for `gap_ns`; feed ``b""`` to tell of a pause.
+    `crc_errors` counts runs of at least `MIN_FRAME` bytes that belong to no frame, `noise_bytes` every such byte. Both
+    are updated when the next frame is found or the line has paused for `gap_ns`; feed ``b""`` to report a pause.
     """
 
     def __init__(self, own: frozenset[int], gap_ns: int = FRAME_GAP_NS, declared: Declared | None = None) -> None:
@@ -62,7 +63,10 @@ class RtuReceiver:
         return len(self._buffer)
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
-        """Frames that are whole now, oldest first, each with unit and CRC. Never raises, whatever comes."""
+        """Return the frames that are now complete, oldest first, each with unit ID and CRC.
+
+        Never raises, whatever `data` is.
+        """
         if not self._buffer and self._is_a_request(data):
             self._last_ns = now_ns
             self.frames += 1
@@ -84,16 +88,20 @@ class RtuReceiver:
         return frames
 
     def _is_a_request(self, data: bytes) -> bool:
-        """As a rule a chunk is a request to us, whole and alone; whatever else it is, `_next_frame` finds out."""
+        """Return whether a chunk is exactly one request to our units, the usual case.
+
+        `_next_frame` handles all other cases.
+        """
         if len(data) < MIN_FRAME or data[0] not in self._own or self._hunt is not None:
             return False
         return FIXED_REQUESTS.get(data[1]) == len(data) and is_whole(data)
 
     def _is_a_whole_request_of_a_wrong_length(self) -> bool:
-        """Whether all that came between two pauses is one request to us, whose length is not the one that its head says.
+        """Return whether the bytes between two pauses are one request to our units whose length differs from what its
+        head implies.
 
-        The pauses and the check sum say that it is a whole frame (SL 2.5.1.1), so it is refused with exception 03 (AP 7: the
-        implied length is incorrect) and not taken for noise.
+        The pauses and the checksum show that it is a complete frame (SL 2.5.1.1). It is therefore refused with
+        exception 03 (AP 7: the implied length is incorrect) and not treated as noise.
         """
         if self._hunt is not None and self._hunt.has_dropped:
             return False
@@ -116,23 +124,24 @@ class RtuReceiver:
             self._drop(start)
             self._end_run()
             return self._take(end - start)
-        self._drop(len(self._buffer) - MAX_FRAME + 1)  # what began earlier has had all the bytes that a frame can have
+        self._drop(len(self._buffer) - MAX_FRAME + 1)  # a frame that began earlier would be complete by now
         return None
 
     def _at_front(self) -> int:
-        """Length of the frame with which the buffer begins; `_WAIT` while a sensible one is not whole, or `_NOISE`."""
+        """Return the length of the frame at the front of the buffer, `_WAIT` if a plausible one is incomplete, or `_NOISE`."""
         size = len(self._buffer)
         if size < MIN_FRAME:
             return _WAIT
         ours = self._buffer[0] in self._own
         fixed = FIXED_REQUESTS.get(self._buffer[1]) if ours else None
-        if fixed is not None:  # by far the most frequent
+        if fixed is not None:  # by far the most frequent case
             if size < fixed:
                 return _WAIT
             return fixed if crc16(self._buffer[:fixed]) == 0 else _NOISE
         head = self._buffer[:MAX_FRAME]
         shapes = self._shapes(head, ours)
-        # Shortest first: a 00 behind a whole frame leaves its check sum right, and is the next frame's broadcast address.
+        # Shortest first: a 00 after a complete frame leaves its checksum correct, and is the broadcast address of the
+        # next frame.
         for length in sorted(s.length for s in shapes if MIN_FRAME <= s.length <= len(head)):
             if crc16(head[:length]) == 0:
                 return length
@@ -141,7 +150,7 @@ class RtuReceiver:
 
     def _shapes(self, head: bytearray, ours: bool) -> list[Shape]:
         if head[0] > LAST_UNIT:
-            return []  # noise, or nothing to do with us
+            return []  # noise, or a frame that does not concern our units
         request = self._declared.request_shape(head)
         both = [request] if ours or head[0] == 0 else [request, response_shape(head)]
         return [shape for shape in both if shape is not None]

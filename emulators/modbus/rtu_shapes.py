@@ -1,4 +1,4 @@
-"""How long RTU frames are, by what they begin with (AP 6, SL 2.5.1), and their check sum. Pure."""
+"""The length of RTU frames, derived from their first bytes (AP 6, SL 2.5.1), and their checksum. Pure."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from functools import lru_cache
 
 MIN_FRAME = 4
 MAX_FRAME = 256
-"""Bytes of a frame with unit and check sum: function only, and the limit of SL 2.5.1."""
+"""Bytes of a frame with unit ID and checksum: a function code alone, and the limit of SL 2.5.1."""
 LAST_UNIT = 247
-"""Ids above are reserved (SL 2.2)."""
+"""Higher IDs are reserved (SL 2.2)."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -25,18 +25,21 @@ def _crc_table() -> tuple[int, ...]:
 
 CRC_TABLE = _crc_table()
 KEPT = 256
-"""Frames whose check sums are kept."""
+"""Number of frames whose checksums are cached."""
 
 
 _NEXT = [n >> 8 ^ CRC_TABLE[n & 0xFF] for n in range(0x10000)]
 _TWICE = [_NEXT[n] for n in _NEXT]
-"""The register after two bytes, by the register before them, both bytes mixed in: half the steps a byte by byte sum takes."""
+"""CRC register after two bytes, by the register before them with both bytes mixed in. It halves the steps of the CRC."""
 
 _PAIRS = [struct.Struct(f"<{n}H") for n in range(MAX_FRAME // 2 + 1)]
 
 
 def crc16(data: bytes | bytearray | memoryview, crc: int = 0xFFFF) -> int:
-    """CRC of SL 2.5.1.2 (polynomial A001h reflected, start FFFFh). Over a whole frame with its CRC it is zero."""
+    """Return the CRC of SL 2.5.1.2 (polynomial A001h reflected, start FFFFh).
+
+    Over a whole frame with its CRC it is zero.
+    """
     size = len(data)
     pairs = _PAIRS[size >> 1] if size <= MAX_FRAME else struct.Struct(f"<{size >> 1}H")
     for pair in pairs.unpack_from(data):
@@ -46,21 +49,24 @@ def crc16(data: bytes | bytearray | memoryview, crc: int = 0xFFFF) -> int:
 
 @lru_cache(maxsize=KEPT)
 def with_crc(frame: bytes) -> bytes:
-    """`frame` (unit and PDU) with its check sum, low byte first. Kept: masters ask the same, and values seldom change."""
+    """Return `frame` (unit ID and PDU) with its checksum, low byte first.
+
+    The result is cached, because clients repeat their requests and values seldom change.
+    """
     return frame + crc16(frame).to_bytes(2, "little")
 
 
 @lru_cache(maxsize=KEPT)
 def is_whole(frame: bytes) -> bool:
-    """Whether a frame's check sum is right. Kept as `with_crc`'s."""
+    """Return whether the checksum of a frame is correct. The result is cached, as in `with_crc`."""
     return crc16(frame) == 0
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """How long a frame is by its head. `plausible`: the head makes sense, so that waiting for the rest does too.
+    """The length of a frame, derived from its head. `plausible`: the head makes sense, so waiting for the rest does too.
 
-    While the head itself is short, `length` is the least it can be, which is more than what is there.
+    While the head itself is incomplete, `length` is the minimum length, which is more than the bytes received so far.
     """
 
     length: int
@@ -73,9 +79,9 @@ FIXED_REQUESTS = {
     0x16: 10,
     0x18: 6,
 }
-"""Function code -> length of the request frame, where it has only one."""
+"""Function code -> length of the request frame, for functions with only one."""
 KNOWN_REQUESTS = frozenset({*FIXED_REQUESTS, 0x0F, 0x10, 0x14, 0x15, 0x17, 0x2B})
-"""Functions whose request frames have a length that can be told."""
+"""Functions whose request length follows from the first bytes."""
 _COUNTED_RESPONSES = frozenset({0x01, 0x02, 0x03, 0x04, 0x0C, 0x11, 0x14, 0x15, 0x17})
 _WORD_RESPONSES = frozenset({0x03, 0x04, 0x17})
 _FIXED_RESPONSES = {0x05: 8, 0x06: 8, 0x07: 5, 0x0B: 8, 0x0F: 8, 0x10: 8, 0x16: 10}
@@ -83,7 +89,7 @@ _IDENTIFICATION = 0x0E
 
 
 def request_shape(head: bytes | bytearray) -> Shape | None:
-    """Shape of a request that begins with `head` (at least unit and function); None: only its CRC can tell."""
+    """Return the shape of a request that begins with `head` (at least unit ID and function); None: only the CRC can tell."""
     function = head[1]
     if function in FIXED_REQUESTS:
         return Shape(FIXED_REQUESTS[function])
@@ -106,17 +112,17 @@ def request_shape(head: bytes | bytearray) -> Shape | None:
 
 
 class Declared:
-    """Requests that the units of a line say the length of: unit id -> function code -> bytes of its request PDU.
+    """Request lengths that the units of a line declare: unit ID -> function code -> bytes of the request PDU.
 
-    By its check sum alone a frame is told wrongly once in 256 times: one whose last byte is 00 looks like a shorter one with a
-    00 behind it. The Renogy Rover's own function 78h is such a frame.
+    By its checksum alone, one frame in 256 is cut wrongly: a frame whose last byte is 00 looks like a shorter frame
+    followed by a 00. Function 78h of the Renogy Rover is an example.
     """
 
     def __init__(self, lengths: Mapping[int, Mapping[int, int]] | None = None) -> None:
         self._lengths = lengths or {}
 
     def request_shape(self, head: bytes | bytearray) -> Shape | None:
-        """As `request_shape`, with what the unit that is addressed has declared."""
+        """Do the same as the function `request_shape`, and also use the lengths declared by the addressed unit."""
         shape = request_shape(head)
         if shape is None:
             length = self._lengths.get(head[0], {}).get(head[1])
@@ -125,7 +131,7 @@ class Declared:
 
 
 def response_shape(head: bytes | bytearray) -> Shape | None:
-    """Shape of a response that begins with `head`; None: only its CRC can tell."""
+    """Return the shape of a response that begins with `head`; None: only the CRC can tell."""
     function = head[1]
     if function >= 0x80:
         return Shape(5)

@@ -1,7 +1,8 @@
-"""RTU frames told by the pauses of the line alone, as a UART with nothing in between hears them (SL 2.5.1.1).
+"""RTU frames recognised only by the pauses of the line, as a directly connected UART hears them (SL 2.5.1.1).
 
-Pure. A pause of t3.5 ends a frame; one over t1.5 inside a frame spoils it; nothing is told by length. For wires that
-deliver every byte in time: behind a pty, a socket or a USB adapter the pauses are gone, and `RtuReceiver` is right.
+Pure. A pause of t3.5 ends a frame, and a pause of more than t1.5 inside a frame spoils it; lengths are not used. It
+suits media that deliver every byte in time. Ptys, sockets and USB adapters do not preserve the pauses: use
+`RtuReceiver` there.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 
 
 class StrictReceiver:
-    """Cuts frames at pauses. `gap_ns` is t3.5; counters as in `RtuReceiver`.
+    """Cuts frames at pauses. `gap_ns` is t3.5; the counters are those of `RtuReceiver`.
 
-    A chunk is taken as characters back to back, the last of which was whole at its `now_ns`. The frame comes out once the
-    pause behind it is told: by the next byte, or by ``b""``.
+    A chunk is taken as characters without gaps, the last of which was complete at its `now_ns`. A frame is returned
+    once the pause after it is known: with the next byte, or with ``b""``.
     """
 
     def __init__(self, settings: SerialSettings) -> None:
@@ -31,11 +32,11 @@ class StrictReceiver:
 
     @property
     def pending(self) -> int:
-        """Bytes of a frame that no pause has ended; more than a frame can have are counted and not kept."""
+        """Bytes of a frame that no pause has ended yet. Bytes beyond the longest frame are counted and not kept."""
         return self._length
 
     def feed(self, data: bytes, now_ns: int) -> list[bytes]:
-        """The frame that a pause ended, if any. Never raises, whatever comes."""
+        """Return the frame that a pause ended, if any. Never raises, whatever `data` contains."""
         frames: list[bytes] = []
         if self._length:
             pause_ns = now_ns - self._pacer.duration_ns(len(data)) - self._last_ns

@@ -1,6 +1,6 @@
-"""The thin asynchronous part: a connection on one side, a pure server on the other, and the wait in between.
+"""The asynchronous part of the Modbus server: it connects a connection to a pure server and waits between them.
 
-Knows no frame format: when to read, when to write, whom to tell.
+It knows no frame format. It decides when to read, when to write and when to call `on_frame`.
 """
 
 from __future__ import annotations
@@ -21,18 +21,19 @@ from fieldtwin.gateway.core.endpoint import SerialSettings
 from fieldtwin.gateway.core.errors import ConnectionLost
 
 OnFrame = Callable[[Direction, int, bytes], None]
-"""``(direction, t_ns, adu)`` for each whole ADU, directions as the gateway sees them: SENT is a request. `t_ns` is
-monotonic: when the request was whole, when the last of the reply was handed over. It may not raise."""
+"""``(direction, t_ns, adu)`` for each complete ADU. The directions are those of the gateway: SENT is a request. `t_ns`
+is monotonic: when the request was complete, or when the last byte of the reply was handed over. It may not raise.
+"""
 
 Latency = Callable[[Exchange], float]
-"""How many seconds a device thinks about one exchange."""
+"""Processing time of a device for one exchange, in seconds."""
 
 
 def as_recorded(line: SerialSettings | None = None) -> Latency:
-    """What each unit itself says, as one that replays a recording does.
+    """Return the latency that each unit states itself, for example a unit that replays a recording.
 
-    A recorded latency ends with the reply's last byte. Where replies are paced on a `line`, the time that they take there
-    is therefore taken off.
+    A recorded latency ends with the last byte of the reply. If replies are paced on a `line`, the time that the reply
+    takes there is therefore subtracted.
     """
     char_time_s = line.char_time_s if line is not None else 0.0
     return lambda exchange: max(0.0, exchange.latency_s - len(exchange.reply) * char_time_s)
@@ -47,11 +48,11 @@ async def serve_rtu(
     *,
     echo: bool = False,
 ) -> None:
-    """Serve RTU or ASCII frames on `connection` (a serial line, or a socket that stands for one) until cancelled or lost.
+    """Serve RTU or ASCII frames on `connection` (a serial line, or a socket in its place) until cancelled or lost.
 
-    `latency_s`: how long the device thinks before each reply, stated or asked for exchange by exchange. `echo`: the master
-    also hears what it sends, as behind a two-wire adapter that listens to itself. Returns when the connection is lost; does
-    not close it.
+    `latency_s` is the processing time of the device before each reply, as a constant or a function of the exchange.
+    `echo`: the client also hears what it sends, as with a two-wire adapter that receives its own frames. Returns when
+    the connection is lost, without closing it.
     """
     line = connection if isinstance(connection, PtyEnd | FaultyEnd) else None
     try:
@@ -78,8 +79,9 @@ async def serve_mbap(
 ) -> None:
     """Serve Modbus TCP on `connection` until cancelled or lost; pipelined requests are answered in order.
 
-    One `MbapSlave` a connection. Closes the connection when the client's stream makes no sense any more (`desync`).
-    A device that never thinks is answered within the callback that brings the request, which takes half the time.
+    Each connection needs its own `MbapSlave`. The connection is closed when the client's stream can no longer be parsed
+    (`desync`). If the latency is zero, the reply is sent from the callback that delivers the request, which takes half
+    the time.
     """
     try:
         if isinstance(connection, SocketEnd) and on_frame is None and latency_s == 0.0:
@@ -94,7 +96,7 @@ async def serve_mbap(
 
 
 def _at_once(slave: MbapSlave, data: bytes, clock: Clock) -> tuple[bytes, bool]:
-    """The replies to a chunk, and whether the stream makes no sense behind it."""
+    """Return the replies to a chunk, and whether the stream cannot be parsed after it."""
     return slave.answer(data, clock.monotonic_ns()), slave.desync is not None
 
 
@@ -106,9 +108,10 @@ async def serve_udp(
     on_frame: OnFrame | None = None,
     clients: ClientCounts | None = None,
 ) -> None:
-    """Serve Modbus TCP's ADUs in datagrams until cancelled or closed; one `slave` for all clients, one after the other.
+    """Serve Modbus TCP ADUs in datagrams until cancelled or closed. All clients share one `slave`, one after the other.
 
-    Each reply goes, in a datagram of its own, to where its request came from. A datagram that comes twice is executed twice.
+    Each reply is sent in its own datagram to the sender of the request. A datagram that arrives twice is executed
+    twice.
     """
     try:
         while True:
@@ -128,7 +131,7 @@ async def serve_udp(
 
 
 async def _read_or_silence(connection: ByteConnection, slave: LineSlave) -> bytes:
-    """What comes next to an unfinished frame; empty after a pause that ends it."""
+    """Return the next bytes of an unfinished frame, or nothing after a pause that ends it."""
     try:
         async with asyncio.timeout(slave.gap_ns / NS_PER_S):
             return await connection.read()
@@ -167,7 +170,7 @@ async def _reply_on_line(
     latency_s: float | Latency,
     on_frame: OnFrame | None,
 ) -> None:
-    """As `_reply`, where the line itself keeps the time: a device thinks from the request's last character on."""
+    """Do the same as `_reply` on a line that keeps the time itself: processing starts at the request's last character."""
     if on_frame is not None:
         _tell_heard(exchanges, now_ns, on_frame)
     after_s = 0.0
@@ -180,5 +183,5 @@ async def _reply_on_line(
 
 
 def _tell_heard(exchanges: list[Exchange], now_ns: int, on_frame: OnFrame) -> None:
-    for exchange in exchanges:  # all of them came before any is answered
+    for exchange in exchanges:  # all of them arrived before any was answered
         on_frame(Direction.SENT, now_ns, exchange.heard)

@@ -1,7 +1,7 @@
-"""One Modbus unit: request PDU in, response PDU out (MODBUS Application Protocol V1.1b3, AP below).
+"""One Modbus unit: it takes request PDUs and returns response PDUs (MODBUS Application Protocol V1.1b3, AP below).
 
-Pure. It never knows unit ids, check sums, transaction ids or what carries it; what the registers mean is the bank's
-business. Each function is in a module of its own; here they are chosen, refused, counted and logged.
+Pure. It never knows unit IDs, checksums, transaction IDs or the transport; the bank knows what the registers mean. Each
+function has its own module; this module selects, refuses, counts and logs them.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ __all__ = ["ALL_FUNCTIONS", "Handler", "ModbusUnit", "UnitLimits", "UnitParts"]
 
 ALL_FUNCTIONS = STANDARD_FUNCTIONS
 BROADCAST_FUNCTIONS = frozenset({0x05, 0x06, 0x0F, 0x10, 0x15, 0x16})
-"""What may come as a broadcast: writes that ask for no data back (SL 2.4.1)."""
+"""Functions that are accepted as a broadcast: writes that do not ask for data (SL 2.4.1)."""
 WHILE_BUSY = frozenset({0x08, 0x0B, 0x0C})
-"""What a busy unit still answers: how a master finds out that it is busy (AP 6.9)."""
+"""Functions that a busy unit still answers, so that a client can find out that it is busy (AP 6.9)."""
 
 MAX_SERVER_DATA = 249
-"""Bytes of a server id and the data after the run indicator that fit a reply of 11h."""
+"""Bytes of the server ID and the data after the run indicator that fit a reply to 11h."""
 
 Handler = Callable[[bytes, int], bytes | None]
-"""``(pdu, now_ns)`` -> the response PDU, None for silence. May raise a `Refusal`, then it has changed nothing."""
+"""``(pdu, now_ns)`` -> the response PDU, or None for silence. It may raise a `Refusal` if it has changed nothing."""
 
 
 class UnitParts(TypedDict, total=False):
-    """What a unit may have besides registers, as `ModbusUnit` takes it."""
+    """The optional parts of a unit besides registers, as keyword arguments of `ModbusUnit`."""
 
     server_id: bytes | None
     server_data: bytes
@@ -50,12 +50,14 @@ class UnitParts(TypedDict, total=False):
 
 
 class ModbusUnit:
-    """A unit's functions over a bank. Without `server_id` (function 11h; `server_data` follows its run indicator),
-    `identification` (2Bh), `files` (14h, 15h) or `fifos` (18h) it has no such function; without `limits` it has all others.
+    """The functions of a unit on a bank.
 
-    Use `respond` for a request to the unit, `execute_broadcast` for one to unit 0 of a serial line. `counters` grow
-    with both; a line tells by `heard` what else went over it. `latency_s` is how long the unit thinks about what it
-    answered last. `running` is the run indicator of 11h.
+    Without `server_id` (function 11h; `server_data` follows its run indicator), `identification` (2Bh), `files` (14h,
+    15h) or `fifos` (18h) the unit lacks that function; without `limits` it has all the others.
+
+    Use `respond` for a request to the unit, and `execute_broadcast` for a request to unit 0 of a serial line. Both
+    increase `counters`; the line reports its other traffic with `heard`. `latency_s` is the processing time of the last
+    answer. `running` is the run indicator of 11h.
     """
 
     def __init__(
@@ -83,7 +85,9 @@ class ModbusUnit:
         self.latency_s = 0.0
         self.running = True
         self.request_lengths: dict[int, int] = {}
-        """Of functions of its own, how long a request PDU is: how a line tells where it ends. By its check sum otherwise."""
+        """Request PDU lengths of device-specific functions, which tell a line where a request ends; otherwise its
+        checksum does.
+        """
         self._server_id = server_id
         self._server_data = server_data
         self._busy_until_ns = 0
@@ -120,10 +124,10 @@ class ModbusUnit:
     def register(
         self, function: int, handler: Handler, *, broadcast: bool = False, request_length: int | None = None
     ) -> None:
-        """Answer `function` (1 to 127) with `handler` from now on, a standard one too: devices have their own ways.
+        """Answer `function` (1 to 127) with `handler` from now on. It may replace a standard function.
 
-        `broadcast`: it is also executed when it comes to unit 0 of a serial line. `request_length`: bytes of its request
-        PDU, where that is always the same; of standard functions it is known.
+        `broadcast`: the function is also executed when it is sent to unit 0 of a serial line. `request_length`: bytes
+        of its request PDU, if they are always the same; those of standard functions are known.
         """
         if not 1 <= function <= 0x7F:
             raise UsageError("function code", expected="1 to 127", got=str(function))
@@ -138,23 +142,24 @@ class ModbusUnit:
         self._busy_until_ns = until_ns
 
     def be_busy_behind(self, every: int, for_ns: int) -> None:
-        """Be busy for `for_ns` behind every so many requests that were not refused for that reason; 0 for never."""
+        """After every `every` requests that were not refused as busy, be busy for `for_ns` nanoseconds; 0 means never."""
         self._busy_every, self._busy_for_ns = every, for_ns
 
     def respond(self, pdu: bytes, now_ns: int) -> bytes | None:
         """Execute a request to this unit and return its response, exception responses included.
 
-        None: no answer. That is so in listen-only mode, for the request that starts or ends it, for an empty PDU, and for
-        function codes from 80h: they are exception responses by AP 4.1, and an answer to an answer may never end.
+        Returns None for no answer: in listen-only mode, for the request that starts or ends it, for an empty PDU, and
+        for function codes from 80h. Those are exception responses by AP 4.1, and answering an answer could go on
+        without end.
         """
         return self._counted(pdu, now_ns, busy=False)
 
     def refuse_busy(self, pdu: bytes) -> bytes | None:
-        """Like `respond`, for a request that comes while too many are under way: exception 06, nothing executed."""
+        """Do the same as `respond` for a request above the limit of requests in progress: exception 06, nothing executed."""
         return self._counted(pdu, 0, busy=True)
 
     def refuse_function(self, pdu: bytes) -> bytes | None:
-        """Like `respond`, for a request that the sender may not make: exception 01, nothing executed."""
+        """Do the same as `respond` for a request that the sender may not make: exception 01, nothing executed."""
         self.counters.requests += 1
         if not pdu or pdu[0] >= 0x80 or self.diagnostics.listen_only:
             self.counters.unanswered += 1
@@ -164,7 +169,7 @@ class ModbusUnit:
         return bytes((pdu[0] | 0x80, IllegalFunction.code))
 
     def execute_broadcast(self, pdu: bytes, now_ns: int) -> None:
-        """Execute a request to unit 0 and say nothing; reads and refused writes have no effect."""
+        """Execute a request to unit 0 without an answer; reads and refused writes have no effect."""
         self.counters.broadcasts += 1
         self.counters.unanswered += 1
         listening = self.diagnostics.listen_only
@@ -177,18 +182,18 @@ class ModbusUnit:
         try:
             handler(pdu, now_ns)
         except Refusal:
-            return  # nobody is answered, nothing was changed: SL 2.4.1
+            return  # a broadcast is never answered, and a refused one changed nothing (SL 2.4.1)
         self.diagnostics.completed(pdu)
 
     def heard(self, messages: int = 0, errors: int = 0) -> None:
-        """The line carried so many whole and damaged frames, for whomever."""
+        """Count complete and damaged frames that the line carried, whatever their unit ID."""
         self.counters.bus_messages += messages
         self.counters.bus_errors += errors
         for _ in range(min(errors, MAX_EVENTS)) if errors else ():
             self.diagnostics.log.note_received(listening=self.diagnostics.listen_only, damaged=True)
 
     def _counted(self, pdu: bytes, now_ns: int, busy: bool) -> bytes | None:
-        self.counters.requests += 1  # first: a request for the counters or the log finds itself there
+        self.counters.requests += 1  # counted first: a request for the counters or the log includes itself
         self.diagnostics.log.note_received(listening=self.diagnostics.listen_only)
         response = self._answer(pdu, now_ns, busy)
         if response is None:
@@ -222,7 +227,7 @@ class ModbusUnit:
         return response
 
     def _tire(self, now_ns: int) -> None:
-        """One request more; busy behind it, where that is stated."""
+        """Count one more request, and become busy after it if `be_busy_behind` says so."""
         self._answered += 1
         if self._busy_every and self._answered % self._busy_every == 0:
             self._busy_until_ns = max(self._busy_until_ns, now_ns + self._busy_for_ns)
